@@ -1,0 +1,68 @@
+"""One wording for bad input, and the shape check of public borders."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+from torch import Tensor
+
+
+class InputError(ValueError):
+    """A mistake of the user's: one sentence, shown without a traceback, exit code 2.
+
+    The sentence says what was expected, what came, which file or key, and what to do.
+    """
+
+
+class RunError(RuntimeError):
+    """A run that cannot go on (a loss that is no longer finite): one sentence, exit code 1."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`known`, listed, led by the nearest name: "did you mean 'grbm'? known: crm, grbm"."""
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}known: {', '.join(names)}"
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """Raise InputError unless low <= value <= high (NaN never passes)."""
+    if not low <= value <= high:
+        raise InputError(f"{name} must lie in [{low:g}, {high:g}], got {value:g}.")
+
+
+def check_choice(name: str, value: str, known: Iterable[str]) -> None:
+    """Raise InputError unless `value` is one of `known`; names the nearest one."""
+    names = list(known)
+    if value not in names:
+        raise InputError(f"{name}: '{value}' is not a choice; {nearest(value, names)}.")
+
+
+def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[str, int]:
+    """Sizes of `tensor` by letter, raising where rank or a known size differs.
+
+    Example:
+        >>> check_shape("label", torch.zeros(2, 4, 6), "B H W", B=2)["W"]
+        6
+
+    Args:
+        name: what the tensor is called in the message.
+        tensor: any tensor.
+        letters: space-separated, one per dimension, e.g. "B H W".
+        sizes: sizes that are already fixed, by letter.
+
+    Returns:
+        letter -> size.
+
+    Raises:
+        ValueError: expected and actual shape, when they differ.
+    """
+    names = letters.split()
+    found = dict(zip(names, tensor.shape, strict=False))
+    expected = {letter: sizes.get(letter, found.get(letter, -1)) for letter in names}
+    if len(names) != tensor.dim() or found != expected:
+        wanted = " x ".join(f"{n}={sizes[n]}" if n in sizes else n for n in names)
+        raise ValueError(f"{name}: expected shape {wanted}, got {tuple(tensor.shape)}.")
+    return found

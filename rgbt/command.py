@@ -1,0 +1,117 @@
+"""The command line: Hydra overrides in, one sentence and an exit code out.
+
+Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable
+from functools import wraps
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from rgbt.checks import InputError, RunError, nearest
+from rgbt.config import check, conf_dir, register_resolvers
+
+Main = Callable[[DictConfig], int | None]
+
+
+def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]:
+    """Make ``main(config)`` a command that is called with Hydra overrides.
+
+    The configuration is composed and checked before `main` sees it. With ``-m`` every point runs,
+    also after one that failed.
+
+    Args:
+        config_name: file of ``conf/`` without extension.
+
+    Returns:
+        decorator; the decorated function takes no arguments and leaves by ``sys.exit``.
+    """
+
+    def decorate(main: Main) -> Callable[[], None]:
+        @wraps(main)
+        def entry() -> None:
+            codes: list[int] = []
+
+            def job(config: DictConfig) -> None:
+                codes.append(_report(lambda: _checked(main, config)))
+
+            sys.exit(max([_report(lambda: _compose(config_name, job)), *codes]))
+
+        return entry
+
+    return decorate
+
+
+def task_overrides() -> list[str]:
+    """Overrides of the running job as they were typed, e.g. ``["+experiment=grbm", "seed=1"]``."""
+    return list(HydraConfig.get().overrides.task)
+
+
+def _checked(main: Main, config: DictConfig) -> int | None:
+    check(config)
+    return main(config)
+
+
+def _compose(config_name: str, job: Callable[[DictConfig], None]) -> None:
+    # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    register_resolvers()
+    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
+
+
+def _report(work: Callable[[], int | None]) -> int:
+    """Exit code of `work`; a user's mistake is told in one sentence on stderr."""
+    try:
+        return work() or 0
+    except InputError as error:
+        return _say(str(error), 2)
+    except RunError as error:
+        return _say(str(error), 1)
+    except (HydraException, OmegaConfBaseException) as error:
+        return _say(_hydra_sentence(error), 2)
+    except KeyboardInterrupt:
+        return _say("interrupted; the same command continues from the last checkpoint.", 130)
+
+
+def _say(sentence: str, code: int) -> int:
+    sys.stdout.flush()
+    sys.stderr.write(f"rgbt: {sentence}\n")
+    return code
+
+
+def _hydra_sentence(error: Exception) -> str:
+    """What Hydra or OmegaConf refused, in one sentence with the nearest known name."""
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, name = (error.missing_cfg_file or "").rpartition("/")
+        return f"there is no {group or 'configuration'} '{name}'; {nearest(name, error.options)}."
+    if isinstance(error, MissingConfigException):
+        known = sorted(path.name for path in conf_dir().iterdir() if path.is_dir())
+        match = re.search(r"'([^']+?)(?:/[^'/]*)?'", str(error))
+        group = match.group(1) if match else "?"
+        return f"there is no group '{group}'; {nearest(group, known)}."
+    text = " ".join(str(error.__cause__ or error).split())
+    key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
+    if key:
+        return _unknown_key(key.group(2))
+    first = str(error).splitlines()[0].rstrip(".")
+    return f"{first}; see `python -m rgbt.run --help`."
+
+
+def _unknown_key(full_key: str) -> str:
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = hydra.compose("config")
+    *parents, last = full_key.split(".")
+    node = config
+    for parent in parents:
+        node = node.get(parent) if isinstance(node, DictConfig) else None
+    known = [str(key) for key in node if key != "_target_"] if isinstance(node, DictConfig) else []
+    return f"'{full_key}' is not a key of the configuration; {nearest(last, known)}."

@@ -1,0 +1,198 @@
+"""Configuration: where it lies, how it is checked, how a node becomes an object.
+
+The schema of a node is the constructor that its ``_target_`` names: keys and values are checked
+against the constructor's signature and annotations before anything is built, so that a misspelt
+key in an experiment file or after ``+`` is refused as well (Hydra lets both through).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pydantic
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rgbt.checks import InputError, nearest
+
+TOP_LEVEL: dict[str, Any] = {"seed": int, "name": str, "runs_dir": str, "out": str | None}
+"""Keys of the configuration that are plain values; every other one is a node with `_target_`."""
+
+NODES = (
+    *("scale", "recipe", "dataset", "data", "transform", "masker", "model", "loss", "scheme"),
+    *("optimizer", "schedule", "trainer", "metric", "tracking"),
+)
+
+NOT_IN_KEY = (
+    *("name", "runs_dir", "out", "recipe", "tracking", "dataset.root", "dataset.cache_dir"),
+    *("data.num_workers", "data.on_error", "data.eval_batch_size"),
+    *("trainer.accelerator", "trainer.threads", "trainer.log_every"),
+)
+"""What may differ between two runs that are the same run: labels, paths, hardware, tracking."""
+
+
+def conf_dir() -> Path:
+    """The folder of configuration files: inside an installed wheel, or beside the package."""
+    here = Path(__file__).resolve().parent
+    inside = here / "conf"
+    return inside if inside.is_dir() else here.parent / "conf"
+
+
+def register_resolvers() -> None:
+    """``${px:64}``: 64 pixels of the paper's images, scaled to the images of the chosen scale."""
+    if not OmegaConf.has_resolver("px"):
+        OmegaConf.register_new_resolver("px", _scaled_pixels)
+
+
+def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
+    return round(pixels * float(_root_.scale.pixel_factor))
+
+
+def check(config: DictConfig) -> None:
+    """Refuse a configuration with unknown keys, missing values or values of a wrong type.
+
+    Raises:
+        InputError: naming the first key that is wrong, with the nearest known name.
+    """
+    known = [*TOP_LEVEL, *NODES]
+    for key in config:
+        if key not in known:
+            raise InputError(
+                f"'{key!s}' is not a key of the configuration; {nearest(str(key), known)}."
+            )
+    for key, annotation in TOP_LEVEL.items():
+        _check_value(key, config[key], annotation)
+    for key in NODES:
+        check_node(config[key], key)
+
+
+def check_node(node: DictConfig, path: str) -> None:
+    """Check one node against the constructor its ``_target_`` names (see the module docstring).
+
+    Args:
+        node: mapping with `_target_`.
+        path: its key in the configuration, for messages.
+
+    Raises:
+        InputError: missing or unknown target, unknown key, missing value, wrong type.
+    """
+    target = _target(node, path)
+    parameters = inspect.signature(target).parameters
+    hints = _annotations(target)
+    for key, value in _items(node, path):
+        if key not in parameters:
+            raise InputError(
+                f"'{path}.{key}' is not a setting of {node['_target_']}; "
+                f"{nearest(key, [name for name in parameters if name in hints])}."
+            )
+        if isinstance(value, DictConfig) and "_target_" in value:
+            check_node(value, f"{path}.{key}")
+        else:
+            _check_value(f"{path}.{key}", value, hints[key])
+
+
+def build(node: DictConfig, **extra: Any) -> Any:
+    """The object that a checked node describes.
+
+    Args:
+        node: mapping with `_target_`; nested nodes are built first.
+        extra: objects from elsewhere (a model for a scheme), passed beside the node's own values.
+
+    Returns:
+        ``target(**values, **extra)``, values converted to the annotated types (lists to tuples).
+    """
+    path = node._get_full_key(None) or "config"
+    target = _target(node, path)
+    hints = _annotations(target)
+    values = {}
+    for key, value in _items(node, path):
+        nested = isinstance(value, DictConfig) and "_target_" in value
+        values[key] = build(value) if nested else _check_value(f"{path}.{key}", value, hints[key])
+    return target(**values, **extra)
+
+
+def run_key(config: DictConfig) -> str:
+    """12 hexadecimal digits that name the run: hash of the resolved configuration.
+
+    Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method with
+    the same seed is the same run wherever it is started from.
+    """
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict), "the configuration is a mapping"
+    for dotted in NOT_IN_KEY:
+        *parents, last = dotted.split(".")
+        node: Any = plain
+        for parent in parents:
+            node = node.get(parent, {})
+        node.pop(last, None)
+    text = json.dumps(plain, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def flatten(config: DictConfig) -> dict[str, Any]:
+    """Resolved leaves of a configuration by dotted key, lists as they are."""
+    plain = OmegaConf.to_container(config, resolve=True)
+
+    def leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+        if not isinstance(value, dict):
+            yield path, value
+            return
+        for key, child in value.items():
+            yield from leaves(child, f"{path}.{key}" if path else str(key))
+
+    return dict(leaves(plain, ""))
+
+
+def _target(node: DictConfig, path: str) -> Any:
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        raise InputError(
+            f"'{path}' must be a mapping with `_target_`; choose a file of conf/{path}/"
+        )
+    try:
+        return get_object(node["_target_"])
+    except Exception as error:
+        raise InputError(
+            f"'{path}._target_': cannot import {node['_target_']} ({error.__cause__ or error})."
+        ) from error
+
+
+def _annotations(target: Any) -> dict[str, Any]:
+    function = target.__init__ if inspect.isclass(target) else target
+    hints = typing.get_type_hints(function)
+    hints.pop("return", None)
+    return hints
+
+
+def _items(node: DictConfig, path: str) -> Iterator[tuple[str, Any]]:
+    for key in node:
+        if key == "_target_":
+            continue
+        if OmegaConf.is_missing(node, key):
+            raise InputError(f"'{path}.{key!s}' has no value; give one with {path}.{key!s}=...")
+        try:
+            yield str(key), node[key]
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"'{path}.{key!s}' cannot be resolved: {reason}") from error
+
+
+def _check_value(path: str, value: Any, annotation: Any) -> Any:
+    """`value` as the annotated type; as in JSON, a list may be a tuple and an int a float."""
+    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    try:
+        return pydantic.TypeAdapter(annotation).validate_json(json.dumps(plain), strict=True)
+    except pydantic.errors.PydanticSchemaGenerationError:
+        raise InputError(f"'{path}' is not a setting: the run itself provides it.") from None
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        inner = "".join(f"[{part}]" for part in first["loc"] if isinstance(part, int))
+        reason = first["msg"].removeprefix("Value error, ")
+        reason = reason[0].lower() + reason[1:]
+        raise InputError(f"'{path}'{inner}: {reason}, got {json.dumps(plain)}.") from None

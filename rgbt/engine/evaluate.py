@@ -1,0 +1,51 @@
+"""Predictions of a network over batches: no gradients, no scores, no logging."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.types import Batch
+
+MODALITIES = ("rgbt", "rgb", "thermal")
+
+
+class Prediction(NamedTuple):
+    """A batch, on the CPU, and the class index of every pixel of its labels: (B, H', W') uint8."""
+
+    batch: Batch
+    classes: Tensor
+
+
+def predictions(
+    model: nn.Module,
+    batches: Iterable[Batch],
+    device: torch.device,
+    modality: str = "rgbt",
+) -> Iterator[Prediction]:
+    """Class maps at the resolution of the labels, batch by batch.
+
+    Class scores are resized (bilinear) to the label before the argmax where the transform resized
+    the images, so that scores always count the pixels of the file.
+
+    Args:
+        model: a network; put into evaluation mode here and left in it.
+        batches: from `rgbt.data.loaders.eval_batches`.
+        device: where the network lies.
+        modality: "rgbt", or "rgb" / "thermal" to decode one branch alone.
+    """
+    model.eval()
+    for batch in batches:
+        moved = batch.to(device)
+        with torch.inference_mode():
+            output = model(moved.rgb, moved.thermal, views=(modality,))
+            scores = output.logits.float()
+            label_hw = batch.label.shape[-2:]
+            if scores.shape[-2:] != label_hw:
+                scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
+            classes = scores.argmax(1).to(torch.uint8).cpu()
+        yield Prediction(batch, classes)

@@ -1,0 +1,208 @@
+"""The one training loop: for every phase of the scheme, backward, clip, step."""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+
+from rgbt.checks import RunError
+from rgbt.engine.checkpoint import State, load_checkpoint, save_checkpoint, training_payload
+from rgbt.engine.progress import progress
+from rgbt.engine.schedules import Schedule
+from rgbt.engine.settings import TrainerSettings
+from rgbt.randomness import torch_generator
+from rgbt.types import Batch, GeneratorOf, Phase
+
+RecordStep = Callable[[int, dict[str, float]], None]
+Validate = Callable[[int], float]
+
+
+class Scheme(Protocol):
+    """What the loop asks a scheme."""
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        """The backward passes of one step, in order."""
+        ...
+
+
+class Trainer:
+    """Runs a scheme to its last step, evaluating and writing checkpoints on the way.
+
+    Args:
+        fabric: device, precision and gradient synchronisation.
+        settings: durations and limits.
+        scheme: yields the phases of a step.
+        model: the network as Fabric wrapped it.
+        optimizers: by the names that phases use.
+        schedule: learning rate factor per step.
+        steps_per_epoch: optimiser steps in one epoch.
+        folder: where checkpoints go.
+        record: called with (step, values) every `settings.log_every` steps.
+        validate: called with the step; returns the score that selects the best checkpoint.
+    """
+
+    def __init__(  # noqa: PLR0913 - the loop is where everything meets
+        self,
+        *,
+        fabric: Fabric,
+        settings: TrainerSettings,
+        scheme: Scheme,
+        model: nn.Module,
+        optimizers: dict[str, torch.optim.Optimizer],
+        schedule: Schedule,
+        steps_per_epoch: int,
+        folder: Path,
+        record: RecordStep,
+        validate: Validate,
+    ) -> None:
+        self.fabric = fabric
+        self.settings = settings
+        self.scheme = scheme
+        self.model = model
+        self.optimizers = optimizers
+        self.schedule = schedule
+        self.steps_per_epoch = steps_per_epoch
+        self.last = folder / "last.pt"
+        self.best = folder / "best.pt"
+        self.record = record
+        self.validate = validate
+
+    def resume(self, state: State) -> bool:
+        """Take up model, optimizers and `state` from the last checkpoint; False if there is none."""
+        if not self.last.exists():
+            return False
+        payload = load_checkpoint(self.last)
+        self.model.load_state_dict(payload["model"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(payload["optimizers"][name])
+        vars(state).update(payload["state"])
+        return True
+
+    def fit(self, batches: Iterator[Batch], state: State) -> None:
+        """Train from ``state.step`` to the last step, keeping `state` up to date.
+
+        Args:
+            batches: training batches, starting at that step.
+            state: where the run stands; changed in place.
+
+        Raises:
+            RunError: a loss part or the gradient is not finite.
+        """
+        total = self.settings.max_steps
+        with progress() as display:
+            task = display.add_task("training", total=total, completed=state.step, note="")
+            self.model.train()
+            for step in range(state.step, total):
+                values = self._step(step, batches, state.seed)
+                state.step = step + 1
+                note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
+                display.update(task, completed=state.step, note=note)
+                if state.step % self.settings.log_every == 0 or state.step == total:
+                    self.record(state.step, values)
+                self._save_when_due(state)
+
+    def _save_when_due(self, state: State) -> None:
+        due = state.step == self.settings.max_steps
+        if due or state.step % self.settings.eval_every == 0:
+            score = self.validate(state.step)
+            self.model.train()
+            if score > state.best_score:
+                state.best_score, state.best_step = score, state.step
+                save_checkpoint(self.best, {"model": self.model.state_dict(), "step": state.step})
+            due = True
+        if due or state.step % self.settings.checkpoint_every == 0:
+            save_checkpoint(self.last, training_payload(self.model, self.optimizers, state))
+
+    def _step(self, step: int, batches: Iterator[Batch], seed: int) -> dict[str, float]:
+        """One optimiser step of every phase; what to record of it."""
+        started = time.perf_counter()
+        waited = 0.0
+        images = 0
+        values: dict[str, float] = {}
+        rates = self._set_rates(step)
+        for micro in range(self.settings.accumulate):
+            before = time.perf_counter()
+            batch = next(batches).to(self.fabric.device)
+            waited += time.perf_counter() - before
+            images += len(batch.name)
+            index = step * self.settings.accumulate + micro
+            generator_of = partial(
+                torch_generator_of, seed=seed, index=index, device=self.fabric.device
+            )
+            for phase in self.scheme.phases(batch, generator_of):
+                for name, value in self._run_phase(phase, step, micro).items():
+                    values[name] = values.get(name, 0.0) + value
+        elapsed = time.perf_counter() - started
+        return {
+            **values,
+            **rates,
+            "images_per_s": images / elapsed,
+            "wait_share": waited / elapsed,
+            "peak_memory_mib": _peak_memory_mib(self.fabric.device),
+        }
+
+    def _run_phase(self, phase: Phase, step: int, micro: int) -> dict[str, float]:
+        optimizer = self.optimizers[phase.optimizer]
+        share = 1.0 / self.settings.accumulate
+        if micro == 0:
+            optimizer.zero_grad()
+        total = torch.stack(list(phase.parts.values())).sum()
+        values = _finite_values(phase.parts, step)
+        self.fabric.backward(total * share)
+        logged = {f"loss/{name}": value * share for name, value in values.items()}
+        logged["loss"] = sum(values.values()) * share
+        if micro == self.settings.accumulate - 1:
+            norm = self.fabric.clip_gradients(
+                self.model,
+                optimizer,
+                max_norm=self.settings.clip_norm or math.inf,
+                error_if_nonfinite=False,
+            )
+            assert norm is not None, "clipping by norm returns the norm"
+            logged |= {"grad_norm": _finite_values({"gradient norm": norm}, step)["gradient norm"]}
+            optimizer.step()
+        return logged
+
+    def _set_rates(self, step: int) -> dict[str, float]:
+        factor = self.schedule(step, self.settings.max_steps, self.steps_per_epoch)
+        rates = {}
+        for name, optimizer in self.optimizers.items():
+            for index, group in enumerate(optimizer.param_groups):
+                group["lr"] = group["base_lr"] * factor
+                rates[f"lr/{name}_{index}"] = group["lr"]
+        return rates
+
+
+def torch_generator_of(
+    purpose: str, *, seed: int, index: int, device: torch.device
+) -> torch.Generator:
+    """The generator of one purpose in one step (see `rgbt.types.GeneratorOf`)."""
+    return torch_generator(seed, purpose, index, device=device)
+
+
+def _finite_values(parts: dict[str, Tensor], step: int) -> dict[str, float]:
+    # One transfer for all parts: reading them one by one would wait for the device each time.
+    numbers = torch.stack([part.detach().float() for part in parts.values()]).tolist()
+    values = dict(zip(parts, numbers, strict=True))
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise RunError(
+                f"step {step + 1}: {name} is {value}; the last checkpoint is kept. Lower "
+                "optimizer.lr, or use trainer.precision=32-true if it was mixed."
+            )
+    return values
+
+
+def _peak_memory_mib(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10

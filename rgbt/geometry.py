@@ -1,0 +1,23 @@
+"""Sizes and padding that several parts must agree on."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn import functional as F
+
+STRIDE = 32
+"""Networks here see images whose sides are multiples of this (SpatialSeg and CRM releases)."""
+
+
+def padded_hw(image_hw: tuple[int, int], multiple: int = STRIDE) -> tuple[int, int]:
+    """(height, width), each rounded up to a multiple of `multiple`."""
+    height, width = image_hw
+    return -(-height // multiple) * multiple, -(-width // multiple) * multiple
+
+
+def pad_to(tensor: Tensor, hw: tuple[int, int], value: float = 0.0) -> Tensor:
+    """`tensor` (..., H, W) padded with `value` at the bottom and right to `hw`."""
+    height, width = tensor.shape[-2:]
+    if (height, width) == hw:
+        return tensor
+    return F.pad(tensor, (0, hw[1] - width, 0, hw[0] - height), value=value)

@@ -1,0 +1,121 @@
+"""Complementary random masking with self-distillation, the six head passes as one batch.
+
+Source: Shin et al., "Complementary Random Masking for RGB-Thermal Semantic Segmentation", and its
+release; SpatialSeg trains with the same scheme and other masks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.checks import InputError
+from rgbt.types import Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
+
+VIEWS = ("rgbt", "rgb", "thermal")
+Distillation = Callable[[Tensor, Tensor], Tensor]
+
+
+class CRM:
+    """Total loss ``L(F) + w_m (L(R) + L(T)) + L(F') + w_c SDC + w_n SDN``.
+
+    F, R, T are the predictions of the clean pass from RGB-T, RGB alone and thermal alone; primes
+    mark the masked pass. SDC is the mean absolute difference of the final class logits of F' to
+    those of F, which are the fixed teacher; SDN the same for R' and T', summed.
+
+    With a masker that hides nothing there is no masked pass (the rows without masking of CRM
+    Table 3a, which the release cannot run); the distillation weights must then be 0.
+
+    Args:
+        model: network with the argument `passes` and `views` of `rgbt.models.mask2former`.
+        loss: criterion that returns one value per stacked pass.
+        masker: draws the masks of the masked pass.
+        distillation: mean absolute difference of two sets of class logits, teacher first.
+        modality_weight: w_m. 1 in the release.
+        complementary_weight: w_c. 1 in the release.
+        nonlocal_weight: w_n. 1 in the release.
+
+    Raises:
+        InputError: distillation asked for without a masked pass.
+    """
+
+    def __init__(  # noqa: PLR0913 - three collaborators, three published weights
+        self,
+        *,
+        model: nn.Module,
+        loss: Loss,
+        masker: Masker,
+        distillation: Distillation,
+        modality_weight: float,
+        complementary_weight: float,
+        nonlocal_weight: float,
+    ) -> None:
+        if masker.hides_nothing and (complementary_weight or nonlocal_weight):
+            raise InputError(
+                "scheme=crm distils from a masked pass, but the masker hides nothing; choose "
+                "a masker (masker=crm) or set scheme.complementary_weight=0 scheme.nonlocal_weight=0."
+            )
+        self.model = model
+        self.loss = loss
+        self.masker = masker
+        self.distillation = distillation
+        self.modality_weight = modality_weight
+        self.complementary_weight = complementary_weight
+        self.nonlocal_weight = nonlocal_weight
+        # Single-modality predictions cost two thirds of the head: only where they are read.
+        self.views = VIEWS if modality_weight or nonlocal_weight else VIEWS[:1]
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        """One phase: the criterion of the supervised passes and the distillation terms.
+
+        Args:
+            batch: see `rgbt.types.Batch`, images in [0, 1].
+            generator_of: purpose -> generator of this step.
+        """
+        output, passes = self._forward(batch, generator_of)
+        weights = self._weights(passes).to(batch.rgb.device)
+        # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
+        supervised = {name: tensor[:, : len(weights)] for name, tensor in output.aux.items()}
+        parts = self.loss(Output(None, supervised), batch, generator_of("loss"))
+        weighted = {name: (values * weights).sum() for name, values in parts.items()}
+        if passes == 2:
+            weighted |= self._distil(output.aux["class_logits"][-1])
+        yield Phase("main", weighted)
+
+    def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:
+        height, width = batch.rgb.shape[-2:]
+        generator = generator_of("stochastic depth")
+        if self.masker.hides_nothing:
+            output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
+            return output, 1
+        masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
+        clean_and_masked = MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks))
+        output = self.model(
+            batch.rgb.repeat(2, 1, 1, 1),
+            batch.thermal.repeat(2, 1, 1, 1),
+            clean_and_masked,
+            passes=2,
+            views=self.views,
+            generator=generator,
+        )
+        return output, 2
+
+    def _weights(self, passes: int) -> Tensor:
+        modality = [self.modality_weight] * (len(self.views) - 1)
+        masked = [1.0] * (passes - 1)
+        return torch.tensor([1.0, *modality, *masked])
+
+    def _distil(self, class_logits_PBQK: Tensor) -> dict[str, Tensor]:
+        views = len(self.views)
+        teacher = class_logits_PBQK[0]
+        terms = {}
+        if self.complementary_weight:
+            student = class_logits_PBQK[views]
+            terms["sdc"] = self.complementary_weight * self.distillation(teacher, student)
+        if self.nonlocal_weight:
+            rgb, thermal = class_logits_PBQK[views + 1 :]
+            both = self.distillation(teacher, rgb) + self.distillation(teacher, thermal)
+            terms["sdn"] = self.nonlocal_weight * both
+        return terms

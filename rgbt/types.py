@@ -1,0 +1,135 @@
+"""The values that carry everything between the parts of the lab.
+
+Letters, everywhere: ``B`` batch, ``C`` channels, ``H W`` pixels, ``h w`` cells or feature grid,
+``K`` classes, ``Q`` queries, ``R`` regions, ``P`` stacked passes of one batch, ``L`` prediction
+layers.
+Conventions: RGB order, (row, column) order, labels int64 with 255 = ignore, mask True = hidden,
+resize with ``align_corners=False``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+IGNORE = 255
+
+GeneratorOf = Callable[[str], torch.Generator]
+"""purpose -> generator; the same purpose in the same step always gives the same draws."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One labelled RGB-thermal pair as it lies on disk: no augmentation, no masking.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, RGB order.
+        thermal: (H, W) uint8.
+        label: (H, W) uint8, class index or 255 = ignore; None where the pair is unlabelled.
+        name: name in the split list, without extension.
+    """
+
+    rgb: NDArray[np.uint8]
+    thermal: NDArray[np.uint8]
+    label: NDArray[np.uint8] | None
+    name: str
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples after the transform, stacked.
+
+    Attributes:
+        rgb: (B, 3, H, W); uint8 or float32 in 0..255 from the loader, float32 in [0, 1] after
+            ``to``.
+        thermal: (B, 1, H, W), same dtype rule as ``rgb``.
+        label: (B, H', W') int64, 255 = ignore. H' = H and W' = W in training; in evaluation the
+            label keeps the resolution of the file while the images may have been resized.
+        name: B names.
+        centre_yx: (B, 2) int64, the pixel of this crop that is nearest to the centre
+            (rows // 2, columns // 2) of the original image; the first in row-major order on a tie.
+        position: (B, 2, H, W) float32, (row, column) in the original image of every crop pixel;
+            None where the transform was asked not to track it.
+        original_hw: (B, 2) int64, height and width of the original image.
+        domain: "source" or "target", for domain adaptation.
+    """
+
+    rgb: Tensor
+    thermal: Tensor
+    label: Tensor
+    name: tuple[str, ...]
+    centre_yx: Tensor
+    position: Tensor | None
+    original_hw: Tensor
+    domain: str = "source"
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The batch on `device`, with images as float32 in [0, 1]."""
+
+        def moved(tensor: Tensor) -> Tensor:
+            return tensor.to(device, non_blocking=True)
+
+        return replace(
+            self,
+            rgb=moved(self.rgb).float() / 255.0,
+            thermal=moved(self.thermal).float() / 255.0,
+            label=moved(self.label),
+            centre_yx=moved(self.centre_yx),
+            position=None if self.position is None else moved(self.position),
+            original_hw=moved(self.original_hw),
+        )
+
+
+class MaskPair(NamedTuple):
+    """Which cells are hidden: rgb (B, h, w) and thermal (B, h, w), bool, True = hidden."""
+
+    rgb: Tensor
+    thermal: Tensor
+
+
+class Output(NamedTuple):
+    """What a network returns.
+
+    Attributes:
+        logits: (B, K, H, W) class scores at the size of the input image. None in training mode for
+            networks whose loss reads `aux` instead (a dense map would be computed for nothing).
+        aux: named intermediates; each network documents its names and shapes.
+    """
+
+    logits: Tensor | None
+    aux: dict[str, Tensor]
+
+
+class Phase(NamedTuple):
+    """One backward pass and optimiser step: optimiser name and named, weighted loss parts."""
+
+    optimizer: str
+    parts: dict[str, Tensor]
+
+
+class Masker(Protocol):
+    """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`)."""
+
+    hides_nothing: bool
+
+    def __call__(
+        self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
+    ) -> MaskPair:
+        """Cells of a crop of `image_hw` pixels, padded; one draw per row of `centre_yx`."""
+        ...
+
+
+class Loss(Protocol):
+    """Compares what a network returned with a batch."""
+
+    def __call__(
+        self, output: Output, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Named, weighted parts, each of shape (P,): one value per stacked pass of the batch."""
+        ...

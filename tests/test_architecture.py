@@ -1,0 +1,111 @@
+"""The rules of the house that a tool can check: imports, sizes, nesting, global randomness."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted(path for path in (ROOT / "rgbt").rglob("*.py") if "conf" not in path.parts)
+
+COMMON = {"rgbt.types", "rgbt.checks", "rgbt.geometry", "rgbt.randomness"}
+ISLANDS = {"data", "transforms", "maskers", "models", "losses", "metrics"}
+ALLOWED = {
+    **{island: COMMON | {f"rgbt.{island}"} for island in ISLANDS},
+    "schemes": COMMON | {"rgbt.schemes"},
+    "engine": COMMON | {"rgbt.engine"},
+    "tracking": COMMON | {"rgbt.tracking", "rgbt.metrics"},
+    "types.py": set(),
+    "checks.py": set(),
+    "geometry.py": {"rgbt.types", "rgbt.checks"},
+    "randomness.py": set(),
+    "config.py": {"rgbt.checks"},
+    "command.py": {"rgbt.checks", "rgbt.config"},
+}
+COMMANDS = {"rgbt.command", "rgbt.config"}
+"""What a command line (a module with `if __name__ == "__main__"`) may import too."""
+
+MEETING_PLACES = {"run.py", "evaluate.py", "predict.py", "session.py", "report.py", "__init__.py"}
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def is_command(text: str) -> bool:
+    return 'if __name__ == "__main__"' in text
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_stay_inside_their_island(path: Path) -> None:
+    place = path.relative_to(ROOT / "rgbt").parts[0]
+    if place in MEETING_PLACES:
+        return
+    text = path.read_text()
+    allowed = ALLOWED[place] | (COMMANDS if is_command(text) else set())
+    for name in imports(ast.parse(text)):
+        if name == "rgbt" or name.startswith(("sweeps", "analysis", "tests")):
+            pytest.fail(f"{path.name} imports {name}")
+        if name.startswith("rgbt."):
+            assert any(name == a or name.startswith(f"{a}.") for a in allowed), (
+                f"{path.relative_to(ROOT)} imports {name}; {place} may import {sorted(allowed)}"
+            )
+
+
+BLOCKS = (ast.If, ast.For, ast.While, ast.With, ast.Try)
+SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
+
+
+def nesting(node: ast.AST, level: int = 0) -> int:
+    """Deepest block of a function; `elif` does not deepen, inner functions count alone."""
+    worst = level
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, SCOPES):
+            continue
+        is_elif = isinstance(node, ast.If) and isinstance(child, ast.If) and child in node.orelse
+        worst = max(worst, nesting(child, level + (isinstance(child, BLOCKS) and not is_elif)))
+    return worst
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_and_functions_fit_a_reader(path: Path) -> None:
+    assert path.read_text().count("\n") <= 400, "a file above 400 lines is two files"
+    for function in functions(path):
+        body = function.body[1:] if ast.get_docstring(function) else function.body
+        if not body:
+            continue
+        size = (function.end_lineno or 0) - body[0].lineno + 1
+        assert size <= 60, f"{function.name}: {size} lines"
+        assert nesting(function) <= 3, f"{function.name} nests {nesting(function)} deep"
+
+
+GLOBAL_DRAWS = re.compile(
+    r"\bnp\.random\.(rand|randn|randint|choice|permutation|shuffle|seed|uniform|normal)\b"
+    r"|^\s*import random\b|^\s*from random import\b"
+    r"|\btorch\.(rand|randn|randint|randperm|bernoulli|multinomial)\((?![^)]*generator)",
+    re.MULTILINE,
+)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nobody_draws_from_a_global_generator(path: Path) -> None:
+    # Calls that span lines are joined, so that `generator=` on the next line counts.
+    text = re.sub(r"\(\s*\n\s*", "(", path.read_text())
+    text = re.sub(r",\s*\n\s*", ", ", text)
+    found = GLOBAL_DRAWS.search(text)
+    assert found is None, f"{path.relative_to(ROOT)}: {found.group(0)}"
