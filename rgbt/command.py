@@ -115,3 +115,44 @@ def _unknown_key(full_key: str) -> str:
         node = node.get(parent) if isinstance(node, DictConfig) else None
     known = [str(key) for key in node if key != "_target_"] if isinstance(node, DictConfig) else []
     return f"'{full_key}' is not a key of the configuration; {nearest(last, known)}."
+
+
+def plain_command(
+    own: dict[str, str | None], main: Callable[[dict[str, str], list[str]], int | None]
+) -> Callable[[], None]:
+    """Make `main` a command on something stored: ``key=value`` arguments, no configuration file.
+
+    Args:
+        own: the command's keys with their defaults; None: must be given.
+        main: gets the values by key, and all other ``key=value`` arguments as Hydra overrides.
+
+    Returns:
+        function without arguments that leaves by ``sys.exit``.
+    """
+
+    def entry() -> None:
+        arguments = sys.argv[1:]
+        if any(item in ("-h", "--help") for item in arguments):
+            usage = " ".join(f"{k}=..." if v is None else f"[{k}={v}]" for k, v in own.items())
+            sys.stdout.write(f"{(main.__doc__ or '').strip()}\n\nusage: {usage} [overrides]\n")
+            sys.exit(0)
+        sys.exit(_report(lambda: main(*_split(own, arguments))))
+
+    return entry
+
+
+def _split(own: dict[str, str | None], arguments: list[str]) -> tuple[dict[str, str], list[str]]:
+    values = {key: value for key, value in own.items() if value is not None}
+    overrides = []
+    for item in arguments:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise InputError(f"'{item}': expected key=value; {nearest(key, own)}.")
+        if key in own:
+            values[key] = value
+        else:
+            overrides.append(item)
+    for key in own:
+        if key not in values:
+            raise InputError(f"'{key}' has no value; give one with {key}=...")
+    return values, overrides

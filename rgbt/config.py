@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pydantic
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -98,15 +97,19 @@ def check_node(node: DictConfig, path: str) -> None:
             _check_value(f"{path}.{key}", value, hints[key])
 
 
-def build(node: DictConfig, **extra: Any) -> Any:
+def build(node: DictConfig, **offered: Any) -> Any:
     """The object that a checked node describes.
 
     Args:
         node: mapping with `_target_`; nested nodes are built first.
-        extra: objects from elsewhere (a model for a scheme), passed beside the node's own values.
+        offered: objects from elsewhere (a network for a scheme); those that the constructor names
+            are passed beside the node's own values.
 
     Returns:
-        ``target(**values, **extra)``, values converted to the annotated types (lists to tuples).
+        the constructed object; values are converted to the annotated types (lists to tuples).
+
+    Raises:
+        InputError: a value that the constructor needs is not in the node.
     """
     path = node._get_full_key(None) or "config"
     target = _target(node, path)
@@ -115,7 +118,13 @@ def build(node: DictConfig, **extra: Any) -> Any:
     for key, value in _items(node, path):
         nested = isinstance(value, DictConfig) and "_target_" in value
         values[key] = build(value) if nested else _check_value(f"{path}.{key}", value, hints[key])
-    return target(**values, **extra)
+    parameters = inspect.signature(target).parameters
+    values |= {key: value for key, value in offered.items() if key in parameters}
+    needed = [key for key, parameter in parameters.items() if parameter.default is parameter.empty]
+    missing = [key for key in needed if key not in values]
+    if missing:
+        raise InputError(f"'{path}.{missing[0]}' has no value; {node['_target_']} needs it.")
+    return target(**values)
 
 
 def run_key(config: DictConfig) -> str:
@@ -185,6 +194,8 @@ def _items(node: DictConfig, path: str) -> Iterator[tuple[str, Any]]:
 
 def _check_value(path: str, value: Any, annotation: Any) -> Any:
     """`value` as the annotated type; as in JSON, a list may be a tuple and an int a float."""
+    import pydantic  # not at the top: --help does not need it
+
     plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
     try:
         return pydantic.TypeAdapter(annotation).validate_json(json.dumps(plain), strict=True)

@@ -1,13 +1,25 @@
-"""Train one configuration: ``python -m rgbt.run +experiment=grbm``."""
+"""Train one configuration: ``python -m rgbt.run +experiment=grbm``.
 
-from omegaconf import DictConfig
+The same command on the same configuration continues its run folder; a finished run shows its
+tables and stops.
+"""
 
-from rgbt.command import command
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rgbt.command import command, task_overrides
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 
 @command()
 def main(config: DictConfig) -> int:
-    print(config.seed)
+    """Train, evaluate the best checkpoint on the test split, show the tables."""
+    from rgbt.training import train  # torch and mlflow load here, after --help has been answered
+
+    train(config, task_overrides())
     return 0
 
 

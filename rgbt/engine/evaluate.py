@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
+from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -24,7 +25,7 @@ class Prediction(NamedTuple):
 def predictions(
     model: nn.Module,
     batches: Iterable[Batch],
-    device: torch.device,
+    fabric: Fabric,
     modality: str = "rgbt",
 ) -> Iterator[Prediction]:
     """Class maps at the resolution of the labels, batch by batch.
@@ -35,13 +36,13 @@ def predictions(
     Args:
         model: a network; put into evaluation mode here and left in it.
         batches: from `rgbt.data.loaders.eval_batches`.
-        device: where the network lies.
+        fabric: device and precision.
         modality: "rgbt", or "rgb" / "thermal" to decode one branch alone.
     """
     model.eval()
     for batch in batches:
-        moved = batch.to(device)
-        with torch.inference_mode():
+        moved = batch.to(fabric.device)
+        with torch.inference_mode(), fabric.autocast():
             output = model(moved.rgb, moved.thermal, views=(modality,))
             scores = output.logits.float()
             label_hw = batch.label.shape[-2:]

@@ -77,7 +77,7 @@ class Trainer:
         self.validate = validate
 
     def resume(self, state: State) -> bool:
-        """Take up model, optimizers and `state` from the last checkpoint; False if there is none."""
+        """Take up everything from the last checkpoint into `state`; False if there is none."""
         if not self.last.exists():
             return False
         payload = load_checkpoint(self.last)

@@ -15,7 +15,7 @@ from rgbt.checks import InputError
 from rgbt.types import Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
 
 VIEWS = ("rgbt", "rgb", "thermal")
-Distillation = Callable[[Tensor, Tensor], Tensor]
+Distillation = Callable[..., Tensor]
 
 
 class CRM:
@@ -32,7 +32,8 @@ class CRM:
         model: network with the argument `passes` and `views` of `rgbt.models.mask2former`.
         loss: criterion that returns one value per stacked pass.
         masker: draws the masks of the masked pass.
-        distillation: mean absolute difference of two sets of class logits, teacher first.
+        sdc: distillation of one student, (teacher, student) -> scalar.
+        sdn: distillation of two students, (teacher, rgb, thermal) -> scalar.
         modality_weight: w_m. 1 in the release.
         complementary_weight: w_c. 1 in the release.
         nonlocal_weight: w_n. 1 in the release.
@@ -47,7 +48,8 @@ class CRM:
         model: nn.Module,
         loss: Loss,
         masker: Masker,
-        distillation: Distillation,
+        sdc: Distillation,
+        sdn: Distillation,
         modality_weight: float,
         complementary_weight: float,
         nonlocal_weight: float,
@@ -55,12 +57,14 @@ class CRM:
         if masker.hides_nothing and (complementary_weight or nonlocal_weight):
             raise InputError(
                 "scheme=crm distils from a masked pass, but the masker hides nothing; choose "
-                "a masker (masker=crm) or set scheme.complementary_weight=0 scheme.nonlocal_weight=0."
+                "a masker (masker=crm) or set scheme.complementary_weight and "
+                "scheme.nonlocal_weight to 0."
             )
         self.model = model
         self.loss = loss
         self.masker = masker
-        self.distillation = distillation
+        self.sdc = sdc
+        self.sdn = sdn
         self.modality_weight = modality_weight
         self.complementary_weight = complementary_weight
         self.nonlocal_weight = nonlocal_weight
@@ -113,9 +117,8 @@ class CRM:
         terms = {}
         if self.complementary_weight:
             student = class_logits_PBQK[views]
-            terms["sdc"] = self.complementary_weight * self.distillation(teacher, student)
+            terms["sdc"] = self.complementary_weight * self.sdc(teacher, student)
         if self.nonlocal_weight:
             rgb, thermal = class_logits_PBQK[views + 1 :]
-            both = self.distillation(teacher, rgb) + self.distillation(teacher, thermal)
-            terms["sdn"] = self.nonlocal_weight * both
+            terms["sdn"] = self.nonlocal_weight * self.sdn(teacher, rgb, thermal)
         return terms

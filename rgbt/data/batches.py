@@ -1,0 +1,117 @@
+"""What the loader asks of a data set and a transform, and how examples become a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.types import Batch, Sample
+
+
+class Dataset(Protocol):
+    """Where samples come from (see `rgbt.data.mfnet.MFNet`)."""
+
+    name: str
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in order."""
+        ...
+
+    def read(self, name: str) -> Sample:
+        """One sample; InputError where it cannot be read."""
+        ...
+
+
+class Example(Protocol):
+    """A sample after the transform (see `rgbt.transforms.example.Example`)."""
+
+    @property
+    def rgb(self) -> NDArray[Any]:
+        """(H, W, 3), uint8 or float32, 0..255."""
+        ...
+
+    @property
+    def thermal(self) -> NDArray[Any]:
+        """(H, W), dtype and range of `rgb`."""
+        ...
+
+    @property
+    def label(self) -> NDArray[np.uint8]:
+        """(H', W') class indices."""
+        ...
+
+    @property
+    def centre_yx(self) -> tuple[int, int]:
+        """Pixel nearest to the centre of the original image."""
+        ...
+
+    @property
+    def position(self) -> NDArray[np.float32] | None:
+        """(2, H, W) row and column in the original image, or None."""
+        ...
+
+    @property
+    def original_hw(self) -> tuple[int, int]:
+        """Size of the original image."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Name in the split list."""
+        ...
+
+
+class Transform(Protocol):
+    """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
+
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example; every draw comes from `rng`."""
+        ...
+
+    def test(self, sample: Sample) -> Example:
+        """Example for evaluation, the same every time."""
+        ...
+
+
+def collate(examples: Sequence[Example], advice: str = "") -> Batch:
+    """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
+
+    Args:
+        examples: at least one, images all (H, W, 3) and labels all (H', W').
+        advice: ends the message where sizes differ; says which key to change.
+
+    Raises:
+        InputError: images or labels differ in size, naming the first two that do.
+    """
+    _check_sizes(examples, advice)
+    positions = [example.position for example in examples if example.position is not None]
+    rgb_BHWC = torch.from_numpy(np.stack([example.rgb for example in examples]))
+    thermal_BHW = torch.from_numpy(np.stack([example.thermal for example in examples]))
+    label = torch.from_numpy(np.stack([example.label for example in examples]))
+    return Batch(
+        rgb=rgb_BHWC.permute(0, 3, 1, 2).contiguous(),
+        thermal=thermal_BHW[:, None],
+        label=label.long(),
+        name=tuple(example.name for example in examples),
+        centre_yx=torch.tensor([example.centre_yx for example in examples]),
+        position=torch.from_numpy(np.stack(positions)) if positions else None,
+        original_hw=torch.tensor([example.original_hw for example in examples]),
+    )
+
+
+def _check_sizes(examples: Sequence[Example], advice: str) -> None:
+    first = examples[0]
+    for example in examples[1:]:
+        for what in ("rgb", "label"):
+            expected, found = getattr(first, what).shape[:2], getattr(example, what).shape[:2]
+            if found != expected:
+                raise InputError(
+                    f"all {what} images of one batch must have one size, got "
+                    f"{expected[0]}x{expected[1]} ('{first.name}') and {found[0]}x{found[1]} "
+                    f"('{example.name}'){advice}."
+                )

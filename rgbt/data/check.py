@@ -1,0 +1,87 @@
+"""Command that reads a whole data set and reports what it holds and what is wrong.
+
+    python -m rgbt.data.check dataset=mfnet dataset.root=...
+
+Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: problems, 2: wrong input.
+"""
+
+from __future__ import annotations
+
+import os
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from rgbt.checks import InputError
+from rgbt.command import command
+from rgbt.config import build
+from rgbt.data.mfnet import MFNet
+from rgbt.data.report import Report, SplitReport, check_dataset, num_listed
+
+WIDTH_WITHOUT_TERMINAL = 120
+
+
+@command()
+def main(config: DictConfig) -> int:
+    """Check ``config.dataset``; 1 where there are problems."""
+    dataset = build(config.dataset)
+    if not isinstance(dataset, MFNet):
+        raise InputError(
+            f"dataset: expected a data set in MFNet's layout, got {type(dataset).__name__}; choose "
+            "dataset=mfnet or dataset=synth."
+        )
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("reading", total=num_listed(dataset))
+        report = check_dataset(
+            dataset,
+            num_threads=os.cpu_count() or 1,
+            advance=lambda: progress.advance(task),
+        )
+    print_report(dataset, report)
+    return 1 if report.problems else 0
+
+
+def print_report(dataset: MFNet, report: Report) -> None:
+    """Write the report to stdout: two tables, then one line per note and per problem."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH_WITHOUT_TERMINAL)
+    console.print(f"{dataset.name} ({dataset.layout} layout): {dataset.root}", soft_wrap=True)
+    if report.splits:
+        console.print(split_table(report.splits))
+        console.print(class_table(report.splits, (*dataset.classes, "ignored")))
+    for kind, lines in (("note", report.notes), ("problem", report.problems)):
+        for line in lines:
+            console.print(f"{kind}: {line}", soft_wrap=True, markup=False, highlight=False)
+    console.print(f"{len(report.problems)} problem(s), {len(report.notes)} note(s).")
+
+
+def split_table(splits: tuple[SplitReport, ...]) -> Table:
+    """Numbers of names and sizes, one row per split."""
+    table = Table("split", "names", "read", "day", "night", "mirrored", "sizes")
+    for split in splits:
+        numbers = (split.num_names, split.num_read, split.num_day, split.num_night)
+        sizes = ", ".join(f"{h}x{w} ({count})" for (h, w), count in sorted(split.sizes.items()))
+        table.add_row(split.split, *map(str, (*numbers, split.num_flipped)), sizes)
+    return table
+
+
+def class_table(splits: tuple[SplitReport, ...], names: tuple[str, ...]) -> Table:
+    """Percent of pixels and number of images, one row per class."""
+    table = Table("class", *(f"{split.split} pixels (images)" for split in splits))
+    for index, name in enumerate(names):
+        cells = [_cell(split, index) for split in splits]
+        if name != "ignored" or any(split.images[index] for split in splits):
+            table.add_row(name, *cells)
+    return table
+
+
+def _cell(split: SplitReport, index: int) -> str:
+    share = split.pixels[index] / max(1, split.pixels.sum())
+    return f"{share:8.3%} ({split.images[index]})"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""Batches for training and evaluation, whatever the number of worker processes.
+
+Which samples a batch holds and how they are augmented follows from (seed, step) alone; workers only
+decide who decodes them. Batches are not padded: networks pad images and losses pad labels.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import torch
+from torch.utils.data import DataLoader
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.data.batches import Dataset, Transform
+from rgbt.data.reader import (
+    BatchReader,
+    EvalExamples,
+    Loaded,
+    Source,
+    TrainExamples,
+    start_worker,
+)
+from rgbt.randomness import numpy_generator
+from rgbt.types import Batch
+
+LOG = logging.getLogger(__name__)
+
+CROP_ADVICE = "; choose transform.crop_hw so that it fits into every resized image"
+EVAL_ADVICE = "; set data.eval_batch_size=1"
+
+
+@dataclass(frozen=True)
+class LoaderSettings:
+    """How samples are loaded.
+
+    Attributes:
+        batch_size: samples of a training batch, >= 1.
+        eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
+        num_workers: processes that decode and augment; 0 = the main process does.
+        on_error: "raise" stops at a file that cannot be read; "skip" names it once and takes the
+            next readable sample of the list instead (training) or leaves it out (evaluation).
+    """
+
+    batch_size: int
+    eval_batch_size: int
+    num_workers: int
+    on_error: Literal["raise", "skip"] = "raise"
+
+    def __post_init__(self) -> None:
+        check_range("data.batch_size", self.batch_size, 1, 2**20)
+        check_range("data.eval_batch_size", self.eval_batch_size, 1, 2**20)
+        check_range("data.num_workers", self.num_workers, 0, 2**10)
+        check_choice("data.on_error", self.on_error, ("raise", "skip"))
+
+
+class Batches(Iterator[Batch]):
+    """Batches in order, as `train_batches` and `eval_batches` make them.
+
+    Args:
+        reader: makes a batch of a list of keys.
+        keys: one list of keys per batch.
+        num_workers: processes that read.
+
+    Attributes:
+        skipped: name -> why it could not be read, of the samples left out so far.
+    """
+
+    def __init__(self, reader: BatchReader, *, keys: Iterable[list[Any]], num_workers: int):
+        self.skipped: dict[str, str] = {}
+        loader = DataLoader(
+            reader,
+            sampler=keys,
+            batch_size=None,  # a key stands for a whole batch
+            collate_fn=_unchanged,
+            num_workers=num_workers,
+            worker_init_fn=start_worker,
+            pin_memory=torch.cuda.is_available(),
+            # Without one of its own, the loader draws a seed for its workers from the global one.
+            generator=torch.Generator(),
+        )
+        self._loaded = cast(Iterator[Loaded], iter(loader))
+
+    def __next__(self) -> Batch:
+        """The next batch that holds at least one sample.
+
+        Raises:
+            InputError: a file cannot be read (on_error="raise"), or sizes differ within the batch.
+        """
+        while True:
+            loaded = next(self._loaded)
+            self._report(loaded.skipped)
+            if loaded.error:
+                self.close()
+                raise InputError(loaded.error)
+            if loaded.batch is not None:
+                return loaded.batch
+
+    def close(self) -> None:
+        """Stop the worker processes; nothing comes after it."""
+        # They leave at once when the loader's iterator goes; one that a traceback keeps alive is
+        # collected late, and its workers are then waited for.
+        self._loaded = iter(())
+
+    def _report(self, skipped: dict[str, str]) -> None:
+        for name, reason in skipped.items():
+            if name not in self.skipped:
+                LOG.warning("skipped '%s': %s", name, reason)
+        self.skipped.update(skipped)
+
+
+def train_batches(
+    dataset: Dataset,
+    split: str,
+    transform: Transform,
+    settings: LoaderSettings,
+    seed: int,
+    steps: range,
+) -> Batches:
+    """Augmented training batches of the global steps in `steps`.
+
+    Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
+    incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
+    So ``steps=range(10, 20)`` continues ``range(10)`` exactly.
+
+    Args:
+        dataset: where samples come from.
+        split: name of the split.
+        transform: its `train` makes the examples.
+        settings: batch size, workers, what to do about unreadable files.
+        seed: run seed.
+        steps: numbers of the batches, counted from the start of the run.
+
+    Raises:
+        InputError: the split is smaller than a batch, or, with on_error="skip", wholly unreadable.
+    """
+    per_epoch = steps_per_epoch(dataset, settings, split)
+    names = dataset.names(split)
+    source = Source(dataset, names, transform, settings.on_error == "skip")
+    return Batches(
+        BatchReader(TrainExamples(source, seed), CROP_ADVICE),
+        keys=_train_keys(len(names), settings.batch_size, per_epoch, seed, steps),
+        num_workers=settings.num_workers,
+    )
+
+
+def eval_batches(
+    dataset: Dataset, split: str, transform: Transform, settings: LoaderSettings
+) -> Batches:
+    """Every sample of the split once, in the order of its list.
+
+    Args:
+        dataset: where samples come from.
+        split: name of the split.
+        transform: its `test` makes the examples.
+        settings: evaluation batch size, workers, what to do about unreadable files.
+    """
+    names = dataset.names(split)
+    source = Source(dataset, names, transform, settings.on_error == "skip")
+    size = settings.eval_batch_size
+    return Batches(
+        BatchReader(EvalExamples(source), EVAL_ADVICE),
+        keys=[list(names[start : start + size]) for start in range(0, len(names), size)],
+        num_workers=settings.num_workers,
+    )
+
+
+def steps_per_epoch(dataset: Dataset, settings: LoaderSettings, split: str = "train") -> int:
+    """Whole batches of one epoch, at least 1.
+
+    Raises:
+        InputError: the split is smaller than a batch.
+    """
+    size = len(dataset.names(split))
+    if size < settings.batch_size:
+        raise InputError(
+            f"data.batch_size is {settings.batch_size} but split '{split}' of {dataset.name} has "
+            f"only {size} names; lower data.batch_size."
+        )
+    return size // settings.batch_size
+
+
+def _train_keys(
+    size: int, batch_size: int, per_epoch: int, seed: int, steps: range
+) -> Iterator[list[tuple[int, int]]]:
+    """(epoch, index in the split) of every sample of every step."""
+    drawn = -1
+    order: list[int] = []
+    for step in steps:
+        epoch, position = divmod(step, per_epoch)
+        if epoch != drawn:
+            order = numpy_generator(seed, "order", epoch).permutation(size).tolist()
+            drawn = epoch
+        start = position * batch_size
+        yield [(epoch, index) for index in order[start : start + batch_size]]
+
+
+def _unchanged(loaded: Any) -> Any:
+    return loaded

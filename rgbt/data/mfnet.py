@@ -1,0 +1,222 @@
+"""MFNet and every data set in its layout: split lists, images, labels, day or night by name.
+
+A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.files import read_channels, read_label, read_packed
+from rgbt.types import Sample
+
+Layout = Literal["auto", "packed", "folders"]
+
+LAYOUTS = {"packed": ("images", "labels"), "folders": ("RGB", "Thermal", "Label")}
+"""Folders of each layout, beside the split lists; the last one holds the labels."""
+
+CLASSES = (
+    *("unlabeled", "car", "person", "bike", "curve"),
+    *("car_stop", "guardrail", "color_cone", "bump"),
+)
+PALETTE = (
+    *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
+    *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
+)
+SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
+FLIPPED = "_flip"
+"""Ending of the names of mirrored copies, which some copies of the data set write to disk."""
+
+
+def base_name(name: str) -> str:
+    """`name` without the ending of mirrored copies: "00001D_flip" -> "00001D"."""
+    return name.removesuffix(FLIPPED)
+
+
+class MFNet:
+    """RGB-thermal street scenes with labels, as the MFNet archive lays them out.
+
+    Layouts (NAME is a line of a split list, five digits and D for day or N for night):
+        packed:  images/NAME.png with channels R, G, B, thermal, and labels/NAME.png
+        folders: RGB/NAME.png, Thermal/NAME.png (one channel, or three equal ones), Label/NAME.png
+
+    A name NAME_flip is read from its own files where a list names it; nothing is mirrored here.
+
+    Source: MFNet (Ha et al., IROS 2017), archive ir_seg_dataset; the folders layout is the one of
+    the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
+    in the published tables); 255 is ignored.
+
+    Args:
+        root: folder that holds the split lists.
+        name: what the data set is called in messages and tables.
+        num_classes: number of classes; other nodes of the configuration interpolate it.
+        classes: their names, in order of the class index.
+        palette: their (red, green, blue) colours, 0..255.
+        splits: split -> list file in `root`; two splits may share one list.
+        layout: "packed", "folders", or "auto" for the one whose folders exist (packed first).
+
+    Raises:
+        InputError: no such root, no known layout, numbers of classes, names and colours differ.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        root: str,
+        *,
+        name: str = "mfnet",
+        num_classes: int = len(CLASSES),
+        classes: tuple[str, ...] = CLASSES,
+        palette: tuple[tuple[int, int, int], ...] = PALETTE,
+        splits: dict[str, str] = SPLITS,
+        layout: Layout = "auto",
+    ) -> None:
+        self.root = Path(root).expanduser()
+        self.name = name
+        self.num_classes = num_classes
+        self.classes = classes
+        self.palette = palette
+        self.splits = dict(splits)
+        if not self.root.is_dir():
+            raise InputError(
+                f"dataset.root: there is no folder '{root}'; give the one that holds "
+                f"{_either_layout()} and the split lists."
+            )
+        for key, length in (("classes", len(classes)), ("palette", len(palette))):
+            if length != num_classes:
+                raise InputError(
+                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                    "make them agree."
+                )
+        self.layout = _find_layout(self.root, layout)
+        self._names: dict[str, tuple[str, ...]] = {}
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in the order of its list.
+
+        Raises:
+            InputError: unknown split, missing or empty list.
+        """
+        if split not in self._names:
+            self._names[split] = self._read_list(split)
+        return self._names[split]
+
+    def read(self, name: str) -> Sample:
+        """The triple called `name`, decoded.
+
+        Returns:
+            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
+
+        Raises:
+            InputError: a file is missing, cannot be decoded, has other channels, bits or size than
+                expected, or the label holds a value that is neither a class nor 255.
+        """
+        label = read_label(self.label_path(name), self.num_classes)
+        rgb, thermal = self._read_images(name)
+        if rgb.shape[:2] != label.shape:
+            raise InputError(
+                f"'{name}': the image is {rgb.shape[0]}x{rgb.shape[1]} pixels but its label is "
+                f"{label.shape[0]}x{label.shape[1]}; both must have one size, see "
+                f"{self.label_path(name)}."
+            )
+        return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+
+    def is_night(self, name: str) -> bool:
+        """Whether the letter before the ending says night (N) and not day (D).
+
+        Raises:
+            InputError: the name ends in neither letter.
+        """
+        letter = base_name(name)[-1:]
+        if letter not in ("D", "N"):
+            raise InputError(
+                f"'{name}' does not say whether it is day or night: expected a name that ends in D "
+                f"or N (before '{FLIPPED}'); rename it in the split lists of {self.root}."
+            )
+        return letter == "N"
+
+    def fingerprint(self) -> str:
+        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+
+        Nothing is decoded and the root is left out, so that equal copies have equal fingerprints.
+        Splits without a list and files that are missing count as such.
+        """
+        digest = hashlib.sha256()
+        for split in sorted(self.splits):
+            names = self.names(split) if self.list_path(split).is_file() else ()
+            digest.update(f"{split} {len(names)}\n".encode())
+            for name in names:
+                paths = (*self.image_paths(name), self.label_path(name))
+                sizes = [path.stat().st_size if path.is_file() else -1 for path in paths]
+                digest.update(f"{name} {sizes}\n".encode())
+        return digest.hexdigest()
+
+    def list_path(self, split: str) -> Path:
+        """The list file of `split`; InputError where the split is unknown."""
+        if split not in self.splits:
+            raise InputError(
+                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
+            )
+        return self.root / self.splits[split]
+
+    def image_paths(self, name: str) -> tuple[Path, ...]:
+        """The packed image of `name`, or its RGB and its thermal image."""
+        *folders, _ = LAYOUTS[self.layout]
+        return tuple(self.root / folder / f"{name}.png" for folder in folders)
+
+    def label_path(self, name: str) -> Path:
+        """The label of `name`."""
+        return self.root / LAYOUTS[self.layout][-1] / f"{name}.png"
+
+    def names_on_disk(self) -> frozenset[str]:
+        """Names of all PNG files in the folders of images and labels, listed or not."""
+        folders = [self.root / folder for folder in LAYOUTS[self.layout]]
+        return frozenset(path.stem for folder in folders for path in folder.glob("*.png"))
+
+    def _read_list(self, split: str) -> tuple[str, ...]:
+        path = self.list_path(split)
+        if not path.is_file():
+            raise InputError(
+                f"dataset.splits.{split}: there is no list '{path}'; write it (one name per line), "
+                f"or name another list with dataset.splits.{split}=..."
+            )
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        names = tuple(line.strip() for line in lines if line.strip())
+        if not names:
+            raise InputError(
+                f"dataset.splits.{split}: the list '{path}' is empty; expected one name per line."
+            )
+        return names
+
+    def _read_images(self, name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        paths = self.image_paths(name)
+        if self.layout == "packed":
+            return read_packed(paths[0])
+        rgb, thermal = read_channels(*paths)
+        if rgb.shape[:2] != thermal.shape:
+            raise InputError(
+                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but thermal is "
+                f"{thermal.shape[0]}x{thermal.shape[1]}; both must have one size, see {paths[1]}."
+            )
+        return rgb, thermal
+
+
+def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:
+    for layout in ("packed", "folders"):
+        folders_exist = all((root / folder).is_dir() for folder in LAYOUTS[layout])
+        if wanted in ("auto", layout) and folders_exist:
+            return layout
+    expected = _either_layout() if wanted == "auto" else "+".join(LAYOUTS[wanted])
+    raise InputError(
+        f"dataset.root: '{root}' does not hold the folders {expected}; give the folder of the "
+        "data set itself."
+    )
+
+
+def _either_layout() -> str:
+    return " or ".join("+".join(folders) for folders in LAYOUTS.values())

@@ -1,0 +1,146 @@
+"""What a worker process does: read the samples of one batch, transform them, stack them.
+
+Part of `rgbt.data.loaders`, which decides what each batch holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import cv2
+from torch import Tensor
+from torch.utils.data import Dataset as TorchDataset
+
+from rgbt.checks import InputError
+from rgbt.data.batches import Dataset, Example, Transform, collate
+from rgbt.randomness import numpy_generator
+from rgbt.types import Batch, Sample
+
+MakeExample = Callable[[Any, dict[str, str]], Example | None]
+"""(key, skipped) -> example, or None where it is left out; notes unreadable names in `skipped`."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Samples of one split and what is done to them.
+
+    Attributes:
+        dataset: reads samples.
+        names: the split.
+        transform: makes examples.
+        skip_errors: note a sample that cannot be read instead of raising.
+    """
+
+    dataset: Dataset
+    names: tuple[str, ...]
+    transform: Transform
+    skip_errors: bool
+
+    def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
+        """The sample; None, with the reason in `skipped`, where it is to be skipped."""
+        try:
+            return self.dataset.read(name)
+        except InputError as error:
+            if not self.skip_errors:
+                raise
+            skipped[name] = str(error)
+            return None
+
+
+@dataclass(frozen=True)
+class TrainExamples:
+    """Augmented examples; a key is (epoch, index in the split)."""
+
+    source: Source
+    seed: int
+
+    def __call__(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
+        """The example of `key`, or of the next readable sample of the list.
+
+        Raises:
+            InputError: no sample of the split can be read.
+        """
+        epoch, index = key
+        names = self.source.names
+        rng = numpy_generator(self.seed, "augment", epoch, index)
+        for name in (*names[index:], *names[:index]):
+            sample = self.source.read(name, skipped)
+            if sample is not None:
+                return self.source.transform.train(sample, rng)
+        raise InputError(
+            f"none of the {len(names)} training samples of {self.source.dataset.name} can be read; "
+            f"the first one: {skipped[names[0]]}"
+        )
+
+
+@dataclass(frozen=True)
+class EvalExamples:
+    """Examples for evaluation; a key is a name."""
+
+    source: Source
+
+    def __call__(self, key: str, skipped: dict[str, str]) -> Example | None:
+        """The example of `key`, or None where it cannot be read."""
+        sample = self.source.read(key, skipped)
+        return None if sample is None else self.source.transform.test(sample)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What a worker hands back.
+
+    Attributes:
+        batch: None where every sample was left out, or after an error.
+        skipped: name -> why it could not be read.
+        error: message of an InputError; it travels as text because torch wraps exceptions of
+            workers into others.
+    """
+
+    batch: Batch | None = None
+    skipped: dict[str, str] = field(default_factory=dict)
+    error: str = ""
+
+    def pin_memory(self) -> Loaded:
+        """Called by the loader's own thread, so that copies to the device need not wait."""
+        return self if self.batch is None else replace(self, batch=_pinned(self.batch))
+
+
+class BatchReader(TorchDataset[Loaded]):
+    """Makes the batch of a list of keys.
+
+    Args:
+        make_example: called once per key.
+        advice: ends the message where sizes within a batch differ.
+    """
+
+    def __init__(self, make_example: MakeExample, advice: str):
+        self.make_example = make_example
+        self.advice = advice
+
+    def __getitem__(self, keys: list[Any]) -> Loaded:
+        """The batch of `keys`, without the samples that are left out."""
+        skipped: dict[str, str] = {}
+        try:
+            found = [self.make_example(key, skipped) for key in keys]
+            examples = [example for example in found if example is not None]
+            batch = collate(examples, self.advice) if examples else None
+        except InputError as error:
+            return Loaded(skipped=skipped, error=str(error))
+        return Loaded(batch, skipped)
+
+
+def start_worker(_: int) -> None:
+    """Settings of a worker process."""
+    # The processes are the parallelism; threads of OpenCV beside them only get in each other's way.
+    cv2.setNumThreads(0)
+
+
+def _pinned(batch: Batch) -> Batch:
+    pinned: dict[str, Any] = {}
+    for each in fields(batch):
+        value = getattr(batch, each.name)
+        if isinstance(value, Tensor):
+            pinned[each.name] = value.pin_memory()
+    return replace(batch, **pinned)

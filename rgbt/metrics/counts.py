@@ -1,0 +1,147 @@
+"""Counts of a split: the file of a run that every score and table is recomputed from."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, nearest
+from rgbt.metrics.names import DAY, NIGHT
+
+FORMAT = "rgbt counts 1"
+"""Written into every file; another number means another layout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """How often each class was predicted as which, per image and region.
+
+    Attributes:
+        counts: (N, R, K, K) int32 or int64, rows = label, columns = prediction.
+        names: names of the N images.
+        night: whether each image was taken at night; None where the data set does not say.
+        classes: names of the K classes.
+        partition: name of the regions, e.g. "ring5" (`rgbt.metrics.metric.Regions.name`).
+        dataset: fingerprint of the data set.
+        split: split that the images come from.
+
+    Raises:
+        ValueError: the lengths do not agree.
+    """
+
+    counts: NDArray[np.integer]
+    names: tuple[str, ...]
+    night: tuple[bool, ...] | None
+    classes: tuple[str, ...]
+    partition: str
+    dataset: str
+    split: str
+
+    def __post_init__(self) -> None:
+        shape = self.counts.shape
+        classes = len(self.classes)
+        if len(shape) != 4 or shape[0] != len(self.names) or shape[2:] != (classes, classes):
+            raise ValueError(
+                f"counts: expected shape N={len(self.names)} x R x K={classes} x K={classes}, "
+                f"got {shape}."
+            )
+        if self.night is not None and len(self.night) != len(self.names):
+            raise ValueError(
+                f"night: expected {len(self.names)} values, one per image, got {len(self.night)}."
+            )
+
+    def by_region(self) -> NDArray[np.int64]:
+        """(R, K, K): all images together."""
+        summed: NDArray[np.int64] = self.counts.sum(0, dtype=np.int64)
+        return summed
+
+    def whole(self) -> NDArray[np.int64]:
+        """(K, K): all images, whole image (the regions cover every pixel once)."""
+        summed: NDArray[np.int64] = self.counts.sum((0, 1), dtype=np.int64)
+        return summed
+
+    def select(self, names: Iterable[str]) -> Counts:
+        """The counts of the images called `names`, in that order.
+
+        Raises:
+            InputError: a name that is not among the counted images.
+        """
+        index_of = {name: index for index, name in enumerate(self.names)}
+        wanted = tuple(names)
+        for name in wanted:
+            if name not in index_of:
+                raise InputError(
+                    f"image '{name}' is not among the {len(self.names)} counted images of split "
+                    f"'{self.split}'; {nearest(name, self.names[:20])}."
+                )
+        return self._take([index_of[name] for name in wanted])
+
+    def parts(self) -> dict[str, Counts]:
+        """Day and night, as far as the data set tells them apart and the split holds both."""
+        if self.night is None or len(set(self.night)) < 2:
+            return {}
+        at_night = np.array(self.night)
+        chosen = {DAY: np.flatnonzero(~at_night), NIGHT: np.flatnonzero(at_night)}
+        return {part: self._take(indices.tolist()) for part, indices in chosen.items()}
+
+    def save(self, path: Path) -> None:
+        """Write one compressed file under a temporary name, then rename: never half a file."""
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        # Missing is stored as no value at all: npz without pickles knows no None.
+        values["night"] = np.array(self.night if self.night is not None else (), dtype=bool)
+        with partial.open("wb") as stream:
+            np.savez_compressed(stream, format=np.array(FORMAT), **values)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Counts:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: no such file, or not a file of counts.
+        """
+        values = _read(path)
+        return cls(
+            counts=values["counts"],
+            names=tuple(values["names"].tolist()),
+            night=tuple(values["night"].tolist()) or None,
+            classes=tuple(values["classes"].tolist()),
+            partition=str(values["partition"]),
+            dataset=str(values["dataset"]),
+            split=str(values["split"]),
+        )
+
+    def _take(self, indices: list[int]) -> Counts:
+        night = None if self.night is None else tuple(self.night[index] for index in indices)
+        names = tuple(self.names[index] for index in indices)
+        return replace(self, counts=self.counts[indices], names=names, night=night)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(f"there is no file of counts '{path}'; evaluate the run to write it.")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {key: stored[key] for key in stored.files}
+    # TypeError: a lone array of NumPy's other format opens, but is no archive.
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"'{path}' is not a readable file of counts; evaluate the run again."
+        ) from error
+    if str(values.get("format")) != FORMAT:
+        raise InputError(
+            f"'{path}' is no file of counts: expected the mark '{FORMAT}', got "
+            f"'{values.get('format')}'; evaluate the run again."
+        )
+    return values

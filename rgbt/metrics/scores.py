@@ -1,0 +1,180 @@
+"""Scores from counts, and from nothing else.
+
+Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (regions, images) are
+kept. Scores are fractions 0..1; variances are in squared percent points, as the papers print them.
+
+A class without a pixel to count (0 / 0) scores, by `absent`:
+    "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables.
+    "exclude":  NaN and is left out of means, as in the RTFNet and Temporal releases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+
+Scores = NDArray[np.float64]
+Matrices = NDArray[np.integer]
+ClassScore = Callable[[Matrices, Absent], Scores]
+
+
+def iou(counts: Matrices, absent: Absent) -> Scores:
+    """Intersection over union of each class: ``TP / (TP + FP + FN)``.
+
+    Source: SpatialSeg, Eq. 18; CRM, RTFNet and Temporal releases.
+
+    Args:
+        counts: (..., K, K).
+        absent: see the module docstring.
+
+    Returns:
+        (..., K).
+    """
+    right, labelled, predicted = _sums(counts)
+    return _ratio(right, labelled + predicted - right, absent)
+
+
+def recall(counts: Matrices, absent: Absent) -> Scores:
+    """``TP / (TP + FN)`` of each class, "Acc" in the papers' tables. Shapes as in `iou`."""
+    right, labelled, _ = _sums(counts)
+    return _ratio(right, labelled, absent)
+
+
+def precision(counts: Matrices, absent: Absent) -> Scores:
+    """``TP / (TP + FP)`` of each class. Shapes as in `iou`."""
+    right, _, predicted = _sums(counts)
+    return _ratio(right, predicted, absent)
+
+
+def f1(counts: Matrices, absent: Absent) -> Scores:
+    """``2 TP / (2 TP + FP + FN)`` of each class. Shapes as in `iou`.
+
+    Released (Temporal): from precision and recall, hence NaN also for a class that is there and
+    never found right; here that is 0 under both settings.
+    """
+    right, labelled, predicted = _sums(counts)
+    return _ratio(2 * right, labelled + predicted, absent)
+
+
+def class_mean(scores: Scores) -> Scores:
+    """Mean over the last dimension without NaN; NaN where nothing is left.
+
+    Args:
+        scores: (..., K).
+
+    Returns:
+        (...).
+    """
+    known = ~np.isnan(scores)
+    total = np.where(known, scores, 0.0).sum(-1)
+    return _divide(total, known.sum(-1), np.nan)
+
+
+def miou(counts: Matrices, absent: Absent) -> Scores:
+    """Mean over all classes, background included, of `iou`.
+
+    For the mIoU of the tables pass the counts of the whole image, regions summed.
+
+    Args:
+        counts: (..., K, K).
+        absent: see the module docstring.
+
+    Returns:
+        (...).
+    """
+    return class_mean(iou(counts, absent))
+
+
+def variance(region_scores: ArrayLike) -> float:
+    """Population variance over regions, in squared percent points.
+
+        10^4 / R  sum_r (s_r - mean s)^2
+
+    Source: SpatialSeg, Eq. 19.
+
+    Args:
+        region_scores: (R,) fractions; regions that are NaN (no class to score) are left out.
+
+    Returns:
+        >= 0; NaN where every region is NaN.
+    """
+    scores = np.asarray(region_scores, dtype=np.float64)
+    scores = scores[~np.isnan(scores)]
+    return float(np.var(100 * scores)) if scores.size else float("nan")
+
+
+def pixel_accuracy(counts: Matrices) -> Scores:
+    """Share of the valid pixels that are right; NaN without any.
+
+    Args:
+        counts: (..., K, K).
+
+    Returns:
+        (...).
+    """
+    right, labelled, _ = _sums(counts)
+    return _divide(right.sum(-1), labelled.sum(-1), np.nan)
+
+
+def summary(counts: Counts, absent: Absent) -> dict[str, float]:
+    """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
+
+    Over all images: means over classes, variance over regions, mIoU of each region, IoU of each
+    class; mIoU and variance again for day and for night where the data set tells them apart.
+
+    Args:
+        counts: of one split, one image or more.
+        absent: see the module docstring.
+
+    Returns:
+        name -> fraction, or squared percent points for the variance. NaN: nothing to score.
+    """
+    whole = counts.whole()
+    by_class = iou(whole, absent)
+    result = _mean_and_variance(counts, absent)
+    result |= {
+        names.MACC: float(class_mean(recall(whole, absent))),
+        names.MPRECISION: float(class_mean(precision(whole, absent))),
+        names.MF1: float(class_mean(f1(whole, absent))),
+        names.PIXEL_ACCURACY: float(pixel_accuracy(whole)),
+    }
+    for number, score in enumerate(miou(counts.by_region(), absent), start=1):
+        result[names.region(number)] = float(score)
+    for name, score in zip(counts.classes, by_class, strict=True):
+        result[names.class_iou(name)] = float(score)
+    for part, subset in counts.parts().items():
+        for name, value in _mean_and_variance(subset, absent).items():
+            result[names.subset(part, name)] = value
+    return result
+
+
+def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
+    return {
+        names.MIOU: float(miou(counts.whole(), absent)),
+        names.VAR: variance(miou(counts.by_region(), absent)),
+    }
+
+
+def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
+    """Right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K) each."""
+    right = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
+    labelled = counts.sum(-1, dtype=np.float64)
+    predicted = counts.sum(-2, dtype=np.float64)
+    return right, labelled, predicted
+
+
+def _ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
+    return _divide(part, whole, 0.0 if absent == "released" else np.nan)
+
+
+def _divide(part: Scores, whole: NDArray[np.generic], undefined: float) -> Scores:
+    """``part / whole``, and `undefined` where the denominator is 0."""
+    quotient: Scores = np.full(np.shape(part), undefined)
+    np.divide(part, whole, out=quotient, where=np.asarray(whole) > 0)
+    return quotient

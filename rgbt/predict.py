@@ -1,0 +1,96 @@
+"""Predict images with a stored run: ``python -m rgbt.predict run=... input=... out=folder``.
+
+For every image a colour overlay and a PNG of class indices are written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError, check_choice
+from rgbt.command import plain_command
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rgbt.session import Session
+    from rgbt.types import Sample
+
+OWN = {"run": None, "input": None, "out": None, "runs_dir": "runs", "modality": "rgbt"}
+
+
+def main(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Write NAME_overlay.png and NAME.png (class indices, 0..K-1) for every input image.
+
+    run       run folder, config key or MLflow run id
+    input     a 4-channel PNG (R, G, B, thermal), a folder of such, or a split of the data set
+    out       folder, made where it is missing
+    modality  rgbt, or rgb / thermal to decode one branch alone
+    overrides such as dataset=mfnet dataset.root=/data/MFNet
+    """
+    import cv2
+    import numpy as np
+
+    from rgbt.engine.evaluate import MODALITIES
+    from rgbt.engine.progress import progress
+    from rgbt.stored import find_run, open_run
+    from rgbt.tracking.pictures import overlay
+
+    check_choice("modality", arguments["modality"], MODALITIES)
+    session = open_run(find_run(arguments["run"], Path(arguments["runs_dir"])), overrides)
+    samples, total = _samples(session, arguments["input"])
+    out = Path(arguments["out"])
+    out.mkdir(parents=True, exist_ok=True)
+    palette = np.array(session.dataset.palette, np.uint8)
+    with progress() as display:
+        task = display.add_task("predicting", total=total, note="images")
+        for sample, classes in _classes(session, samples, arguments["modality"]):
+            painted = overlay(sample.rgb, classes, palette)
+            cv2.imwrite(str(out / f"{sample.name}_overlay.png"), painted[..., ::-1])
+            cv2.imwrite(str(out / f"{sample.name}.png"), classes)
+            display.advance(task)
+    print(f"{total} images in {out.resolve()}")
+    return 0
+
+
+def _classes(
+    session: Session, samples: Iterable[Sample], modality: str
+) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
+    from rgbt.data.batches import collate
+    from rgbt.engine.evaluate import predictions
+
+    for sample in samples:
+        # One image at a time: a folder may hold images of any size.
+        batch = collate([session.transform.test(sample)], "")
+        for found in predictions(session.model, [batch], session.fabric, modality):
+            yield sample, found.classes[0].numpy()
+
+
+def _samples(session: Session, source: str) -> tuple[Iterator[Sample], int]:
+    """The images that `source` names, and how many they are."""
+    from rgbt.data.files import read_packed
+    from rgbt.types import Sample
+
+    dataset, path = session.dataset, Path(source)
+    if source in dataset.splits:
+        names = dataset.names(source)
+        return (dataset.read(name) for name in names), len(names)
+    files = sorted(path.glob("*.png")) if path.is_dir() else [path]
+    if not path.exists() or not files:
+        raise InputError(
+            f"input={source}: expected a 4-channel PNG, a folder that holds some, or a split of "
+            f"{dataset.name} ({', '.join(dataset.splits)})."
+        )
+
+    def read(file: Path) -> Sample:
+        rgb, thermal = read_packed(file)
+        return Sample(rgb=rgb, thermal=thermal, label=None, name=file.stem)
+
+    return map(read, files), len(files)
+
+
+if __name__ == "__main__":
+    plain_command(OWN, main)()

@@ -1,0 +1,181 @@
+"""The objects of a run made from its configuration, and the evaluation that all commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from omegaconf import DictConfig
+from torch import nn
+
+from rgbt.checks import InputError
+from rgbt.config import build
+from rgbt.data.loaders import LoaderSettings, eval_batches
+from rgbt.data.mfnet import MFNet
+from rgbt.engine.allocator import keep_memory
+from rgbt.engine.evaluate import predictions
+from rgbt.engine.progress import progress
+from rgbt.engine.settings import TrainerSettings
+from rgbt.metrics import scores
+from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Regions
+from rgbt.randomness import derive
+from rgbt.tracking.pictures import Example
+from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+
+
+@dataclass(frozen=True)
+class Session:
+    """What every command needs, built once.
+
+    Attributes:
+        config: the composed configuration, checked.
+        dataset: where samples come from.
+        transform: makes examples of them.
+        loading: batch sizes, workers, what to do about unreadable files.
+        regions: partition of the image and the rule for absent classes.
+        trainer: durations, precision, device.
+        fabric: device and precision.
+        model: the network, on the device, not wrapped.
+    """
+
+    config: DictConfig
+    dataset: MFNet
+    transform: Any
+    loading: LoaderSettings
+    regions: Regions
+    trainer: TrainerSettings
+    fabric: Fabric
+    model: nn.Module
+
+
+def open_session(config: DictConfig) -> Session:
+    """Build data set, transform and network; nothing is trained or evaluated yet.
+
+    Weights are drawn from (seed, "weights") without touching the global generator.
+    """
+    keep_memory()
+    trainer: TrainerSettings = build(config.trainer)
+    if trainer.threads is not None:
+        torch.set_num_threads(trainer.threads)
+    fabric = Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive(config.seed, "weights"))
+        model: nn.Module = build(config.model)
+    return Session(
+        config=config,
+        dataset=build(config.dataset),
+        transform=build(config.transform),
+        loading=build(config.data),
+        regions=build(config.metric),
+        trainer=trainer,
+        fabric=fabric,
+        model=model.to(fabric.device),
+    )
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Counts of one split, and the images that were asked to be kept.
+
+    Attributes:
+        counts: per image and region.
+        kept: examples for pictures.
+        skipped: names of unreadable files that were left out.
+    """
+
+    counts: Counts
+    kept: tuple[Example, ...]
+    skipped: tuple[str, ...]
+
+
+def evaluate(
+    session: Session,
+    model: nn.Module,
+    split: str,
+    *,
+    modality: str = "rgbt",
+    keep: Collection[str] = (),
+) -> Evaluation:
+    """Predict a split and count, with a progress bar.
+
+    Args:
+        session: see `open_session`.
+        model: the network to evaluate; left in evaluation mode.
+        split: name of the split.
+        modality: "rgbt", or one branch alone.
+        keep: names of the images to return for pictures.
+
+    Raises:
+        InputError: a file cannot be read (data.on_error=raise), or none could be.
+    """
+    dataset = session.dataset
+    batches = eval_batches(dataset, split, session.transform, session.loading)
+    counter = RegionCounter(len(dataset.classes), session.regions)
+    counted: dict[str, np.ndarray] = {}
+    kept: list[Example] = []
+    with progress() as display:
+        task = display.add_task(split, total=len(dataset.names(split)), note="images")
+        for found in predictions(model, batches, session.fabric, modality):
+            for index, name in enumerate(found.batch.name):
+                label, classes = found.batch.label[index], found.classes[index]
+                counted[name] = counter(label, classes)
+                if name in keep:
+                    kept.append(_example(session, name, classes.numpy()))
+            display.advance(task, len(found.batch.name))
+    if not counted:
+        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
+    counts = Counts(
+        counts=np.stack(list(counted.values())).astype(np.int32),
+        names=tuple(counted),
+        night=tuple(dataset.is_night(name) for name in counted),
+        classes=dataset.classes,
+        partition=session.regions.name,
+        dataset=dataset.fingerprint(),
+        split=split,
+    )
+    return Evaluation(counts, tuple(kept), tuple(batches.skipped))
+
+
+def _example(session: Session, name: str, classes: np.ndarray) -> Example:
+    sample = session.dataset.read(name)
+    label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
+    return Example(name, sample.rgb, sample.thermal, label, classes)
+
+
+def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
+    """The tables of one evaluation, from its counts alone.
+
+    Args:
+        counts: of the split.
+        regions: partition of the counts and the rule for absent classes.
+        label: what the row stands for, e.g. "grbm".
+        step: optimiser steps done.
+    """
+    absent = regions.absent
+    whole, by_region = counts.whole(), counts.by_region()
+    region_ious = scores.miou(by_region, absent)
+    parts = {part: scores.miou(sub.whole(), absent) for part, sub in counts.parts().items()}
+    return ResultTables(
+        split=counts.split,
+        step=step,
+        region_names=tuple(f"{regions.partition}_{n + 1}" for n in range(len(by_region))),
+        regions=RegionTable(
+            row_label=label,
+            region_ious=tuple(map(float, region_ious)),
+            miou=float(scores.miou(whole, absent)),
+            variance=scores.variance(region_ious),
+        ),
+        classes=ClassTable(
+            names=counts.classes,
+            ious=tuple(map(float, scores.iou(whole, absent))),
+            accuracies=tuple(map(float, scores.recall(whole, absent))),
+            region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
+            subset_mious={part: float(value) for part, value in parts.items()},
+        ),
+    )

@@ -1,0 +1,162 @@
+"""The augmentation chain of CRM and SpatialSeg: resize, crop, colour, flip.
+
+What a configuration names. Results are not padded: networks pad images to a multiple of 32 with
+their mean colour, and losses pad labels with "ignore" (`rgbt.geometry`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.transforms.example import Example
+from rgbt.transforms.joint import View, draw_view, short_edge_hw, whole_view
+from rgbt.transforms.photometric import ColourJitter
+from rgbt.types import IGNORE, Sample
+
+
+class CrmTransform:
+    """Resizes the short edge to a drawn length, crops, jitters colours, flips.
+
+    Source: CRM, Sec. 4.1 (implementation details), and the dataset mapper of its release;
+    SpatialSeg uses the same chain.
+    Paper: random crop, colour jitter and horizontal flip of ordinary 8-bit images:
+        ``colour="intended"``. Images stay uint8 and are resized as such (rounded).
+    Released: images are float32 before resizing, which changes what the colour steps do
+        (`ColourJitter.rgb`): ``colour="released"``. Values between steps are not rounded.
+    Both resize bilinearly with half-pixel centres and without antialiasing, and labels by nearest.
+
+    Args:
+        sizes: short edges in pixels, one is drawn with equal odds; None keeps the size of the file.
+        max_size: limit of the long edge in pixels, which wins over `sizes`; None for no limit.
+        crop_hw: size of the crop, clipped to the resized image; None takes all of it.
+        flip_probability: in [0, 1].
+        colour: "intended" (uint8 images) or "released" (float32 images).
+        colour_probability: of each colour change; 0 for none.
+        brightness_delta: largest change, grey levels.
+        contrast_range: (low, high) factor for RGB.
+        saturation_range: (low, high) factor.
+        hue_delta: largest change, in OpenCV's hue units.
+        thermal_contrast_range: (low, high) factor for thermal.
+        test_short_edge: short edge of evaluated images in pixels; labels keep the size of the
+            file. None keeps the images as well.
+        track_position: whether examples carry the map of source positions.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        *,
+        sizes: tuple[int, ...] | None,
+        max_size: int | None,
+        crop_hw: tuple[int, int] | None,
+        flip_probability: float,
+        colour: Literal["intended", "released"],
+        colour_probability: float,
+        brightness_delta: float,
+        contrast_range: tuple[float, float],
+        saturation_range: tuple[float, float],
+        hue_delta: int,
+        thermal_contrast_range: tuple[float, float],
+        test_short_edge: int | None,
+        track_position: bool,
+    ) -> None:
+        self.sizes = sizes
+        self.max_size = max_size
+        self.crop_hw = crop_hw
+        self.flip_probability = flip_probability
+        self.dtype = np.uint8 if colour == "intended" else np.float32
+        self.test_short_edge = test_short_edge
+        self.track_position = track_position
+        self.jitter = ColourJitter(
+            probability=colour_probability,
+            brightness_delta=brightness_delta,
+            contrast_range=contrast_range,
+            saturation_range=saturation_range,
+            hue_delta=hue_delta,
+            thermal_contrast_range=thermal_contrast_range,
+        )
+        check_choice("transform.colour", colour, ("intended", "released"))
+        check_range("transform.flip_probability", flip_probability, 0, 1)
+        self._check_lengths()
+
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example.
+
+        Args:
+            sample: as it lies on disk; without a label, all pixels are ignored.
+            rng: every draw comes from here.
+        """
+        source_hw = _hw(sample)
+        resized_hw = source_hw
+        if self.sizes is not None:
+            short_edge = int(rng.choice(self.sizes))
+            resized_hw = short_edge_hw(source_hw, short_edge, self.max_size)
+        crop_hw = self.crop_hw or resized_hw
+        view = draw_view(source_hw, resized_hw, crop_hw, self.flip_probability, rng)
+        # Colours change pixel by pixel, so that it does not matter that the flip comes before.
+        rgb = self.jitter.rgb(self._image(sample.rgb, view), rng)
+        thermal = self.jitter.thermal(self._image(sample.thermal, view), rng)
+        return self._example(sample, view, rgb, thermal, view.nearest(_label(sample)))
+
+    def test(self, sample: Sample) -> Example:
+        """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
+        source_hw = _hw(sample)
+        resized_hw = source_hw
+        if self.test_short_edge is not None:
+            resized_hw = short_edge_hw(source_hw, self.test_short_edge, self.max_size)
+        view = whole_view(source_hw, resized_hw)
+        rgb, thermal = self._image(sample.rgb, view), self._image(sample.thermal, view)
+        return self._example(sample, view, rgb, thermal, _label(sample))
+
+    def _image(self, image: NDArray[np.uint8], view: View) -> NDArray[Any]:
+        return view.bilinear(image, self.dtype)
+
+    def _example(
+        self,
+        sample: Sample,
+        view: View,
+        rgb: NDArray[Any],
+        thermal: NDArray[Any],
+        label: NDArray[np.uint8],
+    ) -> Example:
+        return Example(
+            rgb=rgb.astype(self.dtype, copy=False),
+            thermal=thermal.astype(self.dtype, copy=False),
+            label=label,
+            centre_yx=view.centre_yx(),
+            position=view.position() if self.track_position else None,
+            original_hw=view.source_hw,
+            name=sample.name,
+        )
+
+    def _check_lengths(self) -> None:
+        lengths = {
+            "sizes": self.sizes,
+            "max_size": (self.max_size,),
+            "crop_hw": self.crop_hw,
+            "test_short_edge": (self.test_short_edge,),
+        }
+        for key, values in lengths.items():
+            if values is None:
+                continue
+            if not values or any(value is not None and value < 1 for value in values):
+                raise InputError(
+                    f"transform.{key} must hold lengths of at least 1 pixel, got {list(values)}."
+                )
+
+
+def _hw(sample: Sample) -> tuple[int, int]:
+    height, width = sample.thermal.shape
+    return height, width
+
+
+def _label(sample: Sample) -> NDArray[np.uint8]:
+    if sample.label is None:
+        return np.full(_hw(sample), IGNORE, np.uint8)
+    return sample.label

@@ -1,0 +1,67 @@
+"""Small data sets on disk in the layouts of MFNet, with contents that follow from the name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbt.randomness import numpy_generator
+
+WriteMFNet = Callable[..., Path]
+
+
+def pair(name: str, hw: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """RGB, thermal, label of a name: noise that depends on the name alone."""
+    rng = numpy_generator(0, name)
+    rgb = rng.integers(0, 256, (*hw, 3), dtype=np.uint8)
+    thermal = rng.integers(0, 256, hw, dtype=np.uint8)
+    label = rng.integers(0, 9, hw, dtype=np.uint8)
+    return rgb, thermal, label
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image given as R, G, B[, T] or one channel."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if image.ndim == 3:
+        image = image[..., [2, 1, 0, *range(3, image.shape[2])]]
+    assert cv2.imwrite(str(path), np.ascontiguousarray(image))
+
+
+@pytest.fixture
+def write_mfnet(tmp_path: Path) -> WriteMFNet:
+    def write(
+        splits: Mapping[str, list[str]],
+        hw: tuple[int, int] = (24, 32),
+        layout: str = "packed",
+        folder: str = "mf",
+    ) -> Path:
+        root = tmp_path / folder
+        for split, names in splits.items():
+            root.mkdir(exist_ok=True)
+            (root / f"{split}.txt").write_text("\n".join(names) + "\n")
+            for name in names:
+                rgb, thermal, label = pair(name, hw)
+                if layout == "packed":
+                    write_png(root / "images" / f"{name}.png", np.dstack([rgb, thermal]))
+                    write_png(root / "labels" / f"{name}.png", label)
+                else:
+                    write_png(root / "RGB" / f"{name}.png", rgb)
+                    write_png(root / "Thermal" / f"{name}.png", thermal)
+                    write_png(root / "Label" / f"{name}.png", label)
+        return root
+
+    return write
+
+
+@pytest.fixture
+def expected_pair() -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    return pair
+
+
+@pytest.fixture
+def png() -> Callable[[Path, np.ndarray], None]:
+    return write_png

@@ -1,0 +1,297 @@
+from __future__ import annotations
+
+import dataclasses
+import logging
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.data.batches import collate
+from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
+from rgbt.data.mfnet import MFNet
+from rgbt.transforms.crm import CrmTransform
+from rgbt.types import Batch
+
+NAMES = [f"{number:05d}{'DN'[number % 2]}" for number in range(1, 11)]
+
+
+def crm(**changes: object) -> CrmTransform:
+    values: dict[str, object] = {
+        "sizes": (16, 24, 40),
+        "max_size": 1920,
+        "crop_hw": (12, 16),
+        "flip_probability": 0.5,
+        "colour": "intended",
+        "colour_probability": 0.5,
+        "brightness_delta": 32.0,
+        "contrast_range": (0.5, 1.5),
+        "saturation_range": (0.5, 1.5),
+        "hue_delta": 18,
+        "thermal_contrast_range": (0.5, 1.5),
+        "test_short_edge": None,
+        "track_position": True,
+    }
+    return CrmTransform(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def settings(**changes: object) -> LoaderSettings:
+    base = LoaderSettings(batch_size=4, eval_batch_size=3, num_workers=0)
+    return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def dataset(write_mfnet) -> MFNet:
+    return MFNet(str(write_mfnet({"train": NAMES, "val": NAMES[:5]})))
+
+
+def damage(dataset: MFNet, name: str) -> None:
+    dataset.image_paths(name)[0].write_bytes(b"damaged")
+
+
+def assert_equal(one: Batch, other: Batch) -> None:
+    for each in dataclasses.fields(Batch):
+        a, b = getattr(one, each.name), getattr(other, each.name)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
+
+
+def test_shapes_and_dtypes(dataset: MFNet) -> None:
+    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
+    assert batch.position is not None
+    shapes = [batch.rgb.shape, batch.thermal.shape, batch.label.shape, batch.position.shape]
+    assert [tuple(shape) for shape in shapes] == [
+        (4, 3, 12, 16),
+        (4, 1, 12, 16),
+        (4, 12, 16),
+        (4, 2, 12, 16),
+    ]
+    assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.uint8, torch.uint8)
+    assert (batch.label.dtype, batch.position.dtype) == (torch.int64, torch.float32)
+    assert (batch.centre_yx.dtype, batch.original_hw.dtype) == (torch.int64, torch.int64)
+    assert batch.original_hw.tolist() == [[24, 32]] * 4
+    assert batch.rgb.is_contiguous()
+
+
+def test_released_colours_are_float(dataset: MFNet) -> None:
+    transform = crm(colour="released", track_position=False)
+    batch = next(train_batches(dataset, "train", transform, settings(), 0, range(1)))
+    assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.float32, torch.float32)
+    assert batch.position is None
+
+
+def test_label_comes_from_the_position(dataset: MFNet, expected_pair) -> None:
+    """Through the whole chain, batch and all: label[crop] == label of the file[position]."""
+    for batch in train_batches(dataset, "train", crm(), settings(), 3, range(4)):
+        assert batch.position is not None
+        for index, name in enumerate(batch.name):
+            label = torch.from_numpy(expected_pair(name, (24, 32))[2]).long()
+            row, column = batch.position[index].long()
+            assert torch.equal(batch.label[index], label[row, column])
+
+
+def test_same_batches_whatever_the_workers(dataset: MFNet) -> None:
+    runs = [
+        list(train_batches(dataset, "train", crm(), settings(num_workers=n), 7, range(5)))
+        for n in (0, 1, 2)
+    ]
+    for one, *others in zip(*runs, strict=True):
+        for other in others:
+            assert_equal(one, other)
+
+
+def test_evaluation_does_not_depend_on_the_workers(dataset: MFNet) -> None:
+    runs = [list(eval_batches(dataset, "train", crm(), settings(num_workers=n))) for n in (0, 2)]
+    for one, other in zip(*runs, strict=True):
+        assert_equal(one, other)
+
+
+def test_starting_later_gives_the_same_batches(dataset: MFNet) -> None:
+    """Steps 3 and 4 lie in another epoch (two whole batches per epoch), with workers or without."""
+    whole = list(train_batches(dataset, "train", crm(), settings(), 7, range(6)))
+    for workers in (0, 2):
+        changed = settings(num_workers=workers)
+        late = list(train_batches(dataset, "train", crm(), changed, 7, range(3, 6)))
+        for one, other in zip(whole[3:], late, strict=True):
+            assert_equal(one, other)
+
+
+def test_epochs_are_permutations_and_seeds_differ(dataset: MFNet) -> None:
+    def order(seed: int) -> list[str]:
+        whole = settings(batch_size=5)
+        batches = train_batches(dataset, "train", crm(), whole, seed, range(4))
+        return [name for batch in batches for name in batch.name]
+
+    first = order(0)
+    assert sorted(first[:10]) == sorted(first[10:]) == NAMES
+    assert first[:10] != first[10:]
+    assert order(0) == first
+    assert order(1) != first
+
+
+def test_augmentation_differs_between_epochs(dataset: MFNet) -> None:
+    whole = settings(batch_size=10)
+    one, other = train_batches(dataset, "train", crm(), whole, 0, range(2))
+    same = [one.name.index(name) for name in other.name]
+    assert not torch.equal(one.rgb[same], other.rgb)
+
+
+def test_loading_leaves_the_global_generators_alone(dataset: MFNet) -> None:
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()
+    for workers in (0, 1):
+        changed = settings(num_workers=workers)
+        list(train_batches(dataset, "train", crm(), changed, 0, range(1)))
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    np.testing.assert_array_equal(np.random.get_state()[1], numpy_state)
+
+
+def test_evaluation_in_list_order(dataset: MFNet) -> None:
+    batches = list(eval_batches(dataset, "val", crm(test_short_edge=12), settings()))
+    assert [batch.name for batch in batches] == [tuple(NAMES[:3]), tuple(NAMES[3:5])]
+    assert batches[0].rgb.shape == (3, 3, 12, 16)
+    assert batches[0].label.shape == (3, 24, 32)
+    np.testing.assert_array_equal(batches[1].label[0].numpy(), dataset.read(NAMES[3]).label)
+
+
+def test_sizes_that_differ(dataset: MFNet, expected_pair, png) -> None:
+    rgb, thermal, label = expected_pair(NAMES[1], (20, 32))
+    png(dataset.image_paths(NAMES[1])[0], np.dstack([rgb, thermal]))
+    png(dataset.label_path(NAMES[1]), label)
+    with pytest.raises(InputError, match=r"24x32 \('00001N'\) and 20x32 .*eval_batch_size=1"):
+        next(eval_batches(dataset, "val", crm(), settings()))
+    batches = list(eval_batches(dataset, "val", crm(), settings(eval_batch_size=1)))
+    assert len(batches) == 5
+    transform = crm(sizes=None, crop_hw=None)
+    with pytest.raises(InputError, match="choose transform.crop_hw"):
+        list(train_batches(dataset, "train", transform, settings(), 0, range(2)))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_nothing_comes_after_close(dataset: MFNet, workers: int) -> None:
+    changed = settings(num_workers=workers)
+    batches = train_batches(dataset, "train", crm(), changed, 0, range(4))
+    next(batches)
+    batches.close()
+    assert list(batches) == []
+    assert multiprocessing.active_children() == []
+
+
+def test_steps_per_epoch(dataset: MFNet) -> None:
+    assert steps_per_epoch(dataset, settings()) == 2
+    assert steps_per_epoch(dataset, settings(batch_size=10)) == 1
+    assert steps_per_epoch(dataset, settings(batch_size=2), "val") == 2
+    with pytest.raises(InputError, match="is 11 but split 'train' of mfnet has only 10"):
+        steps_per_epoch(dataset, settings(batch_size=11))
+    with pytest.raises(InputError, match="lower data.batch_size"):
+        train_batches(dataset, "train", crm(), settings(batch_size=11), 0, range(1))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_raise_names_the_damaged_file(dataset: MFNet, workers: int) -> None:
+    damage(dataset, NAMES[4])
+    changed = settings(num_workers=workers)
+    with pytest.raises(InputError, match=rf"^\S*images/{NAMES[4]}.png cannot be decoded") as info:
+        list(train_batches(dataset, "train", crm(), changed, 0, range(4)))
+    assert "Traceback" not in str(info.value)
+    assert multiprocessing.active_children() == []
+    with pytest.raises(InputError, match=rf"images/{NAMES[4]}.png cannot be decoded"):
+        list(eval_batches(dataset, "val", crm(), changed))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_skip_in_training_takes_the_next_of_the_list(
+    dataset: MFNet, workers: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    intact = list(train_batches(dataset, "train", crm(), settings(), 0, range(4)))
+    damage(dataset, NAMES[4])
+    damage(dataset, NAMES[5])
+    changed = settings(num_workers=workers, on_error="skip")
+    with caplog.at_level(logging.WARNING):
+        batches = train_batches(dataset, "train", crm(), changed, 0, range(4))
+        found = list(batches)
+    replaced = {NAMES[4]: NAMES[6], NAMES[5]: NAMES[6]}
+    for one, other in zip(intact, found, strict=True):
+        assert other.name == tuple(replaced.get(name, name) for name in one.name)
+    assert set(batches.skipped) == {NAMES[4], NAMES[5]}
+    assert "cannot be decoded" in batches.skipped[NAMES[4]]
+    named = [record.getMessage() for record in caplog.records]
+    assert sum(f"'{NAMES[4]}'" in message for message in named) == 1
+
+
+def test_skip_wraps_around_the_list(dataset: MFNet) -> None:
+    damage(dataset, NAMES[-1])
+    whole = settings(batch_size=10, on_error="skip")
+    batch = next(train_batches(dataset, "train", crm(), whole, 0, range(1)))
+    assert sorted(batch.name) == sorted([*NAMES[:-1], NAMES[0]])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_skip_in_evaluation_leaves_out(dataset: MFNet, workers: int) -> None:
+    for name in (NAMES[1], NAMES[3], NAMES[4]):
+        damage(dataset, name)
+    batches = eval_batches(
+        dataset, "val", crm(), settings(num_workers=workers, on_error="skip", eval_batch_size=3)
+    )
+    # The second batch would be empty and does not come at all.
+    assert [batch.name for batch in batches] == [(NAMES[0], NAMES[2])]
+    assert set(batches.skipped) == {NAMES[1], NAMES[3], NAMES[4]}
+
+
+def test_skip_with_nothing_left(dataset: MFNet) -> None:
+    for name in NAMES:
+        damage(dataset, name)
+    batches = train_batches(dataset, "train", crm(), settings(on_error="skip"), 0, range(1))
+    with pytest.raises(InputError, match="none of the 10 training samples of mfnet can be read"):
+        next(batches)
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(InputError, match=r"data.batch_size must lie in \[1"):
+        settings(batch_size=0)
+    with pytest.raises(InputError, match="data.num_workers"):
+        settings(num_workers=-1)
+    with pytest.raises(InputError, match="data.on_error: 'skpi'.*did you mean 'skip'"):
+        settings(on_error="skpi")
+
+
+def test_collate_stacks_in_order(dataset: MFNet) -> None:
+    examples = [crm().test(dataset.read(name)) for name in NAMES[:2]]
+    batch = collate(examples)
+    assert batch.name == tuple(NAMES[:2])
+    np.testing.assert_array_equal(batch.rgb[1].permute(1, 2, 0).numpy(), examples[1].rgb)
+    np.testing.assert_array_equal(batch.thermal[1, 0].numpy(), examples[1].thermal)
+    # The centre of a whole image is its own centre pixel.
+    assert batch.centre_yx.tolist() == [[12, 16], [12, 16]]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_batches_are_pinned(dataset: MFNet) -> None:
+    for workers in (0, 1):
+        changed = settings(num_workers=workers)
+        batch = next(train_batches(dataset, "train", crm(), changed, 0, range(1)))
+        assert batch.rgb.is_pinned()
+        assert batch.label.is_pinned()
+
+
+def test_datasets_need_no_files_here(tmp_path: Path) -> None:
+    """Anything with `name`, `names` and `read` is a data set."""
+    dataset = InMemory()
+    batch = next(eval_batches(dataset, "any", crm(), settings(eval_batch_size=1)))
+    assert batch.label.tolist() == [[[255, 255], [255, 255]]]
+    assert not any(tmp_path.iterdir())
+
+
+class InMemory:
+    name = "memory"
+
+    def names(self, split: str) -> tuple[str, ...]:
+        return (split,)
+
+    def read(self, name: str):  # noqa: ANN201
+        from rgbt.types import Sample
+
+        image = np.zeros((2, 2, 3), np.uint8)
+        return Sample(rgb=image, thermal=image[..., 0], label=None, name=name)

@@ -1,0 +1,214 @@
+"""The loop: it learns, resumes to the same bits, accumulates, and stops on non-finite values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from lightning_fabric import Fabric
+from torch import nn
+
+from rgbt.checks import InputError, RunError
+from rgbt.engine.checkpoint import State, load_checkpoint, load_weights, save_checkpoint
+from rgbt.engine.optimizers import AdamW
+from rgbt.engine.schedules import Poly
+from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.trainer import Trainer
+from rgbt.randomness import torch_generator
+from rgbt.types import Batch, GeneratorOf, Phase
+
+SETTINGS = {
+    "max_steps": 6,
+    "eval_every": 3,
+    "checkpoint_every": 2,
+    "log_every": 1,
+    "accumulate": 1,
+    "clip_norm": 1.0,
+    "precision": "32-true",
+    "accelerator": "cpu",
+    "threads": None,
+    "selection_split": "val",
+    "init_from": None,
+}
+
+
+class Noisy:
+    """Fits the mean of the image under noise drawn from the step's generator."""
+
+    def __init__(self, model: nn.Module, poison: int | None = None) -> None:
+        self.model = model
+        self.poison = poison
+        self.calls = 0
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        noise = torch.randn(batch.rgb.shape, generator=generator_of("noise"))
+        guess = self.model((batch.rgb + 0.1 * noise).mean((2, 3)))
+        loss = (guess - batch.rgb.mean((1, 2, 3))[:, None]).square().mean()
+        if self.calls == self.poison:
+            loss = loss * float("nan")
+        self.calls += 1
+        yield Phase("main", {"fit": loss, "extra": 0 * loss})
+
+
+def batches(start: int, batch_size: int = 4) -> Iterator[Batch]:
+    step = start
+    while True:
+        rgb = torch.rand(batch_size, 3, 8, 8, generator=torch_generator(0, "data", step))
+        yield Batch(
+            rgb=(rgb * 255).to(torch.uint8),
+            thermal=(rgb[:, :1] * 255).to(torch.uint8),
+            label=torch.zeros(batch_size, 8, 8, dtype=torch.int64),
+            name=tuple("abcdefgh"[:batch_size]),
+            centre_yx=torch.zeros(batch_size, 2, dtype=torch.int64),
+            position=None,
+            original_hw=torch.full((batch_size, 2), 8),
+        )
+        step += 1
+
+
+def make(folder: Path, poison: int | None = None, **changes: object) -> tuple[Trainer, list]:
+    fabric = Fabric(accelerator="cpu", devices=1)
+    torch.manual_seed(1)
+    model = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 1))
+    builder = AdamW(
+        lr=0.1, backbone_multiplier=1.0, weight_decay=0.05, betas=(0.9, 0.999), eps=1e-8
+    )
+    wrapped, optimizer = fabric.setup(model, builder(model))
+    log: list = []
+    trainer = Trainer(
+        fabric=fabric,
+        settings=TrainerSettings(**{**SETTINGS, **changes}),
+        scheme=Noisy(wrapped, poison),
+        model=wrapped,
+        optimizers={"main": optimizer},
+        schedule=Poly(power=0.9, per="iteration", warmup_steps=0),
+        steps_per_epoch=2,
+        folder=folder,
+        record=lambda step, values: log.append((step, values)),
+        validate=lambda step: float(step),
+    )
+    return trainer, log
+
+
+def test_resume_equals_straight_through(tmp_path: Path) -> None:
+    straight, log = make(tmp_path / "a")
+    straight.fit(batches(0), State(seed=7))
+
+    first, _ = make(tmp_path / "b", max_steps=6)
+    state = State(seed=7)
+    interrupted = batches(0)
+
+    def stop_after_five() -> Iterator[Batch]:
+        for _ in range(5):
+            yield next(interrupted)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.fit(stop_after_five(), state)
+
+    second, second_log = make(tmp_path / "b")
+    resumed = State(seed=7)
+    assert second.resume(resumed)
+    assert resumed.step == 4  # the last checkpoint, written every second step
+    second.fit(batches(resumed.step), resumed)
+
+    for a, b in zip(straight.model.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert [values["loss"] for _, values in log[4:]] == [v["loss"] for _, v in second_log]
+    assert resumed.best_step == 6
+    assert resumed.best_score == 6.0
+
+
+def test_loss_falls(tmp_path: Path) -> None:
+    trainer, log = make(tmp_path, max_steps=60, eval_every=60)
+    trainer.fit(batches(0), State(seed=0))
+    assert log[-1][1]["loss"] < 0.1 * log[0][1]["loss"]
+    assert {"loss/fit", "loss/extra", "grad_norm", "lr/main_0", "images_per_s"} <= set(log[0][1])
+
+
+def test_accumulated_halves_equal_the_whole_batch(tmp_path: Path) -> None:
+    def halves() -> Iterator[Batch]:
+        for batch in batches(0):
+            for part in (slice(0, 2), slice(2, 4)):
+                yield Batch(
+                    batch.rgb[part],
+                    batch.thermal[part],
+                    batch.label[part],
+                    batch.name[part],
+                    batch.centre_yx[part],
+                    None,
+                    batch.original_hw[part],
+                )
+
+    whole, _ = make(tmp_path / "whole", max_steps=1)
+    split, _ = make(tmp_path / "split", max_steps=1, accumulate=2)
+    for trainer, source in ((whole, batches(0)), (split, halves())):
+        trainer.scheme.phases = quiet(trainer.model)
+        trainer.fit(source, State(seed=0))
+    for a, b in zip(whole.model.parameters(), split.model.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def quiet(model: nn.Module):
+    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        guess = model(batch.rgb.mean((2, 3)))
+        target = batch.rgb.mean((1, 2, 3))[:, None]
+        yield Phase("main", {"fit": (guess - target).square().mean()})
+
+    return phases
+
+
+def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tmp_path: Path) -> None:
+    trainer, _ = make(tmp_path, poison=3)
+    before = [p.clone() for p in trainer.model.parameters()]
+    with pytest.raises(RunError, match=r"step 4: fit is nan"):
+        trainer.fit(batches(0), State(seed=0))
+    assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
+    assert any(not torch.equal(a, b) for a, b in zip(before, trainer.model.parameters()))
+
+
+def test_schedule_values() -> None:
+    iteration = Poly(power=1.0, per="iteration", warmup_steps=0)
+    assert [iteration(s, 4, 2) for s in range(4)] == [1.0, 0.75, 0.5, 0.25]
+    # As released: 312 epochs of 112 iterations against a total of 35000 iterations.
+    released = Poly(power=0.9, per="epoch", warmup_steps=0)
+    assert released(34999, 35000, 112) == pytest.approx(0.992, abs=5e-4)
+    warm = Poly(power=0.9, per="iteration", warmup_steps=4)
+    assert warm(0, 10**9, 1) == pytest.approx(0.25)
+    assert warm(3, 10**9, 1) == pytest.approx(1.0)
+
+
+def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings() -> None:
+    model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
+    model["query"] = nn.Embedding(3, 2)
+    builder = AdamW(lr=1.0, backbone_multiplier=0.1, weight_decay=0.5, betas=(0.9, 0.999), eps=1e-8)
+    groups = builder(model).param_groups
+    found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}
+    assert found == {(0.1, 0.5): 6, (1.0, 0.0): 4 + 6}
+
+
+def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
+    path = tmp_path / "other.pt"
+    save_checkpoint(path, {"model": nn.Linear(2, 3).state_dict()})
+    weights = load_checkpoint(path)["model"]
+    with pytest.raises(InputError, match=r"another model: 0 keys missing.*weight"):
+        load_weights(nn.Linear(2, 4), weights, path)
+    with pytest.raises(InputError, match=r"1 keys unexpected \(bias\)"):
+        load_weights(nn.Linear(2, 3, bias=False), weights, path)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.pt"
+    broken.write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="cannot be read as a checkpoint"):
+        load_checkpoint(broken)
+    with pytest.raises(InputError, match="no such checkpoint"):
+        load_checkpoint(tmp_path / "missing.pt")
+
+
+@pytest.mark.parametrize("key", ["max_steps", "eval_every", "accumulate"])
+def test_durations_below_one_are_refused(key: str) -> None:
+    with pytest.raises(InputError, match=f"trainer.{key} must be at least 1, got 0"):
+        TrainerSettings(**{**SETTINGS, key: 0})

@@ -1,0 +1,261 @@
+"""Every variant of the masker: shares, pairing, replay, published statistics, bad settings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import build, conf_dir, register_resolvers
+from rgbt.maskers.masker import Masker
+from rgbt.maskers.pairing import complementary, random_complementary
+from rgbt.randomness import torch_generator
+
+SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
+GOLDEN = SHARED / "golden" / "losses.npz"
+VARIANTS = ["none", "crm", "irm", "square", "grbm_paper", "grbm_released"]
+
+
+def configured(variant: str, scale: str = "paper", **changes: object) -> Masker:
+    """The masker of conf/masker/<variant>.yaml at a scale, with some settings changed."""
+    register_resolvers()
+    factor = OmegaConf.load(conf_dir() / "scale" / f"{scale}.yaml").pixel_factor
+    masker = OmegaConf.load(conf_dir() / "masker" / f"{variant}.yaml")
+    config = OmegaConf.create({"scale": {"pixel_factor": factor}, "masker": masker})
+    config.masker.update(changes)
+    return build(config.masker)
+
+
+def centres(batch: int, y: int = 120, x: int = 160) -> torch.Tensor:
+    return torch.tensor([[y, x]]).expand(batch, 2)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+class TestContract:
+    """What every masker promises; a new variant is added to `VARIANTS`."""
+
+    def test_shapes_types_and_scale(self, variant) -> None:
+        paper = configured(variant)((240, 320), centres(3), torch_generator(0, "m"))
+        demo = configured(variant, "demo")((120, 160), centres(3, 60, 80), torch_generator(0, "m"))
+        for mask in (*paper, *demo):
+            assert mask.dtype == torch.bool
+            assert mask.shape[0] == 3
+        if variant not in ("square", "none"):
+            # Half of the pixels in half of the cell: the same grid, and the same draws.
+            assert torch.equal(paper.rgb, demo.rgb)
+            assert torch.equal(paper.thermal, demo.thermal)
+
+    def test_the_same_generator_replays_the_same_masks(self, variant) -> None:
+        masker = configured(variant)
+        first = masker((240, 320), centres(16), torch_generator(3, "m", 7))
+        second = masker((240, 320), centres(16), torch_generator(3, "m", 7))
+        other = masker((240, 320), centres(16), torch_generator(3, "m", 8))
+        assert torch.equal(first.rgb, second.rgb)
+        assert torch.equal(first.thermal, second.thermal)
+        assert variant == "none" or not torch.equal(first.rgb, other.rgb)
+
+    def test_no_global_generator_is_touched(self, variant) -> None:
+        before = torch.get_rng_state()
+        configured(variant)((240, 320), centres(4), torch_generator(0, "m"))
+        assert torch.equal(before, torch.get_rng_state())
+
+    def test_says_whether_it_hides_anything(self, variant) -> None:
+        masker = configured(variant)
+        masks = masker((240, 320), centres(64), torch_generator(0, "m"))
+        hidden = (masks.rgb | masks.thermal).any().item()
+        assert masker.hides_nothing == (not hidden)
+
+    @pytest.mark.gpu
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+    def test_draws_on_the_device_of_the_batch(self, variant) -> None:
+        generator = torch_generator(0, "m", device="cuda")
+        masks = configured(variant)((240, 320), centres(4).cuda(), generator)
+        assert masks.rgb.device.type == masks.thermal.device.type == "cuda"
+
+
+@pytest.mark.parametrize("variant", ["crm", "grbm_released"])
+def test_counts_are_exact_and_masks_complementary(variant) -> None:
+    masks = configured(variant, pairing="comp")((240, 320), centres(100), torch_generator(0, "m"))
+    cells = masks.rgb[0].numel()
+    assert (masks.rgb.sum((1, 2)) == cells // 2).all()
+    assert torch.equal(masks.thermal, ~masks.rgb)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.4, 0.5, 0.6, 0.7])
+def test_individual_masks_have_the_ratio_each_and_overlap(ratio) -> None:
+    masks = configured("irm", ratio=ratio)((240, 320), centres(500), torch_generator(0, "m"))
+    for mask in masks:
+        assert (mask.sum((1, 2)) == round(80 * ratio)).all()
+    # Independent: both hidden in ratio^2 of the cells.
+    both = (masks.rgb & masks.thermal).double().mean().item()
+    assert both == pytest.approx(ratio**2, abs=0.02)
+
+
+@pytest.mark.parametrize("variant", ["crm", "square", "grbm_paper", "grbm_released"])
+def test_three_patterns_are_equally_likely(variant) -> None:
+    masks = configured(variant)((240, 320), centres(6000), torch_generator(0, "m"))
+    rgb, thermal = masks.rgb.any((1, 2)), masks.thermal.any((1, 2))
+    for pattern in (~rgb & thermal, rgb & ~thermal, rgb & thermal):
+        # Standard error 0.006.
+        assert pattern.double().mean().item() == pytest.approx(1 / 3, abs=0.03)
+    both = rgb & thermal
+    assert torch.equal(masks.thermal[both], ~masks.rgb[both])
+
+
+def test_pattern_probabilities_in_their_order() -> None:
+    taken = torch.tensor([[[True, False]]])
+    only_thermal = random_complementary(taken, (1.0, 0.0, 0.0), torch_generator(0, "m"))
+    only_rgb = random_complementary(taken, (0.0, 1.0, 0.0), torch_generator(0, "m"))
+    both = random_complementary(taken, (0.0, 0.0, 1.0), torch_generator(0, "m"))
+    assert [m.flatten().tolist() for m in only_thermal] == [[False, False], [False, True]]
+    assert [m.flatten().tolist() for m in only_rgb] == [[True, False], [False, False]]
+    assert [m.flatten().tolist() for m in both] == [[True, False], [False, True]]
+    assert torch.equal(complementary(taken).thermal, both.thermal)
+
+
+def test_square_covers_a_quarter() -> None:
+    masks = configured("square", pairing="comp")((240, 320), centres(50), torch_generator(0, "m"))
+    assert masks.rgb.shape[1:] == (64, 80)
+    assert (masks.rgb.double().mean((1, 2)) == 0.25).all()
+
+
+def test_paper_gaussian_hides_its_expected_share() -> None:
+    # Eq. 8 on the 4 x 5 grid with sigma = 4 / 4, summed by hand over the cells.
+    weights = [np.exp(-((y - 2.0) ** 2 + (x - 2.5) ** 2) / 2) for y in range(4) for x in range(5)]
+    assert np.mean(weights) == pytest.approx(0.289, abs=5e-4)
+    masker = configured("grbm_paper", pairing="comp")
+    masks = masker((240, 320), centres(20000), torch_generator(0, "m"))
+    share = masks.rgb.double().mean(0).flatten().numpy()
+    np.testing.assert_allclose(share, weights, atol=0.015)
+    assert masks.rgb.sum((1, 2)).unique().numel() > 3, "the number of cells must vary"
+
+
+def test_sigma_may_be_counted_on_the_rows_of_the_image() -> None:
+    narrow = configured("grbm_paper", pairing="comp")
+    wide = configured("grbm_paper", pairing="comp", sigma_height=480)  # N_y = 7 instead of 4
+    share = [
+        m((240, 320), centres(4000), torch_generator(0, "m")).rgb.double().mean().item()
+        for m in (narrow, wide)
+    ]
+    weights = [
+        np.exp(-((y - 2.0) ** 2 + (x - 2.5) ** 2) / (2 * (7 / 4) ** 2))
+        for y in range(4)
+        for x in range(5)
+    ]
+    assert share[1] == pytest.approx(np.mean(weights), abs=0.015)
+    assert share[1] > share[0]
+
+
+def test_tracked_anchor_follows_the_centre_of_each_sample() -> None:
+    masker = configured("grbm_released", pairing="comp", sigma_div=100.0, ratio=0.05)
+    centre = torch.tensor([[0, 0], [70, 200], [239, 319]])
+    masks = masker((240, 320), centre, torch_generator(0, "m"))
+    # 5 % of 20 cells is one cell, and so narrow a Gaussian leaves only the one it stands on.
+    assert masks.rgb.nonzero().tolist() == [[0, 0, 0], [1, 1, 3], [2, 3, 4]]
+
+
+def test_cell_middles_remove_the_lean_of_half_a_cell() -> None:
+    index = configured("grbm_paper", pairing="comp")
+    middle = configured("grbm_paper", pairing="comp", cell_position="centre")
+    lean = []
+    for masker in (index, middle):
+        share = masker((240, 320), centres(8000), torch_generator(0, "m")).rgb.double().mean(0)
+        lean.append((share[2:].sum() - share[:2].sum()).item() / share.sum().item())
+    assert lean[0] > 0.2
+    assert lean[1] == pytest.approx(0, abs=0.02)
+
+
+def test_cell_middles_with_a_tracked_centre() -> None:
+    masker = configured(
+        "grbm_released", pairing="comp", cell_position="centre", sigma_div=100.0, ratio=0.1
+    )
+    # Pixel 63 lies beside the edge between cells 0 and 1: those two are nearest.
+    masks = masker((240, 320), torch.tensor([[30, 63]]), torch_generator(0, "m"))
+    assert masks.rgb.nonzero().tolist() == [[0, 0, 0], [0, 0, 1]]
+
+
+CASES = {
+    "grbm_mf_no_centre": ("grbm_released", {"anchor": "grid"}, (256, 320), None),
+    "grbm_mf_centre_128_160": ("grbm_released", {}, (256, 320), (128, 160)),
+    "grbm_mf_centre_20_300": ("grbm_released", {}, (256, 320), (20, 300)),
+    "grbm_kp_no_centre": ("grbm_released", {"anchor": "grid", "patch_size": 32}, (256, 320), None),
+    "grbm_pst_no_centre": ("grbm_released", {"anchor": "grid", "patch_size": 32}, (224, 320), None),
+    "crm_mf": ("crm", {}, (256, 320), None),
+    "crm_pst": ("crm", {}, (224, 320), None),
+}
+
+
+@pytest.mark.skipif(not GOLDEN.exists(), reason="reference material is not beside the checkout")
+@pytest.mark.parametrize("case", CASES)
+def test_frequencies_of_the_releases(case) -> None:
+    variant, changes, size, centre = CASES[case]
+    stored = np.load(GOLDEN)
+    expected = {
+        key: stored[f"masks.{case}.{key}"]
+        for key in ("rgb_frequency", "thermal_frequency", "pattern_counts")
+    }
+    draws = 20000
+    masker = configured(variant, **changes)
+    masks = masker(size, centres(draws, *(centre or (0, 0))), torch_generator(0, "golden"))
+    rgb, thermal = masks.rgb, masks.thermal
+    np.testing.assert_allclose(rgb.double().mean(0), expected["rgb_frequency"], atol=0.02)
+    np.testing.assert_allclose(thermal.double().mean(0), expected["thermal_frequency"], atol=0.02)
+    any_rgb, any_thermal = rgb.any((1, 2)), thermal.any((1, 2))
+    patterns = [~any_rgb & any_thermal, any_rgb & ~any_thermal, any_rgb & any_thermal]
+    counts = [int(p.sum()) for p in patterns]
+    np.testing.assert_allclose(counts, expected["pattern_counts"], atol=400)
+
+
+def test_patch_size_that_does_not_divide_names_those_that_do() -> None:
+    masker = configured("grbm_released")
+    with pytest.raises(InputError) as caught:
+        masker((224, 320), centres(1), torch_generator(0, "m"))
+    message = str(caught.value)
+    assert "masker.patch_size=64" in message
+    assert "224x320" in message
+    assert message.endswith("4, 8, 16, 32.")
+
+
+@pytest.mark.parametrize(
+    ("variant", "changes", "key"),
+    [
+        ("crm", {"sigma_div": 4.0}, "masker.sigma_div"),
+        ("crm", {"sigma_height": 480}, "masker.sigma_height"),
+        ("crm", {"anchor": "grid"}, "masker.anchor"),
+        ("crm", {"ratio": None}, "masker.ratio"),
+        ("crm", {"ratio": 1.3}, "masker.ratio"),
+        ("crm", {"pairing": None}, "masker.pairing"),
+        ("crm", {"patch_size": 6}, "masker.patch_size"),
+        ("crm", {"patch_size": 0}, "masker.patch_size"),
+        ("crm", {"patch_size": "large"}, "masker.patch_size"),
+        ("crm", {"sampler": "gausian"}, "masker.sampler"),
+        ("none", {"patch_size": 32}, "masker.patch_size"),
+        ("none", {"ratio": 0.5}, "masker.ratio"),
+        ("grbm_paper", {"ratio": 0.5}, "masker.ratio"),
+        ("grbm_paper", {"sigma_div": 0.0}, "masker.sigma_div"),
+        ("grbm_paper", {"sigma_div": None}, "masker.sigma_div"),
+        ("grbm_paper", {"sigma_height": 32}, "masker.sigma_height"),
+        ("irm", {"pattern_probabilities": [0.3, 0.3, 0.4]}, "masker.pattern_probabilities"),
+        ("crm", {"pattern_probabilities": [0.5, 0.5, 0.5]}, "masker.pattern_probabilities"),
+        ("crm", {"pattern_probabilities": [1.5, -0.5, 0.0]}, "masker.pattern_probabilities"),
+    ],
+)
+def test_a_setting_that_is_wrong_or_without_effect_is_named(variant, changes, key) -> None:
+    with pytest.raises(InputError, match=key):
+        configured(variant, **changes)
+
+
+def test_grid_of_the_padded_crop() -> None:
+    assert configured("grbm_paper").grid_hw((240, 320)) == (4, 5)
+    assert configured("grbm_paper", "demo").grid_hw((120, 160)) == (4, 5)
+    assert configured("crm").grid_hw((216, 320)) == (7, 10)
+
+
+def test_centres_must_be_pairs() -> None:
+    with pytest.raises(ValueError, match="centre_yx"):
+        configured("crm")((240, 320), torch.zeros(4, 3), torch_generator(0, "m"))

@@ -1,0 +1,147 @@
+"""Partitions: no gap, equal areas, the released rings, region 1 innermost."""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import build, conf_dir
+from rgbt.metrics.metric import Regions
+from rgbt.metrics.regions import ring_map, ring_rectangle, strip_map
+
+SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
+GOLDEN = SHARED / "golden"
+
+
+def configured(name: str, **changes: object) -> Regions:
+    config = OmegaConf.create({"metric": OmegaConf.load(conf_dir() / "metric" / f"{name}.yaml")})
+    config.metric.update(changes)
+    return build(config.metric)
+
+
+def test_strips_by_hand() -> None:
+    # 7 columns in 3 strips: floor(3 n / 7) = 0 0 0 1 1 2 2.
+    assert strip_map((2, 7), 3, vertical=True).tolist() == [[0, 0, 0, 1, 1, 2, 2]] * 2
+    assert strip_map((4, 2), 2, vertical=False).tolist() == [[0, 0], [0, 0], [1, 1], [1, 1]]
+
+
+def test_rings_by_hand() -> None:
+    # 8 x 8 in 4 rings: inner sides 8 sqrt(1/4) = 4, 8 sqrt(2/4) = 5.66, 8 sqrt(3/4) = 6.93.
+    # Bounds floor((8 -+ s) / 2): 2..6, 1..6, 0..7.
+    expected = np.full((8, 8), 3)
+    expected[0:7, 0:7] = 2
+    expected[1:6, 1:6] = 1
+    expected[2:6, 2:6] = 0
+    assert np.array_equal(ring_map((8, 8), 4, "image"), expected)
+
+
+PUBLISHED = {
+    # Inner rows and columns of each ring from the outside, and areas, 480x640.
+    5: (
+        [((25, 454), (33, 606)), ((54, 425), (72, 567)), ((88, 391), (117, 522))]
+        + [((132, 347), (176, 463))],
+        [61383, 62172, 60930, 61010, 61705],
+    ),
+    9: (
+        [((13, 466), (18, 621)), ((28, 451), (37, 602)), ((44, 435), (58, 581))]
+        + [((61, 418), (81, 558)), ((80, 400), (106, 533)), ((101, 378), (135, 504))]
+        + [((126, 353), (169, 470)), ((160, 320), (213, 426))],
+        [34041, 34164, 34502, 34204, 33649, 34427, 33886, 34247, 34080],
+    ),
+}
+
+
+@pytest.mark.parametrize("aspect", ["image", "released_3_4"])
+@pytest.mark.parametrize("regions", PUBLISHED)
+def test_rings_of_mfnet_images_are_the_released_ones(regions, aspect) -> None:
+    bounds, areas = PUBLISHED[regions]
+    for inner, (rows, columns) in zip(range(regions - 1, 0, -1), bounds, strict=True):
+        found = ring_rectangle((480, 640), regions, inner, aspect)
+        assert [(s.start, s.stop) for s in found] == [rows, columns]
+    assert np.bincount(ring_map((480, 640), regions, aspect).ravel()).tolist() == areas[::-1]
+
+
+@pytest.mark.skipif(not GOLDEN.exists(), reason="reference material is not beside the checkout")
+@pytest.mark.parametrize("case", ["480x640.5", "480x640.9", "512x640.5"])
+def test_released_rings_pixel_by_pixel(case) -> None:
+    stored = np.load(GOLDEN / "losses.npz")
+    recipe = json.loads((GOLDEN / "losses.json").read_text())["recipes"]["rings"][f"rings.{case}"]
+    size, regions = case.split(".")
+    height, width = map(int, size.split("x"))
+    rings = ring_map((height, width), int(regions), "released_3_4") + 1
+    assert np.bincount(rings.ravel()).tolist() == stored[f"rings.{case}.area"].tolist()
+    assert rings[height // 2].tolist() == stored[f"rings.{case}.middle_row"].tolist()
+    assert rings[:, width // 2].tolist() == stored[f"rings.{case}.middle_column"].tolist()
+    assert zlib.crc32(rings.astype(np.uint8).tobytes()) == recipe["crc32_uint8_map"]
+    rectangles = stored[f"rings.{case}.outer_rect_rowstart_rowend_colstart_colend"]
+    for ring, *bounds in rectangles.tolist():
+        rows, columns = np.nonzero(rings == ring)
+        found = [rows.min(), rows.max() + 1, columns.min(), columns.max() + 1]
+        assert found == bounds
+
+
+@pytest.mark.parametrize("image_hw", [(480, 640), (512, 640), (720, 1280), (120, 160), (97, 131)])
+@pytest.mark.parametrize("name", ["ring5", "ring9", "vertical5", "horizontal5"])
+def test_regions_partition_the_image_into_equal_areas(name, image_hw) -> None:
+    regions = configured(name)
+    region_map = regions.map(image_hw)
+    assert region_map.shape == image_hw
+    assert region_map.dtype == np.uint8
+    areas = np.bincount(region_map.ravel(), minlength=regions.regions)
+    assert len(areas) == regions.regions
+    assert areas.sum() == image_hw[0] * image_hw[1]
+    # An edge is off by less than a pixel; the longest edge runs around the image.
+    assert np.abs(areas - areas.mean()).max() <= 2 * sum(image_hw)
+
+
+def test_region_one_is_the_centre() -> None:
+    region_map = configured("ring9").map((480, 640))
+    assert region_map[240, 320] == 0
+    assert region_map[0, 0] == region_map[479, 639] == 8
+
+
+def test_maps_are_computed_once_and_cannot_be_changed() -> None:
+    regions = configured("ring5")
+    assert regions.map((48, 64)) is configured("ring5").map((48, 64))
+    with pytest.raises(ValueError, match="read-only"):
+        regions.map((48, 64))[0, 0] = 1
+
+
+def test_names_of_partitions() -> None:
+    assert configured("ring9").name == "ring9"
+    assert configured("ring5", aspect="released_3_4").name == "ring5_released_3_4"
+    assert configured("horizontal5", regions=4).name == "horizontal4"
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "key"),
+    [
+        ("ring5", {"aspect": None}, "metric.aspect"),
+        ("ring5", {"regions": 0}, "metric.regions"),
+        ("ring5", {"regions": 256}, "metric.regions"),
+        ("ring5", {"partition": "rings"}, "metric.partition"),
+        ("ring5", {"absent": "nan"}, "metric.absent"),
+        ("vertical5", {"aspect": "image"}, "metric.aspect"),
+    ],
+)
+def test_wrong_settings_are_named(name, changes, key) -> None:
+    with pytest.raises(InputError, match=key):
+        configured(name, **changes)
+
+
+def test_released_rings_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match=r"720x1280.*metric\.aspect=image"):
+        configured("ring5", aspect="released_3_4").map((720, 1280))
+
+
+@pytest.mark.parametrize("name", ["ring5", "vertical5", "horizontal5"])
+def test_more_regions_than_pixels_are_refused(name) -> None:
+    with pytest.raises(InputError, match=r"metric\.regions=5.*4x4"):
+        configured(name).map((4, 4))

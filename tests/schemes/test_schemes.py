@@ -1,0 +1,132 @@
+"""How the CRM step is made of passes and losses, checked with hand-made predictions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.schemes.crm import CRM
+from rgbt.schemes.supervised import Supervised
+from rgbt.types import Batch, MaskPair, Output
+
+B, Q, K = 2, 3, 4
+
+
+def batch() -> Batch:
+    return Batch(
+        rgb=torch.zeros(B, 3, 32, 32),
+        thermal=torch.zeros(B, 1, 32, 32),
+        label=torch.zeros(B, 32, 32, dtype=torch.int64),
+        name=("a", "b"),
+        centre_yx=torch.zeros(B, 2, dtype=torch.int64),
+        position=None,
+        original_hw=torch.full((B, 2), 32),
+    )
+
+
+def generator_of(purpose: str) -> torch.Generator:
+    return torch.Generator().manual_seed(len(purpose))
+
+
+class Numbered:
+    """Pass p predicts class logits that are all p; remembers how it was called."""
+
+    def __call__(self, rgb, thermal, masks=None, *, passes=1, views=("rgbt",), generator=None):
+        self.call = {"n": len(rgb), "masks": masks, "passes": passes, "views": views}
+        count = passes * len(views)
+        logits = torch.arange(count, dtype=torch.float32).view(1, -1, 1, 1, 1)
+        class_logits = logits.expand(2, count, B, Q, K + 1)
+        return Output(None, {"class_logits": class_logits, "mask_logits": class_logits[..., None]})
+
+
+class OneEach:
+    """Every pass has loss 1 + its index."""
+
+    def __call__(self, output: Output, batch: Batch, generator: torch.Generator) -> dict:
+        self.passes = output.aux["class_logits"].shape[1]
+        return {"class": torch.arange(1.0, self.passes + 1)}
+
+
+class Halves:
+    hides_nothing = False
+
+    def __call__(self, image_hw, centre_yx: Tensor, generator) -> MaskPair:
+        hidden = torch.zeros(len(centre_yx), 2, 2, dtype=torch.bool)
+        hidden[:, 0] = True
+        return MaskPair(hidden, ~hidden)
+
+
+class Nothing(Halves):
+    hides_nothing = True
+
+
+def sdc(teacher: Tensor, student: Tensor) -> Tensor:
+    return (teacher.detach() - student).abs().mean()
+
+
+def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
+    return sdc(teacher, rgb) + sdc(teacher, thermal)
+
+
+def scheme(masker: object, **weights: float) -> CRM:
+    names = ("modality_weight", "complementary_weight", "nonlocal_weight")
+    given = {name: weights.get(name, 1.0) for name in names}
+    return CRM(model=Numbered(), loss=OneEach(), masker=masker, sdc=sdc, sdn=sdn, **given)
+
+
+def test_full_step_weights_four_supervised_passes_and_two_distillations() -> None:
+    crm = scheme(Halves(), modality_weight=0.5, complementary_weight=2.0, nonlocal_weight=3.0)
+    (phase,) = crm.phases(batch(), generator_of)
+    # Passes in order F R T F' R' T' are numbered 0..5; losses of the first four are 1 2 3 4.
+    assert crm.loss.passes == 4
+    assert phase.parts["class"] == 1 + 0.5 * 2 + 0.5 * 3 + 4
+    assert phase.parts["sdc"] == 2.0 * 3  # |F - F'| = |0 - 3|
+    assert phase.parts["sdn"] == 3.0 * (4 + 5)  # |F - R'| + |F - T'|
+    assert crm.model.call["views"] == ("rgbt", "rgb", "thermal")
+
+
+def test_the_clean_half_of_the_batch_is_not_masked() -> None:
+    crm = scheme(Halves())
+    list(crm.phases(batch(), generator_of))
+    masks = crm.model.call["masks"]
+    assert crm.model.call["n"] == 2 * B
+    assert not masks.rgb[:B].any()
+    assert not masks.thermal[:B].any()
+    assert masks.rgb[B:].float().mean() == 0.5
+    assert torch.equal(masks.rgb[B:], ~masks.thermal[B:])
+
+
+def test_without_masking_there_is_one_pass() -> None:
+    crm = scheme(Nothing(), complementary_weight=0.0, nonlocal_weight=0.0)
+    (phase,) = crm.phases(batch(), generator_of)
+    assert crm.model.call["passes"] == 1
+    assert set(phase.parts) == {"class"}
+    assert phase.parts["class"] == 1 + 2 + 3
+
+
+def test_single_modalities_are_not_decoded_where_nothing_reads_them() -> None:
+    crm = scheme(Halves(), modality_weight=0.0, nonlocal_weight=0.0)
+    (phase,) = crm.phases(batch(), generator_of)
+    assert crm.model.call["views"] == ("rgbt",)
+    assert phase.parts["class"] == 1 + 2
+    assert phase.parts["sdc"] == 1.0
+
+
+def test_distillation_without_masks_is_refused() -> None:
+    with pytest.raises(InputError, match="the masker hides nothing; choose a masker"):
+        scheme(Nothing())
+
+
+def test_supervised_sums_the_parts_of_one_pass() -> None:
+    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Nothing())
+    (phase,) = supervised.phases(batch(), generator_of)
+    assert phase.parts["class"] == 1.0
+    assert supervised.model.call["masks"] is None
+
+
+def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:
+    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves())
+    list(supervised.phases(batch(), generator_of))
+    assert supervised.model.call["masks"].rgb.shape == (B, 2, 2)
