@@ -122,11 +122,10 @@ def evaluate(
     with progress() as display:
         task = display.add_task(split, total=len(dataset.names(split)), note="images")
         for found in predictions(model, batches, session.fabric, modality):
-            for index, name in enumerate(found.batch.name):
-                label, classes = found.batch.label[index], found.classes[index]
+            triples = zip(found.batch.name, found.batch.label, found.classes, strict=True)
+            for name, label, classes in triples:
                 counted[name] = counter(label, classes)
-                if name in keep:
-                    kept.append(_example(session, name, classes.numpy()))
+                kept += [_example(session, name, classes.numpy())] if name in keep else []
             display.advance(task, len(found.batch.name))
     if not counted:
         raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +27,9 @@ from rgbt.tracking.provenance import provenance
 from rgbt.tracking.tables import ResultTables
 from rgbt.tracking.terminal import result_view, show
 
+LABEL_WIDTH = 40
+"""Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
+
 NUM_PANELS = 6
 """Images of the qualitative panel: as many by day as by night where the split holds both."""
 
@@ -43,13 +47,22 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     if folder.result() is not None:
         _say(f"{name} is finished; showing its result. Another seed is another run: seed=1.")
         _track(tracking, folder, config, name)
+        tracking.finish()
     else:
         with folder.lock():
-            Run(config, folder, tracking, name).complete()
-    tracking.finish()
+            _finished_either_way(Run(config, folder, tracking, name))
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
     show(result_view(ResultTables.from_json(tables), folder.path, tracking.links()))
+
+
+def _finished_either_way(run: Run) -> None:
+    try:
+        run.complete()
+    finally:
+        # A run that stops on an error is shown as failed, not as running for ever.
+        if run.folder.description() is not None:
+            run.tracking.finish()
 
 
 def run_name(config: DictConfig, overrides: Sequence[str]) -> str:
@@ -189,7 +202,8 @@ class Run:
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
         self.folder.append(state.step, "test", values)
-        tables = result_tables(found.counts, session.regions, self.name, state.best_step)
+        label = textwrap.shorten(self.name, LABEL_WIDTH, placeholder=" ...")
+        tables = result_tables(found.counts, session.regions, label, state.best_step)
         self.folder.write_tables(tables.to_json())
         self._draw(session, tables, found.kept)
 

@@ -92,7 +92,10 @@ def reference_criterion(
             parts = parts + _layer(criterion, prediction, images, points, spatial)
         totals.append(parts)
     total = torch.stack(totals)
-    return {name: weight * total[:, i] for i, (name, weight) in enumerate(criterion.part_weights.items())}
+    return {
+        name: weight * total[:, i]
+        for i, (name, weight) in enumerate(criterion.part_weights.items())
+    }
 
 
 def _images(criterion: SetCriterion, batch: Batch, padded_hw: tuple[int, int]) -> list[_Image]:
@@ -102,7 +105,9 @@ def _images(criterion: SetCriterion, batch: Batch, padded_hw: tuple[int, int]) -
     images = []
     for index, label in enumerate(pad_to(batch.label, padded_hw, IGNORE)):
         labels = torch.tensor([v for v in label.unique().tolist() if v != IGNORE], dtype=torch.long)
-        masks = torch.stack([label == v for v in labels]) if len(labels) else torch.zeros(0, *padded_hw)
+        masks = (
+            torch.stack([label == v for v in labels]) if len(labels) else torch.zeros(0, *padded_hw)
+        )
         images.append(_Image(labels, masks.float(), None if weights is None else weights[index]))
     return images
 
@@ -137,7 +142,9 @@ def _layer(
     logits, masks, maps, rows, first = [], [], [], [], 0
     for b, image in enumerate(images):
         match_spatial = spatial if spatial.match == "weighted" else PLAIN
-        cost = _costs(criterion, class_BQC[b], mask_BQhw[b], image, matcher_points[b], match_spatial)
+        cost = _costs(
+            criterion, class_BQC[b], mask_BQhw[b], image, matcher_points[b], match_spatial
+        )
         queries, targets = map(torch.as_tensor, linear_sum_assignment(cost.cpu()))
         target_classes[b, queries] = image.labels[targets]
         logits.append(mask_BQhw[b, queries])
@@ -160,7 +167,9 @@ def _layer(
 
 
 def _at(maps: Tensor, points: Tensor, outside: str = "zeros") -> Tensor:
-    return F.grid_sample(maps, points[:, :, None], padding_mode=outside, align_corners=False)[..., 0]
+    return F.grid_sample(maps, points[:, :, None], padding_mode=outside, align_corners=False)[
+        ..., 0
+    ]
 
 
 def _weights_at(maps: list[Tensor], points: Tensor, spatial: SpatialWeight) -> Tensor:
@@ -180,7 +189,11 @@ def _costs(
 ) -> Tensor:
     """(Q, M) matching costs of one image."""
     x = _at(mask_Qhw[None], points[None])[0]
-    t = _at(image.masks[None], points[None])[0] if len(image.labels) else torch.zeros(0, len(points))
+    t = (
+        _at(image.masks[None], points[None])[0]
+        if len(image.labels)
+        else torch.zeros(0, len(points))
+    )
     w = _weights_at([image.weights], points[None], spatial)[0]
     total = w.sum() if spatial.normaliser == "weights" else len(w)
     positive = F.binary_cross_entropy_with_logits(x, torch.ones_like(x), reduction="none")
@@ -204,7 +217,9 @@ def _loss_points(criterion: SetCriterion, logits_Mhw: Tensor, drawn: Tensor) -> 
     return torch.cat([kept, fresh], dim=1)
 
 
-def _mask_and_dice(x: Tensor, t: Tensor, w: Tensor, spatial: SpatialWeight) -> tuple[Tensor, Tensor]:
+def _mask_and_dice(
+    x: Tensor, t: Tensor, w: Tensor, spatial: SpatialWeight
+) -> tuple[Tensor, Tensor]:
     total = w.sum(1) if spatial.normaliser == "weights" else float(x.shape[1])
     e = 0.0 if spatial.active and spatial.dice_smoothing == "none" else 1.0
     bce = (w * F.binary_cross_entropy_with_logits(x, t, reduction="none")).sum(1) / total

@@ -1,0 +1,173 @@
+"""Pinhole camera above the ground plane: projection, rays, and the motion between two frames.
+
+World: X right, Y up, Z ahead, metres, ground at Y = 0. Camera: x right, y down, z ahead.
+Pixels: the centre of the top-left pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.data.synth.factors import EgoMotion, SceneFactors
+
+Floats = NDArray[np.float32]
+Real = TypeVar("Real", np.float32, np.float64)
+
+
+def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
+    """A float32 array of `values`."""
+    return np.array(values, np.float32)
+
+
+NEAR_M = 0.3
+"""Nothing nearer than this along the optical axis is drawn."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where the camera stands and how it looks.
+
+    Attributes:
+        height: image height in pixels.
+        width: image width in pixels.
+        focal: focal length in pixels.
+        position: (X, Y, Z) in metres.
+        pitch: downward tilt in radians.
+        yaw: turn to the right in radians.
+    """
+
+    height: int
+    width: int
+    focal: float
+    position: tuple[float, float, float]
+    pitch: float
+    yaw: float = 0.0
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """(column, row) of the optical axis: the middle of the image."""
+        return (self.width - 1) / 2, (self.height - 1) / 2
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) float64: rows are the camera's x, y and z axes in world coordinates."""
+        sin_yaw, cos_yaw = np.sin(self.yaw), np.cos(self.yaw)
+        sin_pitch, cos_pitch = np.sin(self.pitch), np.cos(self.pitch)
+        return np.array(
+            [
+                [cos_yaw, 0.0, -sin_yaw],
+                [-sin_yaw * sin_pitch, -cos_pitch, -cos_yaw * sin_pitch],
+                [sin_yaw * cos_pitch, -sin_pitch, cos_yaw * cos_pitch],
+            ]
+        )
+
+    def to_camera(self, points: NDArray[Real]) -> NDArray[Real]:
+        """World points (..., 3) in camera coordinates, in the precision they come in."""
+        position = np.asarray(self.position, points.dtype)
+        return (points - position) @ self.rotation.T.astype(points.dtype)
+
+    def project(self, points_in_camera: Floats) -> Floats:
+        """Points (..., 3) in camera coordinates as (column, row); depth is held above `NEAR_M`."""
+        scale = np.reciprocal(np.maximum(points_in_camera[..., 2:], np.float32(NEAR_M)))
+        scale *= np.float32(self.focal)
+        return points_in_camera[..., :2] * scale + floats(self.centre)
+
+    def rays(self) -> Floats:
+        """(3, H, W) camera coordinates of the point at depth 1 that each pixel sees."""
+        column, row = self.centre
+        rays = np.ones((3, self.height, self.width), np.float32)
+        rays[0] = (np.arange(self.width, dtype=np.float32) - column) / self.focal
+        rays[1] = ((np.arange(self.height, dtype=np.float32) - row) / self.focal)[:, None]
+        return rays
+
+    def turned(self, vectors_3HW: Floats) -> Floats:
+        """(3, H, W) vectors in camera coordinates as vectors in world coordinates."""
+        flat = vectors_3HW.reshape(3, -1)
+        return (self.rotation.T.astype(np.float32) @ flat).reshape(vectors_3HW.shape)
+
+    def to_world(self, rays_3HW: Floats, inverse_depth_HW: Floats) -> Floats:
+        """(3, H, W) world points along `rays_3HW`; 10 km away where the inverse depth is 0."""
+        depth = np.reciprocal(np.maximum(inverse_depth_HW, np.float32(1e-4)))
+        return self.turned(rays_3HW) * depth + floats(self.position)[:, None, None]
+
+    def moved(self, motion: EgoMotion) -> Camera:
+        """The camera after `motion`."""
+        yaw = self.yaw + float(np.deg2rad(motion.yaw_deg))
+        x, y, z = self.position
+        step = motion.forward_m
+        return replace(
+            self,
+            position=(x + step * float(np.sin(yaw)), y, z + step * float(np.cos(yaw))),
+            yaw=yaw,
+        )
+
+
+def camera_of(factors: SceneFactors) -> Camera:
+    """The camera that the factors describe, above the origin, looking along Z."""
+    half_angle = np.deg2rad(factors.field_of_view_deg) / 2
+    return Camera(
+        height=factors.height,
+        width=factors.width,
+        focal=float(factors.width / 2 / np.tan(half_angle)),
+        position=(0.0, factors.camera_height_m, 0.0),
+        pitch=float(np.deg2rad(factors.camera_pitch_deg)),
+    )
+
+
+def flow_between(depth_HW: Floats, source: Camera, target: Camera) -> Floats:
+    """Where each pixel of `source` lies in `target`, for a scene in which nothing else moves.
+
+        p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
+
+    with R, C rotation and position of `source`, R', C' those of `target`, z the depth.
+
+    Args:
+        depth_HW: depth along the optical axis of `source` in metres; infinity for the sky.
+        source: camera that the depth belongs to.
+        target: the other camera.
+
+    Returns:
+        (H, W, 2) float32, displacement (rows, columns) in pixels; NaN behind the target camera.
+
+    Raises:
+        ValueError: the two cameras differ in image size or focal length.
+    """
+    shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
+    rays = source.rays()
+    turned = np.tensordot((target.rotation @ source.rotation.T).astype(np.float32), rays, 1)
+    # Divided by the depth, so that the sky (inverse depth 0) needs no case of its own.
+    points = turned + (1.0 / depth_HW) * shift.astype(np.float32)[:, None, None]
+    ahead = np.where(points[2] > 0, points[2], np.nan)
+    focal = source.focal
+    if (target.focal, target.centre) != (focal, source.centre):
+        raise ValueError("flow_between: the two cameras must be the same but for where they stand.")
+    rows, columns = (points[axis] / ahead - rays[axis] for axis in (1, 0))
+    return np.asarray(np.stack([rows, columns], axis=2) * np.float32(focal), np.float32)
+
+
+def ground_homography(source: Camera, target: Camera) -> NDArray[np.float64]:
+    """Homography that maps ground pixels of `source` to `target`.
+
+        H = K' (R' R^T + R' (C - C') n^T / d) K^-1
+
+    with n the downward normal of the ground in camera coordinates of `source` and d its height.
+
+    Returns:
+        (3, 3) float64 for homogeneous (column, row, 1), scaled to H[2, 2] = 1.
+    """
+    turn = target.rotation @ source.rotation.T
+    shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
+    normal = source.rotation @ np.array([0.0, -1.0, 0.0])
+    plane = np.outer(shift, normal) / source.position[1]
+    homography = _intrinsics(target) @ (turn + plane) @ np.linalg.inv(_intrinsics(source))
+    return np.asarray(homography / homography[2, 2])
+
+
+def _intrinsics(camera: Camera) -> NDArray[np.float64]:
+    column, row = camera.centre
+    return np.array([[camera.focal, 0, column], [0, camera.focal, row], [0, 0, 1.0]])

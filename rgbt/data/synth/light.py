@@ -1,0 +1,119 @@
+"""Day or night, sun, sky and lamps of one scene, for the RGB and the thermal image alike."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+from rgbt.data.synth.camera import Floats, floats
+from rgbt.randomness import numpy_generator
+
+_GOLDEN = 0.6180339887
+
+
+class Light(NamedTuple):
+    """What shines.
+
+    Attributes:
+        is_night: night.
+        sun: (3,) unit vector towards the sun.
+        direct: strength of the sun, 0 under clouds.
+        ambient: strength of the sky.
+        zenith: colour of the sky above.
+        horizon: colour of the sky at the horizon, and of the haze.
+        cloud: how much clouds show, 0..1.
+        exposure: factor on all light.
+        tint: colour cast of the camera.
+        headlight: strength of the own headlights by night.
+        lamp: colour of the street lamps; zero where they are off.
+        lit_windows: share of windows with light by night.
+        visibility_m: distance at which 37 % of the light comes through.
+    """
+
+    is_night: bool
+    sun: Floats
+    direct: float
+    ambient: float
+    zenith: Floats
+    horizon: Floats
+    cloud: float
+    exposure: float
+    tint: Floats
+    headlight: float
+    lamp: Floats
+    lit_windows: float
+    visibility_m: float
+
+
+def is_night(seed: int, index: int, night_share: float) -> bool:
+    """Whether scene `index` is a night scene; consecutive scenes keep the share closely."""
+    return (_night_start(seed) + index * _GOLDEN) % 1.0 < night_share
+
+
+@lru_cache(maxsize=64)
+def _night_start(seed: int) -> float:
+    return float(numpy_generator(seed, "synth/night").random())
+
+
+def draw_light(seed: int, index: int, night_share: float) -> Light:
+    """The light of one scene. Both day and night are drawn, so the share changes nothing else."""
+    u = numpy_generator(seed, "synth/light", index).random(16).tolist()
+    dark = floats([0, 0, 0])
+    common = Light(
+        is_night=is_night(seed, index, night_share),
+        sun=_sun(u[2], u[3]),
+        direct=0.0,
+        ambient=0.0,
+        zenith=dark,
+        horizon=dark,
+        cloud=0.0,
+        exposure=1.6 ** (u[12] - 0.5),
+        tint=floats([0.96 + 0.08 * u[0], 1.0, 0.96 + 0.08 * u[1]]),
+        headlight=0.5 + 0.8 * u[4],
+        lamp=_lamp_colour(u[7], u[8]),
+        lit_windows=0.06 + 0.4 * u[5] ** 2,
+        visibility_m=140 + 300 * u[6],
+    )
+    return (_night if common.is_night else _day)(common, u)
+
+
+def _sun(azimuth: float, elevation: float) -> Floats:
+    angle, height = 2 * math.pi * azimuth, math.radians(22 + 43 * elevation)
+    flat = math.cos(height)
+    return floats([math.sin(angle) * flat, math.sin(height), math.cos(angle) * flat])
+
+
+def _lamp_colour(on: float, warm: float) -> Floats:
+    """Street lamps are off in a quarter of the streets, and of any strength in the others."""
+    colour = floats([1.0, 0.72, 0.38] if warm < 0.5 else [0.85, 1.0, 0.85])
+    return colour * (0.25 + 0.87 * on if on < 0.75 else 0.0)
+
+
+def _day(light: Light, u: list[float]) -> Light:
+    """Clear, or in a third of the scenes cloudy."""
+    brighter = light._replace(exposure=1.25 * light.exposure)
+    if u[9] < 0.35:
+        grey = floats([0.74, 0.77, 0.82]) * (0.85 + 0.3 * u[10])
+        return brighter._replace(
+            direct=0.15, ambient=0.72, zenith=grey * 0.9, horizon=grey, cloud=0.25
+        )
+    return brighter._replace(
+        direct=0.95,
+        ambient=0.42,
+        zenith=floats([0.28, 0.50, 0.95]),
+        horizon=floats([0.80, 0.88, 0.98]),
+        cloud=0.9 * u[11],
+    )
+
+
+def _night(light: Light, u: list[float]) -> Light:
+    """A dark sky with some glow at the horizon; the camera sees a little green, as MFNet's does."""
+    return light._replace(
+        ambient=0.010 + 0.022 * u[10],
+        zenith=floats([0.004, 0.005, 0.010]),
+        horizon=floats([0.026, 0.022, 0.018]) * (0.6 + u[11]),
+        cloud=0.3,
+        exposure=1.5 * light.exposure,
+        tint=light.tint * floats([0.93, 1.03, 0.92]),
+    )

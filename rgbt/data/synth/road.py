@@ -1,0 +1,183 @@
+"""The road: its course, and everything painted or raised on the ground, as strips of quads."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.data.synth.camera import Floats
+from rgbt.data.synth.materials import INDEX
+from rgbt.data.synth.shapes import CURVE, MAX_CORNERS, UNLABELED
+from rgbt.randomness import numpy_generator
+
+KERB_M = (0.24, 0.17)
+"""Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels."""
+
+_STEPS = np.array([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250], np.float32)
+
+
+Numbers = float | NDArray[np.float64] | Floats
+
+
+class Road(NamedTuple):
+    """Course and cross-section.
+
+    Attributes:
+        half_width: metres from the centre line to the kerb.
+        centre: X of the centre line beside the camera; positive, traffic keeps left.
+        curvature: 1 / metres, positive to the right.
+        sidewalk: widths in metres (left, right).
+        kerb: whether there is one (left, right).
+        crossing_z: distance of a zebra crossing, or None.
+        line_phase: where in a dash the centre line begins, 0..1.
+        edge_line: whether there are solid lines along the edges.
+        patches: (n, 4) rows of Z, lateral position, width and length of repaired asphalt.
+        manhole: (Z, lateral position).
+    """
+
+    half_width: float
+    centre: float
+    curvature: float
+    sidewalk: tuple[float, float]
+    kerb: tuple[bool, bool]
+    crossing_z: float | None
+    line_phase: float
+    edge_line: bool
+    patches: NDArray[np.float64]
+    manhole: tuple[float, float]
+
+    def x(self, z: float, lateral: float) -> float:
+        """X of a point `lateral` metres right of the centre line at distance `z`."""
+        return self.centre + lateral + 0.5 * self.curvature * z * z
+
+    def heading(self, z: float) -> float:
+        """Direction of the road at distance `z`, radians to the right of Z."""
+        return math.atan(self.curvature * z)
+
+
+def draw_road(seed: int, index: int) -> Road:
+    """The road of one scene."""
+    generator = numpy_generator(seed, "synth/road", index)
+    u = generator.random(16).tolist()
+    half_width = 2.7 + 1.2 * u[0]
+    return Road(
+        half_width=half_width,
+        centre=half_width * (0.30 + 0.25 * u[1]),
+        curvature=0.0055 * (u[2] - 0.5) * (u[3] > 0.4),
+        sidewalk=(1.6 + 2.2 * u[4], 1.6 + 2.2 * u[5]),
+        kerb=(u[6] < 0.8, u[7] < 0.75),
+        crossing_z=7 + 9 * u[8] if u[9] < 0.3 else None,
+        line_phase=u[10],
+        edge_line=u[11] < 0.5,
+        patches=generator.random((3, 4)) * (24, 4, 1.6, 4) + (4, -2, 0.6, 1.5),
+        manhole=(5 + 10 * u[12], half_width * (u[13] - 0.5)),
+    )
+
+
+class Quads(NamedTuple):
+    """Quads on the ground in drawing order: corners (F, 8, 3), material (F,), label (F,)."""
+
+    corners: Floats
+    material: NDArray[np.intp]
+    label: NDArray[np.intp]
+
+
+def ground_quads(road: Road) -> Quads:
+    """Terrain, sidewalks, asphalt, markings and kerbs, from bottom to top."""
+    w, (left, right) = road.half_width, road.sidewalk
+    strips = [
+        ("paving", UNLABELED, _strip(-w - left, -w)),
+        ("paving", UNLABELED, _strip(w, w + right)),
+        ("asphalt", UNLABELED, _strip(-w, w)),
+        ("patch", UNLABELED, _patches(road)),
+        *(("line", UNLABELED, rows) for rows in _markings(road)),
+        *_kerbs(road),
+    ]
+    counts = [len(rows) for _, _, rows in strips]
+    flat = [_flat(TERRAIN), _flat(_circle(road, *road.manhole, 0.36))]
+    first = [INDEX["grass"], INDEX["manhole"]]
+    return Quads(
+        np.concatenate(
+            [flat[0], _corners(road, np.concatenate([rows for _, _, rows in strips])), flat[1]]
+        ),
+        np.concatenate(
+            [first[:1], np.repeat([INDEX[name] for name, _, _ in strips], counts), first[1:]]
+        ),
+        np.concatenate([[0], np.repeat([label for _, label, _ in strips], counts), [0]]),
+    )
+
+
+TERRAIN = [(-2500.0, -2.0), (-2500.0, 2500.0), (2500.0, 2500.0), (2500.0, -2.0)]
+"""Corners (X, Z) of the ground around the road."""
+
+
+def _flat(outline: list[tuple[float, float]]) -> Floats:
+    padded = outline + [outline[-1]] * (MAX_CORNERS - len(outline))
+    return np.array([[(x, 0, z) for x, z in padded]], np.float32)
+
+
+def _circle(road: Road, z: float, lateral: float, radius: float) -> list[tuple[float, float]]:
+    angles = [2 * math.pi * corner / MAX_CORNERS for corner in range(MAX_CORNERS)]
+    x = road.x(z, lateral)
+    return [(x + radius * math.cos(angle), z + radius * math.sin(angle)) for angle in angles]
+
+
+def _rows(
+    start: Numbers, end: Numbers, left: Numbers, right: Numbers, y: tuple[float, float] = (0, 0)
+) -> Floats:
+    """Quads as rows: Z of both ends, lateral position of both sides, height of both sides."""
+    columns = (start, end, left, right, *y)
+    rows = np.empty((max(np.size(column) for column in columns), 6), np.float32)
+    for number, column in enumerate(columns):
+        rows[:, number] = column
+    return rows
+
+
+def _strip(left: float, right: float, y: tuple[float, float] = (0, 0)) -> Floats:
+    """A strip along the whole road."""
+    return _rows(_STEPS[:-1], _STEPS[1:], left, right, y)
+
+
+def _corners(road: Road, rows: Floats) -> Floats:
+    """Corners (n, 8, 3) of quads given as rows, bent along the road."""
+    corners = np.empty((len(rows), MAX_CORNERS, 3), np.float32)
+    ends, sides, heights = rows[:, [0, 1, 1, 0]], rows[:, [2, 2, 3, 3]], rows[:, [4, 4, 5, 5]]
+    corners[:, :4, 0] = sides + road.centre + 0.5 * road.curvature * ends * ends
+    corners[:, :4, 1] = heights
+    corners[:, :4, 2] = ends
+    corners[:, 4:] = corners[:, 3:4]
+    return corners
+
+
+def _patches(road: Road) -> Floats:
+    z, x, width, length = road.patches.T
+    return _rows(z, z + length, x, x + width)
+
+
+def _markings(road: Road) -> list[Floats]:
+    """Dashes along the middle; in some streets edge lines, a zebra crossing with a stop line."""
+    starts = np.arange(14) * 5.0 - 5.0 * road.line_phase
+    lines = [_rows(starts, starts + 2.6, -0.07, 0.07)]
+    if road.edge_line:
+        inner = road.half_width - 0.35
+        lines += [_strip(-inner - 0.12, -inner), _strip(inner, inner + 0.12)]
+    if road.crossing_z is not None:
+        x = np.arange(-road.half_width + 0.5, road.half_width - 0.7, 0.9)
+        lines.append(_rows(road.crossing_z, road.crossing_z + 2.6, x, x + 0.45))
+        stop = road.crossing_z - 1.6
+        lines.append(_rows(stop, stop + 0.35, -road.half_width + 0.3, -0.1))
+    return lines
+
+
+def _kerbs(road: Road) -> list[tuple[str, int, Floats]]:
+    width, height = KERB_M
+    strips = []
+    for side, present in zip((-1, 1), road.kerb, strict=True):
+        if present:
+            inner, outer = side * road.half_width, side * (road.half_width + width)
+            strips.append(("kerb_top", CURVE, _strip(inner, outer, (height, height))))
+            strips.append(("kerb_face", CURVE, _strip(inner, inner, (0, height))))
+    return strips

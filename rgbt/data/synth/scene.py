@@ -1,0 +1,155 @@
+"""One scene from factors to images: places, draws, lights, and the second frame after a motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.data.synth import rgb, thermal
+from rgbt.data.synth.camera import Camera, Floats, camera_of, flow_between
+from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
+from rgbt.data.synth.factors import EgoMotion, SceneFactors
+from rgbt.data.synth.lamps import Lamp, lamps_of
+from rgbt.data.synth.layout import place_objects
+from rgbt.data.synth.light import Light, draw_light
+from rgbt.data.synth.placement import Placed
+from rgbt.data.synth.raster import draw
+from rgbt.data.synth.road import draw_road, ground_quads
+from rgbt.data.synth.scenery import place_scenery
+from rgbt.data.synth.surface import shadow_map, surface_of
+from rgbt.randomness import numpy_generator
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One frame.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, RGB order.
+        thermal: (H, W) uint8.
+        label: (H, W) uint8, MFNet's class ids 0..8.
+        depth: (H, W) float32, metres along the optical axis; infinity for the sky.
+        is_night: whether it is night.
+        camera: where the frame was taken from.
+    """
+
+    rgb: NDArray[np.uint8]
+    thermal: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+    depth: Floats
+    is_night: bool
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class ScenePair:
+    """Two consecutive frames of one scene in which nothing moves but the camera.
+
+    Attributes:
+        first: the frame before the motion.
+        second: the frame after it.
+        flow: (H, W, 2) float32, for each pixel of `second` the displacement (rows, columns) to
+            where its surface point lies in `first`; NaN where that is behind the first camera.
+        visible: (H, W) bool, for each pixel of `second`: its surface point is seen in `first`.
+    """
+
+    first: Scene
+    second: Scene
+    flow: Floats
+    visible: NDArray[np.bool_]
+
+
+class _World(NamedTuple):
+    facets: Facets
+    placed: list[Placed]
+    light: Light
+    lamps: list[Lamp]
+
+
+def render_scene(seed: int, index: int, factors: SceneFactors) -> Scene:
+    """Scene `index` of the endless data set `seed`; the same arguments give the same bytes.
+
+    Args:
+        seed: of the data set, any integer.
+        index: number of the scene, >= 0.
+        factors: what the scene is made of.
+    """
+    return _frame(_world(seed, index, factors), camera_of(factors), factors, (seed, index, 0))
+
+
+def render_pair(seed: int, index: int, factors: SceneFactors, motion: EgoMotion) -> ScenePair:
+    """Scene `index` before and after the camera's `motion`, with exact flow.
+
+    The first frame is that of `render_scene`; texture, light and thermal drift stay, sensor noise
+    is drawn anew.
+
+    Args:
+        seed: of the data set.
+        index: number of the scene.
+        factors: what the scene is made of.
+        motion: of the camera between the frames.
+    """
+    world = _world(seed, index, factors)
+    camera = camera_of(factors)
+    first = _frame(world, camera, factors, (seed, index, 0))
+    second = _frame(world, camera.moved(motion), factors, (seed, index, 1))
+    flow = flow_between(second.depth, second.camera, first.camera)
+    return ScenePair(first, second, flow, _visible(first, second, flow))
+
+
+def _world(seed: int, index: int, factors: SceneFactors) -> _World:
+    road = draw_road(seed, index)
+    light = draw_light(seed, index, factors.night_share)
+    placed = place_objects(seed, index, road, factors) + place_scenery(seed, index, road)
+    placed = sorted_for_drawing(placed)
+    return _World(facets_of(ground_quads(road), placed), placed, light, lamps_of(placed, light))
+
+
+def _frame(
+    world: _World, camera: Camera, factors: SceneFactors, key: tuple[int, int, int]
+) -> Scene:
+    seed, index, frame = key
+    facets, light = world.facets, world.light
+    drawing = draw(facets, camera)
+    shadow = shadow_map(world.placed, camera, light)
+    surface = surface_of(drawing, facets, camera, shadow, (seed, index))
+    strength = factors.texture_strength
+    image = rgb.render_rgb(surface, light, world.lamps, strength, seed)
+    heat = thermal.render_thermal(surface, light, strength)
+    rgb_noise = numpy_generator(seed, "synth/rgb_noise", index, frame)
+    thermal_noise = numpy_generator(seed, "synth/thermal_noise", index, frame)
+    return Scene(
+        rgb=rgb.develop(image, factors, rgb_noise),
+        thermal=thermal.develop(heat, factors, seed, index, thermal_noise),
+        label=np.concatenate([[0], facets.label]).astype(np.uint8)[drawing.ids],
+        depth=surface.depth,
+        is_night=light.is_night,
+        camera=camera,
+    )
+
+
+def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
+    """Pixels of `second` whose surface point is inside `first` and the nearest thing there."""
+    height, width = second.depth.shape
+    rows, columns = np.mgrid[:height, :width]
+    target_rows, target_columns = rows + flow[..., 0], columns + flow[..., 1]
+    inside = (target_rows >= 0) & (target_rows <= height - 1)
+    inside &= (target_columns >= 0) & (target_columns <= width - 1)
+    to_rows = np.rint(np.where(inside, target_rows, 0)).astype(int)
+    to_columns = np.rint(np.where(inside, target_columns, 0)).astype(int)
+    expected = _depth_in(first.camera, second)
+    found = first.depth[to_rows, to_columns]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        agrees = np.abs(1 / found - 1 / expected) < 0.03 / expected + 2e-3
+    return np.asarray(inside & agrees)
+
+
+def _depth_in(camera: Camera, scene: Scene) -> Floats:
+    """Depth along the axis of `camera` of each pixel of `scene`."""
+    inverse = 1.0 / scene.depth
+    points = scene.camera.to_world(scene.camera.rays(), inverse)
+    depth = camera.to_camera(np.moveaxis(points, 0, 2).astype(np.float64))[..., 2]
+    return np.where(np.isinf(scene.depth), np.inf, depth).astype(np.float32)

@@ -1,0 +1,108 @@
+"""The thermal image: temperatures of what is seen, blurred, drifting and noisy.
+
+It follows the materials, not the classes: an engine differs from a door, a parked car is as cold as
+the street, a warm outlet shines like a person.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.data.synth import materials
+from rgbt.data.synth.camera import Floats
+from rgbt.data.synth.factors import SceneFactors
+from rgbt.data.synth.light import Light
+from rgbt.data.synth.raster import average
+from rgbt.data.synth.rgb import eight_bits
+from rgbt.data.synth.surface import Surface
+from rgbt.randomness import numpy_generator
+
+_COLDEST, _SPAN = -45.0, 95.0
+"""Range in degrees above the air that eight bits per facet cover."""
+
+_LEVEL, _PER_DEGREE = 0.21, 0.026
+"""Grey level (1 = full scale) of air temperature, and per degree, as MFNet's camera shows them."""
+
+_DAY, _NIGHT, _HEAT = (materials.column(name) for name in ("day", "night", "heat"))
+_TEXTURES = materials.column("heat_texture")
+
+
+def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
+    """Temperature of each pixel.
+
+    Args:
+        surface: what each pixel shows.
+        light: day or night, and the sun.
+        strength: factor on texture.
+
+    Returns:
+        (H, W) float32, degrees above the air, without blur, drift and noise.
+    """
+    table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
+    degrees = np.concatenate([[-34.0], _facet_degrees(surface, light)])
+    table[:, 0] = np.clip((degrees - _COLDEST) / _SPAN * 255, 0, 255)
+    table[0, 1] = 255
+    mean = average(table, surface.drawing)
+    heat = mean[..., 0].astype(np.float32) * np.float32(_SPAN / 255) + np.float32(_COLDEST)
+    heat += _TEXTURES[surface.material] * strength * surface.patches
+    heat -= surface.window * np.where(
+        surface.window_lit < light.lit_windows, np.float32(-4), np.float32(5)
+    )
+    if not light.is_night:
+        heat -= 5.0 * light.direct * surface.shadow
+    # The sky is warmer towards the horizon, where the path through the air is longer.
+    up = surface.camera.turned(surface.rays)[1]
+    lower = 14 * np.exp(-6 * np.maximum(up, 0)) * (mean[..., 1] / np.float32(255))
+    return np.asarray(heat + lower, np.float32)
+
+
+def _facet_degrees(surface: Surface, light: Light) -> Floats:
+    facets = surface.facets
+    degrees = (_NIGHT if light.is_night else _DAY)[facets.material]
+    degrees = degrees + _HEAT[facets.material] * facets.warmth
+    if not light.is_night:
+        facing = np.maximum(surface.drawing.normals[1:] @ light.sun, 0)
+        degrees = degrees + 4.0 * light.direct * (facing - 0.5) * ~facets.on_ground
+    return np.asarray(degrees, np.float32)
+
+
+def develop(
+    heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Contrast, lens, drift, noise and eight bits.
+
+    The noise has three parts of the same strength factor: per pixel, per column, and smeared over
+    neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
+    belong to the scene, so two frames of one scene share them.
+
+    Args:
+        heat: (H, W) float32 of `render_thermal`.
+        factors: contrast, drift, noise.
+        seed: of the data set.
+        index: of the scene.
+        generator: of the noise of this frame.
+
+    Returns:
+        (H, W) uint8.
+    """
+    height, width = heat.shape
+    drift = numpy_generator(seed, "synth/drift", index)
+    gain = 1.0 + 2.0 * factors.thermal_drift * float(drift.standard_normal())
+    coarse = drift.standard_normal((4, 5)).astype(np.float32)
+    offset = (
+        cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) * factors.thermal_drift
+    )
+    grey = _LEVEL + _PER_DEGREE * factors.thermal_contrast * gain * _blurred(heat) + offset
+    pixel, column = (
+        generator.standard_normal(heat.shape, np.float32),
+        generator.standard_normal(width, np.float32),
+    )
+    grey += factors.thermal_noise * (0.75 * pixel + 0.35 * column + 1.4 * _blurred(pixel))
+    return eight_bits(grey)
+
+
+def _blurred(image: Floats) -> Floats:
+    """The thermal lens is softer than the RGB lens: 0.7 pixels at a width of 160."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7 * image.shape[1] / 160))

@@ -1,0 +1,156 @@
+"""Writes scenes in MFNet's layout: images, labels, split lists; in parallel where it is worth it.
+
+images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
+train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
+next/               the same names after the ego-motion, with flow/NAME.npy, where asked for
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from rgbt.checks import check_range
+from rgbt.data.synth.factors import EgoMotion, SceneFactors
+from rgbt.data.synth.light import is_night
+from rgbt.data.synth.scene import Scene, render_pair, render_scene
+
+_WORTH_A_POOL = 200
+"""Scenes; fewer are written before a pool has started."""
+
+_WORTH_A_BAR = 100
+"""Scenes; about a second's work."""
+
+_FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+"""A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a written data set consists of; equal plans give equal files.
+
+    Attributes:
+        seed: of the data set.
+        num_train: scenes of the training split.
+        num_val: scenes of the validation split.
+        num_test: scenes of the test split.
+        factors: what the scenes are made of.
+        motion: of the camera to a second frame of every scene, or None for single frames.
+    """
+
+    seed: int
+    num_train: int
+    num_val: int
+    num_test: int
+    factors: SceneFactors
+    motion: EgoMotion | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError where a split is empty or names would need more than five digits."""
+        for name in ("num_train", "num_val", "num_test"):
+            check_range(name, getattr(self, name), 1, 30_000)
+
+    @property
+    def num_scenes(self) -> int:
+        """Scenes in all splits."""
+        return self.num_train + self.num_val + self.num_test
+
+    def name(self, index: int) -> str:
+        """Five digits and D (day) or N (night), as in MFNet; indices run on over the splits."""
+        night = is_night(self.seed, index, self.factors.night_share)
+        return f"{index:05d}{'N' if night else 'D'}"
+
+
+def write(plan: Plan, folder: Path) -> None:
+    """Write the whole data set into `folder`, which exists.
+
+    Args:
+        plan: what to write.
+        folder: receives images, labels, lists.
+
+    Raises:
+        OSError: the files cannot be written.
+    """
+    roots = [folder, folder / "next"] if plan.motion else [folder]
+    for root in roots:
+        for sub in ("images", "labels", *(["flow"] if root != folder else [])):
+            (root / sub).mkdir(parents=True)
+    with _advancing(plan.num_scenes) as advance:
+        for _ in _for_each(partial(write_index, plan, folder), range(plan.num_scenes)):
+            advance()
+    for root in roots:
+        _write_lists(plan, root)
+
+
+def _write_lists(plan: Plan, root: Path) -> None:
+    names = [plan.name(index) for index in range(plan.num_scenes)]
+    test = names[plan.num_train + plan.num_val :]
+    lists = {
+        "train": names[: plan.num_train],
+        "val": names[plan.num_train : plan.num_train + plan.num_val],
+        "test": test,
+        "test_day": [name for name in test if name.endswith("D")],
+        "test_night": [name for name in test if name.endswith("N")],
+    }
+    for split, lines in lists.items():
+        (root / f"{split}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
+
+def write_index(plan: Plan, folder: Path, index: int) -> None:
+    """Render and write one scene, with its second frame where the plan has a motion."""
+    cv2.setNumThreads(1)
+    name = plan.name(index)
+    if plan.motion is None:
+        _write_scene(render_scene(plan.seed, index, plan.factors), folder, name)
+        return
+    pair = render_pair(plan.seed, index, plan.factors, plan.motion)
+    _write_scene(pair.first, folder, name)
+    _write_scene(pair.second, folder / "next", name)
+    flow = np.where(pair.visible[..., None], pair.flow, np.float32(np.nan))
+    np.save(folder / "next" / "flow" / f"{name}.npy", flow)
+
+
+def _write_scene(scene: Scene, root: Path, name: str) -> None:
+    # OpenCV stores its first three channels as B, G, R; the fourth, alpha, is thermal.
+    packed = np.dstack([scene.rgb[..., ::-1], scene.thermal])
+    _write_png(root / "images" / f"{name}.png", packed)
+    _write_png(root / "labels" / f"{name}.png", scene.label)
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    _, encoded = cv2.imencode(".png", image, _FAST_PNG)
+    path.write_bytes(encoded.tobytes())
+
+
+def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
+    """``work(index)`` for every index, on all cores where there are many."""
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if len(indices) < _WORTH_A_POOL or cores == 1:
+        yield from map(work, indices)
+        return
+    # Forked workers need not import the caller's main module again; only Linux forks safely.
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    with ProcessPoolExecutor(cores, mp_context=context) as pool:
+        yield from pool.map(work, indices, chunksize=8)
+
+
+@contextmanager
+def _advancing(total: int) -> Iterator[partial[None]]:
+    """A progress bar on stderr, gone when done; none for what takes less than about a second."""
+    hidden = total < _WORTH_A_BAR
+    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
+        task = progress.add_task("writing synthetic scenes", total=total)
+        yield partial(progress.advance, task)

@@ -1,0 +1,74 @@
+"""Pixel-wise cross-entropy for networks that return dense class scores."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_shape
+from rgbt.types import IGNORE, Batch, Output
+
+
+class CrossEntropy:
+    """Mean over labelled pixels of ``-c_y log softmax(s)_y``, divided by the mean of ``c_y``.
+
+    Pixels labelled 255 are left out; a batch without a labelled pixel costs 0.
+
+    Args:
+        class_weights: c, one value >= 0 per class; null weighs all classes alike.
+
+    Raises:
+        InputError: a negative weight.
+    """
+
+    def __init__(self, *, class_weights: tuple[float, ...] | None) -> None:
+        if class_weights is not None and min(class_weights, default=-1.0) < 0:
+            raise InputError(
+                f"loss.class_weights needs one number of at least 0 per class, got {class_weights}."
+            )
+        self.class_weights = class_weights
+
+    def __call__(
+        self,
+        output: Output,
+        batch: Batch,
+        generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
+    ) -> dict[str, Tensor]:
+        """The part "cross_entropy".
+
+        Args:
+            output: with `logits` (B, K, H, W).
+            batch: with `label` (B, H, W).
+            generator: not drawn from.
+
+        Returns:
+            one value, shape (1,), float32.
+
+        Raises:
+            InputError: a network without dense scores, or class weights of another number.
+            ValueError: label and scores of different size.
+        """
+        if output.logits is None:
+            raise InputError(
+                "loss=cross_entropy needs a network that returns dense class scores in training; "
+                "choose loss=set_criterion for this one."
+            )
+        sizes = check_shape("logits", output.logits, "B K H W")
+        check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
+        weights = self._weights(sizes["K"], output.logits.device)
+        logits = output.logits.float()
+        total = F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="sum")
+        kept = batch.label[batch.label != IGNORE]
+        # The smallest float only matters where nothing is labelled and the sum is 0.
+        normaliser = weights[kept].sum().clamp(min=torch.finfo(torch.float32).tiny)
+        return {"cross_entropy": (total / normaliser).reshape(1)}
+
+    def _weights(self, num_classes: int, device: torch.device) -> Tensor:
+        weights = self.class_weights or (1.0,) * num_classes
+        if len(weights) != num_classes:
+            raise InputError(
+                f"loss.class_weights holds {len(weights)} numbers, the network has {num_classes} "
+                "classes; give one per class."
+            )
+        return torch.tensor(weights, device=device)

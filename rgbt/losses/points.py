@@ -1,0 +1,141 @@
+"""Points at which masks are compared, instead of at every pixel: drawing, reading, keeping.
+
+Part of the set criterion. Points are (x, y) in [-1, 1], the coordinates of `grid_sample`: -1 and 1
+are the outer edges of the outermost pixels, so one point means the same place at every resolution.
+Letters beyond `rgbt.types`: ``N`` points, ``R`` maps (any number of masks, stacked), ``S`` sets,
+one per (layer, pass), layer-major.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.types import IGNORE
+
+
+class Points(Protocol):
+    """Where points come from: drawn (`PointSource`) or, in tests, replayed."""
+
+    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
+        """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
+        ...
+
+    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
+        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
+        ...
+
+
+class PointSource:
+    """Independent uniform points from one generator.
+
+    Draws are made set by set in the order in which they are asked for, so that the numbers do not
+    depend on how many sets are asked for at once. The criterion asks for the matcher's points of
+    all (layer, pass) pairs, then for the loss points of all pairs; within a loss set, the points of
+    one mask are its candidates followed by its random remainder.
+
+    A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
+    image): four coordinates come from one random integer, in half the time of four floats.
+
+    Args:
+        generator: the only source of randomness, on any device.
+        device: where the points are needed.
+    """
+
+    def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
+        self.generator = generator
+        self.device = device
+
+    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
+        """See `Points.matcher`."""
+        return self._draw(num_sets, num_images, num_points)
+
+    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
+        """See `Points.loss`."""
+        return self._draw(num_sets, num_masks, num_points)
+
+    def _draw(self, *shape: int) -> Tensor:
+        numbers = 2 * math.prod(shape[1:])
+        bits = torch.empty(
+            shape[0], -(-numbers // 4), dtype=torch.int64, device=self.generator.device
+        )
+        for one_set in bits:
+            one_set.random_(generator=self.generator)
+        # 63 random bits are four words of 16; the top bit of each is cut, because one is always 0.
+        words = bits.view(torch.int16)[:, :numbers].bitwise_and_(0x7FFF).to(self.device)
+        return words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14).reshape(*shape, 2)
+
+
+def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
+    """Bilinear values of maps at points.
+
+    Source: Mask2Former, point_features.py (PointRend), align_corners False.
+
+    Args:
+        maps: (R, C, h, w) float.
+        points: (R, S, N, 2) in [-1, 1], (x, y); every channel of map r is read at points[r].
+        outside: what lies beyond the outermost pixel centres.
+
+    Returns:
+        (R, C, S, N), dtype of `maps`.
+    """
+    return F.grid_sample(maps, points, mode="bilinear", padding_mode=outside, align_corners=False)
+
+
+def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
+    """Bilinear values of the binary masks of all classes at points, without making the masks.
+
+    The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
+    point are read once, not once per class.
+
+    Args:
+        label: (B, H, W) int64; 255 belongs to no class.
+        points: (S, B, N, 2) in [-1, 1].
+        num_classes: K.
+
+    Returns:
+        (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or outside.
+    """
+    height, width = label.shape[1:]
+    sets, images, count = points.shape[:3]
+    # A frame of ignored pixels stands for the outside, so that no index needs a check.
+    framed = F.pad(label, (1, 1, 1, 1), value=IGNORE).clamp(max=num_classes).flatten(1)
+    x = (points[..., 0] + 1) * (width / 2) + 0.5
+    y = (points[..., 1] + 1) * (height / 2) + 0.5
+    left, top = x.floor(), y.floor()
+    right_share, bottom_share = x - left, y - top
+    corner = (top.long() * (width + 2) + left.long()).transpose(0, 1).flatten(1)
+
+    shares = points.new_zeros(sets, images, num_classes + 1, count)
+    for down, across in product((0, 1), (0, 1)):
+        index = corner + (down * (width + 2) + across)
+        found = framed.gather(1, index).reshape(images, sets, 1, count).transpose(0, 1)
+        row = bottom_share if down else 1 - bottom_share
+        column = right_share if across else 1 - right_share
+        shares.scatter_add_(2, found, (row * column)[:, :, None])
+    return shares[:, :, :num_classes]
+
+
+def most_uncertain(logits: Tensor, points: Tensor, keep: int) -> Tensor:
+    """The `keep` points of each mask whose logits are nearest to 0, in no particular order.
+
+    Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.
+
+    Args:
+        logits: (R, N) float32, finite; overwritten.
+        points: (R, N, 2).
+        keep: 0 <= keep <= N.
+
+    Returns:
+        (R, keep, 2).
+    """
+    # Non-negative floats are ordered like their bits, and integers are selected much faster.
+    magnitude = logits.abs_().view(torch.int32)
+    index = magnitude.topk(keep, dim=1, largest=False, sorted=False).indices
+    kept = torch.view_as_complex(points).gather(1, index)
+    return torch.view_as_real(kept)

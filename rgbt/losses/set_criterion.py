@@ -1,0 +1,177 @@
+"""The set criterion of Mask2Former with SpatialSeg's weights, for all layers and passes at once.
+
+Not here: how passes are weighted against each other (`rgbt.schemes`).
+Letters beyond `rgbt.types`: ``S`` sets, one per (layer, pass), layer-major; ``N`` points; ``G``
+targets of the batch: one per class present in an image, by image, then by class.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, distributed
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_range, check_shape
+from rgbt.losses.masks import Sampling, mask_losses
+from rgbt.losses.matcher import Matcher, Matches, targets_of
+from rgbt.losses.points import Points, PointSource
+from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
+from rgbt.types import Batch, Output
+
+
+class SetCriterion:
+    """Class, mask and dice loss of queries matched to classes.
+
+        L = a CE + b BCE + d (1 - dice),  each summed over the prediction layers
+
+    CE is the mean over all queries, weighted by 1 or, where nothing is matched, `no_object_weight`.
+    BCE and dice are means over the N points of a matched mask, summed over masks and divided by the
+    number of targets of the batch over all processes (at least 1). Points: of `oversample_ratio` N
+    random ones the `importance_ratio` N nearest to the predicted border, the rest fresh.
+
+    Source: Mask2Former, Sec. 3.3 and 4.1; CRM, Eq. (4); `spatial`: SpatialSeg, Eqs. (14) to (17).
+    Paper: CRM gives 2.0 and 0.1 as two class coefficients.   Released: 0.1 is a class weight inside
+    the term that 2.0 multiplies, as here.
+
+    Args:
+        num_classes: K.
+        num_points: N, for matching and for the losses.
+        oversample_ratio: >= 1.
+        importance_ratio: in [0, 1].
+        class_weight: a.
+        mask_weight: b.
+        dice_weight: d.
+        no_object_weight: >= 0.
+        deep_supervision: whether the auxiliary layers count, or the last one alone.
+        spatial: weights of the pixels in BCE and dice.
+
+    Raises:
+        InputError: a setting out of its range.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        *,
+        num_classes: int,
+        num_points: int,
+        oversample_ratio: float,
+        importance_ratio: float,
+        class_weight: float,
+        mask_weight: float,
+        dice_weight: float,
+        no_object_weight: float,
+        deep_supervision: bool,
+        spatial: SpatialWeight = PLAIN,
+    ) -> None:
+        if num_points < 1:
+            raise InputError(f"loss.num_points must be at least 1, got {num_points}.")
+        if not oversample_ratio >= 1:
+            raise InputError(f"loss.oversample_ratio must be at least 1, got {oversample_ratio}.")
+        check_range("loss.importance_ratio", importance_ratio, 0.0, 1.0)
+        self.num_classes = num_classes
+        kept = int(num_points * importance_ratio)
+        candidates = int(num_points * oversample_ratio)
+        self.sampling = Sampling(candidates=candidates, kept=kept, fresh=num_points - kept)
+        self.part_weights = {"class": class_weight, "mask": mask_weight, "dice": dice_weight}
+        self.no_object_weight = no_object_weight
+        self.deep_supervision = deep_supervision
+        self.spatial = spatial
+        self.matcher = Matcher(
+            num_points=num_points,
+            class_weight=class_weight,
+            mask_weight=mask_weight,
+            dice_weight=dice_weight,
+        )
+
+    def __call__(
+        self, output: Output, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """The parts "class", "mask" and "dice", weighted and summed over the layers.
+
+        Args:
+            output: `aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits"
+                (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
+                the prediction.
+            batch: with `label` (B, H, W), H <= 4h and W <= 4w; the weighted loss reads `position`.
+            generator: draws the points (order: `rgbt.losses.points.PointSource`).
+
+        Returns:
+            name -> (P,) float32.
+
+        Raises:
+            InputError: a network that predicts no masks; positions missing for the weighted loss.
+            RunError: predictions that are not finite.
+            ValueError: shapes or labels that do not fit.
+        """
+        return self.compare(output, batch, PointSource(generator, device=batch.label.device))
+
+    def compare(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
+        """As `__call__`, at given points."""
+        layers = self.layers(output, batch, points)
+        return {name: weight * layers[name].sum(0) for name, weight in self.part_weights.items()}
+
+    def layers(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
+        """The parts of every layer, not weighted.
+
+        Returns:
+            name -> (L, P) float32; L = 1 without deep supervision.
+        """
+        class_logits, mask_logits = self._predictions(output, batch)
+        passes = class_logits.shape[1]
+        padded_hw = (4 * mask_logits.shape[-2], 4 * mask_logits.shape[-1])
+        # Costs and sums over thousands of points are kept in float32 under autocast too.
+        with torch.autocast(mask_logits.device.type, enabled=False):
+            spatial = None
+            if self.spatial.active:
+                spatial = SpatialMap(batch, padded_hw, settings=self.spatial, num_passes=passes)
+            targets = targets_of(batch.label, padded_hw, self.num_classes, spatial)
+            matches = self.matcher(class_logits, mask_logits, targets, points)
+            mask, dice = mask_losses(mask_logits, targets, matches, points, self.sampling)
+            count = self._count(len(matches.image), mask.device)
+            parts = {"mask": mask / count, "dice": dice / count}
+            parts["class"] = self._class_loss(class_logits, matches)
+        return {name: values.reshape(-1, passes) for name, values in parts.items()}
+
+    def _predictions(self, output: Output, batch: Batch) -> tuple[Tensor, Tensor]:
+        missing = {"class_logits", "mask_logits"} - set(output.aux)
+        if missing:
+            raise InputError(
+                f"loss=set_criterion needs a network that predicts masks; its output lacks "
+                f"{sorted(missing)}. Choose model=mask2former_tiny or loss=cross_entropy."
+            )
+        class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
+        sizes = check_shape("class_logits", class_logits, "L P B Q C", C=self.num_classes + 1)
+        sizes = {letter: sizes[letter] for letter in "LPBQ"}
+        sizes = check_shape("mask_logits", mask_logits, "L P B Q h w", **sizes)
+        label = check_shape("label", batch.label, "B H W", B=sizes["B"])
+        if label["H"] > 4 * sizes["h"] or label["W"] > 4 * sizes["w"]:
+            raise ValueError(
+                f"label: {label['H']}x{label['W']} does not fit into four times the masks, "
+                f"{sizes['h']}x{sizes['w']}."
+            )
+        # Not `[0:]`: its backward would copy the gradient of all masks.
+        if self.deep_supervision:
+            return class_logits, mask_logits
+        return class_logits[-1:], mask_logits[-1:]
+
+    def _class_loss(self, logits_LPBQC: Tensor, matches: Matches) -> Tensor:
+        """(S,): cross-entropy of all queries, divided by the sum of their weights."""
+        layers, passes, images, queries = logits_LPBQC.shape[:4]
+        labels = np.full((layers * passes, images, queries), self.num_classes)
+        sets, columns = np.nonzero(matches.query >= 0)
+        labels[sets, matches.image[columns], matches.query[sets, columns]] = matches.label[columns]
+        label_SQ = torch.from_numpy(labels).to(logits_LPBQC.device).flatten(1)
+        weights = torch.ones(self.num_classes + 1, device=logits_LPBQC.device)
+        weights[-1] = self.no_object_weight
+        logits = logits_LPBQC.float().reshape(layers * passes, images * queries, -1)
+        each = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
+        return each.sum(1) / weights[label_SQ].sum(1)
+
+    def _count(self, num_targets: int, device: torch.device) -> Tensor:
+        """() float32: targets of the batch, averaged over the processes, at least 1."""
+        count = torch.tensor(float(num_targets), device=device)
+        if distributed.is_available() and distributed.is_initialized():
+            distributed.all_reduce(count)
+            count = count / distributed.get_world_size()
+        return count.clamp(min=1)

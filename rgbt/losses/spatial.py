@@ -1,0 +1,175 @@
+"""Weights by distance from the image centre for the mask losses (SpatialSeg, Eqs. 14-17).
+
+Part of the set criterion. The SpatialSeg release holds no code for this loss; every choice that
+the paper leaves open is a named setting here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError, check_shape
+from rgbt.geometry import pad_to
+from rgbt.losses.points import sample
+from rgbt.types import Batch
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpatialWeight:
+    """Settings of the spatial-weighted mask losses.
+
+        w = 1 + alpha d / d_max            focus "edge"    (Eqs. 14, 15)
+        w = 1 + alpha (1 - d / d_max)      focus "center"  (Table VI, reversed)
+
+    d is the distance in pixels of the original image. Paper: everything below `focus` is open; the
+    first choice of each is the one nearest to the text or to Mask2Former.
+    With ``alpha: 0`` or ``focus: none`` the loss is the plain one whatever the other settings.
+
+    Attributes:
+        alpha: >= 0. Paper: 2.
+        focus: where the weight is largest.
+        centre: distance from pixel (rows // 2, columns // 2) of the original image, followed
+            through resizing, cropping and flipping ("tracked"), or of the crop ("crop").
+        d_max: largest distance within the original image or within the crop.
+        padding: weight of the padded rows and columns: as the farthest pixel ("map"), 1, or 0.
+        normaliser: the weighted cross-entropy is divided by the number of points (Eq. 16: W x H) or
+            by the sum of their weights.
+        dice_smoothing: 1 in numerator and denominator, as in the unweighted loss, or none (Eq. 17).
+        match: whether the matching costs are weighted too.
+        passes: which predictions are weighted: all, or those from RGB-T (clean and masked) alone.
+
+    Raises:
+        InputError: alpha below 0.
+    """
+
+    alpha: float
+    focus: Literal["none", "edge", "center"]
+    centre: Literal["tracked", "crop"]
+    d_max: Literal["original", "crop"]
+    padding: Literal["map", "one", "zero"]
+    normaliser: Literal["points", "weights"]
+    dice_smoothing: Literal["one", "none"]
+    match: Literal["unweighted", "weighted"]
+    passes: Literal["all", "fused"]
+
+    def __post_init__(self) -> None:
+        if not self.alpha >= 0:
+            raise InputError(f"loss.spatial.alpha must be at least 0, got {self.alpha}.")
+
+    @property
+    def active(self) -> bool:
+        """Whether the loss differs from the plain one at all."""
+        return self.alpha > 0 and self.focus != "none"
+
+
+PLAIN = SpatialWeight(
+    alpha=0.0,
+    focus="none",
+    centre="tracked",
+    d_max="original",
+    padding="map",
+    normaliser="points",
+    dice_smoothing="one",
+    match="unweighted",
+    passes="all",
+)
+"""No weighting."""
+
+
+class PointWeights(NamedTuple):
+    """What the weighted mask losses of R masks need.
+
+    Attributes:
+        values: (..., N) weight of every point.
+        total: (...) what the weighted cross-entropy is divided by.
+        smoothing: (...) what is added to numerator and denominator of the dice term.
+    """
+
+    values: Tensor
+    total: Tensor
+    smoothing: Tensor
+
+
+def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight) -> Tensor:
+    """Weight of every pixel of a padded crop (SpatialSeg, Eqs. 14 and 15; see `SpatialWeight`).
+
+    Args:
+        batch: with `position` and `original_hw`.
+        padded_hw: size to pad to, bottom and right.
+        settings: active settings.
+
+    Returns:
+        (B, 1, *padded_hw) float32.
+
+    Raises:
+        InputError: the batch does not say where its pixels come from.
+    """
+    if batch.position is None:
+        raise InputError(
+            "loss.spatial weights pixels by their place in the original image, which this "
+            "transform does not track; set transform.track_position=true or loss.spatial.alpha=0."
+        )
+    sizes = check_shape("position", batch.position, "B 2 H W", **{"2": 2})
+    original = batch.original_hw.to(batch.position)
+    centre = torch.div(original, 2, rounding_mode="floor")
+    if settings.centre == "crop":
+        centre = batch.position[:, :, sizes["H"] // 2, sizes["W"] // 2]
+
+    distance = torch.linalg.vector_norm(batch.position - centre[:, :, None, None], dim=1)
+    farthest = torch.maximum(centre, original - 1 - centre).norm(dim=1)
+    if settings.d_max == "crop":
+        farthest = distance.amax((1, 2))
+
+    relative = distance / farthest[:, None, None]
+    if settings.focus == "center":
+        relative = 1 - relative
+    far = 1.0 + settings.alpha if settings.focus == "edge" else 1.0
+    padding = {"map": far, "one": 1.0, "zero": 0.0}[settings.padding]
+    return pad_to(1 + settings.alpha * relative, padded_hw, padding)[:, None]
+
+
+class SpatialMap:
+    """The weights of one batch, read at points.
+
+    Args:
+        batch: see `weight_map`.
+        padded_hw: see `weight_map`.
+        settings: active settings.
+        num_passes: P, stacked passes of the batch, for `passes: fused`: the clean RGB-T pass is
+            the first; a masked RGB-T pass, if any, is the last, after one or three clean ones.
+    """
+
+    def __init__(
+        self, batch: Batch, padded_hw: tuple[int, int], *, settings: SpatialWeight, num_passes: int
+    ) -> None:
+        self.map_B1HW = weight_map(batch, padded_hw, settings)
+        self.settings = settings
+        self.weighted_P = torch.ones(num_passes, dtype=torch.bool)
+        if settings.passes == "fused":
+            self.weighted_P[1:] = False
+            self.weighted_P[-1] = num_passes % 2 == 0 or num_passes == 1
+        self.weighted_P = self.weighted_P.to(self.map_B1HW.device)
+
+    def at(self, points: Tensor, image: Tensor, first_set: int) -> PointWeights:
+        """Weights at points.
+
+        Args:
+            points: (S, G, N, 2), see `rgbt.losses.points`.
+            image: (G,) int64, which image of the batch each of the G columns belongs to.
+            first_set: number of the first of the S sets; pass = set modulo P.
+        """
+        maps = self.map_B1HW[image]
+        values = sample(maps, points.transpose(0, 1), outside="border")[:, 0].transpose(0, 1)
+        sets = torch.arange(first_set, first_set + len(points), device=points.device)
+        weighted = self.weighted_P[sets % len(self.weighted_P)][:, None]
+        values = torch.where(weighted[..., None], values, 1.0)
+        count = torch.full_like(values[..., 0], values.shape[-1])
+        total = values.sum(-1) if self.settings.normaliser == "weights" else count
+        smoothing = torch.ones_like(count)
+        if self.settings.dice_smoothing == "none":
+            smoothing = smoothing.masked_fill(weighted, 0.0)
+        return PointWeights(values, total, smoothing)

@@ -1,0 +1,94 @@
+"""The two Swin branches and their fusion, one set of features per view."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.models.mask2former.swin import Stage, Swin, SwinShape
+from rgbt.types import MaskPair
+
+View = Literal["rgbt", "rgb", "thermal"]
+VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
+LEVELS = ("res2", "res3", "res4", "res5")
+
+
+class RgbtBackbone(nn.Module):
+    """RGB branch, thermal branch, and the normalised maximum (or sum) of their maps.
+
+    Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
+    a single modality leave as the branch normalised them.
+
+    Args:
+        shape: sizes of a branch.
+        share_start: stages from this index on (0..4) are the RGB branch's own in both branches;
+            embedding, output normalisations and mask token never are. 4 shares nothing.
+        fusion: "max" or "add".
+    """
+
+    def __init__(
+        self, shape: SwinShape, *, share_start: int, fusion: Literal["max", "add"]
+    ) -> None:
+        super().__init__()
+        self.fuse = torch.maximum if fusion == "max" else torch.add
+        self.RGB_branch = Swin(3, shape=shape, shared={})
+        stages = {i: s for i, s in enumerate(self.RGB_branch.layers) if isinstance(s, Stage)}
+        shared = {index: stage for index, stage in stages.items() if index >= share_start}
+        self.THR_branch = Swin(1, shape=shape, shared=shared)
+        self.norm_layers = nn.ModuleDict(
+            {
+                level: nn.BatchNorm2d(width)
+                for level, width in zip(LEVELS, shape.widths, strict=True)
+            }
+        )
+
+    def forward(
+        self,
+        images: tuple[Tensor, Tensor],
+        hidden: MaskPair | None = None,
+        *,
+        passes: int = 1,
+        views: tuple[View, ...] = ("rgbt",),
+        generator: torch.Generator | None = None,
+    ) -> list[Tensor]:
+        """Features of all views as one batch; a branch that no view needs is not run.
+
+        Args:
+            images: (N, 3, H, W) and (N, 1, H, W) normalised, sides multiples of 32.
+            hidden: per token, (N, H/4, W/4) bool each; None: nothing is hidden.
+            passes: N holds this many stacked copies of a batch; the fusion's batch normalisation
+                takes them one after the other, so that each is normalised on its own.
+            views: which sets of features, in this order along the batch.
+            generator: draws stochastic depth, first the RGB branch's, then the thermal one's.
+
+        Returns:
+            four (len(views) N, C_s, H/s, W/s), s = 4, 8, 16, 32.
+        """
+        maps: dict[str, list[Tensor]] = {}
+        if views != ("thermal",):
+            mask = None if hidden is None else hidden.rgb
+            maps["rgb"] = self.RGB_branch(images[0], mask, generator)
+        if views != ("rgb",):
+            mask = None if hidden is None else hidden.thermal
+            maps["thermal"] = self.THR_branch(images[1], mask, generator)
+        return [self._join(level, maps, passes, views) for level in range(len(LEVELS))]
+
+    def _join(
+        self, level: int, maps: dict[str, list[Tensor]], passes: int, views: tuple[View, ...]
+    ) -> Tensor:
+        """The maps of one level, views along the batch."""
+        parts: list[Tensor] = []
+        for view in views:
+            if view == "rgbt":
+                fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
+                parts += self._normalise(level, fused, passes)
+            else:
+                parts.append(maps[view][level])
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    def _normalise(self, level: int, fused: Tensor, passes: int) -> list[Tensor]:
+        """Batch normalisation of each pass; without batch statistics all are one call."""
+        norm = self.norm_layers[LEVELS[level]]
+        return [norm(part) for part in fused.chunk(passes if self.training else 1)]

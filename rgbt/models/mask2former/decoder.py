@@ -1,0 +1,267 @@
+"""Masked transformer decoder: queries read the image where their own mask says they are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, Pyramid
+from rgbt.models.mask2former.position import sine_code
+
+
+class Predictions(NamedTuple):
+    """Predictions of the untouched queries and after each layer.
+
+    Attributes:
+        class_logits: (L, B, Q, K + 1), last column = no object.
+        mask_logits: (L, B, Q, H/4, W/4), a view of memory ordered B, L, Q, H/4, W/4.
+    """
+
+    class_logits: Tensor
+    mask_logits: Tensor
+
+
+class Attention(nn.Module):
+    """Multi-head attention with the parameter layout of `torch.nn.MultiheadAttention`.
+
+    That module cannot take one mask for all heads of a sample without repeating it.
+    """
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * dim, dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
+        self.out_proj = nn.Linear(dim, dim)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.xavier_uniform_(self.out_proj.weight)
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None) -> Tensor:
+        """Scaled dot-product attention.
+
+        Args:
+            query: (B, Q, C).
+            key: (B, S, C).
+            value: (B, S, C).
+            allowed: (B, Q, S) bool, True = may be read, the same for all heads; None: all.
+
+        Returns:
+            (B, Q, C).
+        """
+        weights, biases = self.in_proj_weight.chunk(3), self.in_proj_bias.chunk(3)
+        q, k, v = (
+            F.linear(x, w, b).view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+            for x, w, b in zip((query, key, value), weights, biases, strict=True)
+        )
+        mask = None if allowed is None else allowed[:, None]
+        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        projected: Tensor = self.out_proj(out.transpose(1, 2).flatten(2))
+        return projected
+
+
+class CrossAttentionLayer(nn.Module):
+    """Queries read one level; added, then normalised."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.multihead_attn = Attention(dim, heads)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(
+        self,
+        queries: Tensor,
+        query_position: Tensor,
+        memory: tuple[Tensor, Tensor],
+        allowed: Tensor,
+    ) -> Tensor:
+        """(B, Q, C) -> (B, Q, C); `memory` is (keys, values), each (B, S, C)."""
+        read = self.multihead_attn(queries + query_position, *memory, allowed)
+        out: Tensor = self.norm(queries + read)
+        return out
+
+
+class SelfAttentionLayer(nn.Module):
+    """Queries read each other; added, then normalised."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.self_attn = Attention(dim, heads)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, queries: Tensor, query_position: Tensor) -> Tensor:
+        """(B, Q, C) -> (B, Q, C)."""
+        placed = queries + query_position
+        out: Tensor = self.norm(queries + self.self_attn(placed, placed, queries, None))
+        return out
+
+
+class FfnLayer(nn.Module):
+    """Linear, ReLU, linear; added, then normalised."""
+
+    def __init__(self, dim: int, ffn_dim: int) -> None:
+        super().__init__()
+        self.linear1 = nn.Linear(dim, ffn_dim)
+        self.linear2 = nn.Linear(ffn_dim, dim)
+        self.norm = nn.LayerNorm(dim)
+        for layer in (self.linear1, self.linear2):
+            nn.init.xavier_uniform_(layer.weight)
+
+    def forward(self, queries: Tensor) -> Tensor:
+        """(B, Q, C) -> (B, Q, C)."""
+        out: Tensor = self.norm(queries + self.linear2(F.relu(self.linear1(queries))))
+        return out
+
+
+class MaskEmbed(nn.Module):
+    """Three linear layers with ReLU between them: query -> mask embedding."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(dim, dim) for _ in range(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, Q, C) -> (B, Q, C)."""
+        first, second, third = self.layers
+        out: Tensor = third(F.relu(second(F.relu(first(x)))))
+        return out
+
+
+class Predictor(nn.Module):
+    """Query decoder with a prediction before the first and after every layer.
+
+    Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).
+
+    Args:
+        num_classes: K, without the no-object class.
+        hidden_dim: C.
+        num_queries: Q.
+        num_layers: decoder layers; layer i reads level i mod 3 (strides 32, 16, 8).
+        heads: attention heads.
+        ffn_dim: width of the feed-forward networks.
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        *,
+        hidden_dim: int,
+        num_queries: int,
+        num_layers: int,
+        heads: int,
+        ffn_dim: int,
+    ) -> None:
+        super().__init__()
+        dim, count = hidden_dim, range(num_layers)
+        self.transformer_self_attention_layers = nn.ModuleList(
+            SelfAttentionLayer(dim, heads) for _ in count
+        )
+        self.transformer_cross_attention_layers = nn.ModuleList(
+            CrossAttentionLayer(dim, heads) for _ in count
+        )
+        self.transformer_ffn_layers = nn.ModuleList(FfnLayer(dim, ffn_dim) for _ in count)
+        self.decoder_norm = nn.LayerNorm(dim)
+        self.query_feat = nn.Embedding(num_queries, dim)
+        self.query_embed = nn.Embedding(num_queries, dim)
+        self.level_embed = nn.Embedding(NUM_LEVELS, dim)
+        self.class_embed = nn.Linear(dim, num_classes + 1)
+        self.mask_embed = MaskEmbed(dim)
+
+    def forward(self, pyramid: Pyramid) -> Predictions:
+        """Predict classes and masks.
+
+        Args:
+            pyramid: what the pixel decoder returned.
+
+        Returns:
+            L = number of layers + 1 predictions, the last one final.
+        """
+        memories = self._memories(pyramid)
+        reduced = _reduce(pyramid)
+        position = self.query_embed.weight
+        queries = self.query_feat.weight.expand(len(pyramid.fine), -1, -1)
+        normed: list[Tensor] = [self.decoder_norm(queries)]
+        embeds: list[Tensor] = [self.mask_embed(normed[0])]
+        layers = zip(
+            self.transformer_cross_attention_layers,
+            self.transformer_self_attention_layers,
+            self.transformer_ffn_layers,
+            strict=True,
+        )
+        for index, (cross_attention, self_attention, ffn) in enumerate(layers):
+            level = index % NUM_LEVELS
+            with torch.no_grad():
+                allowed = _allowed(_mask_logits(embeds[-1], pyramid, reduced[level]))
+            queries = cross_attention(queries, position, memories[level], allowed)
+            queries = ffn(self_attention(queries, position))
+            normed.append(self.decoder_norm(queries))
+            embeds.append(self.mask_embed(normed[-1]))
+
+        # The masks of all layers are one matrix product: no copy, one gradient of the features.
+        class_logits = self.class_embed(torch.stack(normed))
+        masks = _mask_logits(torch.cat(embeds, dim=1), pyramid, pyramid.fine.flatten(2))
+        masks = masks.view(len(masks), len(embeds), -1, *pyramid.fine.shape[-2:])
+        return Predictions(class_logits, masks.transpose(0, 1))
+
+    def _memories(self, pyramid: Pyramid) -> list[tuple[Tensor, Tensor]]:
+        """Keys and values of the three levels, each (B, S_l, C)."""
+        memories = []
+        for tokens, hw, embed in zip(
+            pyramid.tokens, pyramid.levels, self.level_embed.weight, strict=True
+        ):
+            values = tokens + embed
+            code = sine_code(hw, values.shape[-1], values.device)
+            memories.append((values + code, values))
+        return memories
+
+
+def _mask_logits(embed: Tensor, pyramid: Pyramid, fine: Tensor) -> Tensor:
+    """Dot products of mask embeddings with mask features, the latter at any set of pixels.
+
+    Args:
+        embed: (B, Q, C).
+        pyramid: holds the map from fine to mask features.
+        fine: (B, C, pixels).
+
+    Returns:
+        (B, Q, pixels).
+    """
+    offset = embed @ pyramid.bias[:, None]
+    return torch.baddbmm(offset.expand(-1, -1, fine.shape[-1]), embed @ pyramid.weight, fine)
+
+
+@torch.no_grad()
+def _reduce(pyramid: Pyramid) -> list[Tensor]:
+    """Fine features at the size of each level, (B, C, S_l).
+
+    Resizing is linear: a resized mask is the product of the embedding with resized features,
+    which costs the size of the level instead of the size of the mask.
+    """
+    fine = pyramid.fine
+    return [shrink(fine, fine.shape[-1] // columns).flatten(2) for _, columns in pyramid.levels]
+
+
+def shrink(x: Tensor, factor: int) -> Tensor:
+    """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
+
+    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU.
+
+    Args:
+        x: (..., H, W), sides multiples of `factor`.
+        factor: even.
+
+    Returns:
+        (..., H / factor, W / factor).
+    """
+    low, high = factor // 2 - 1, factor // 2
+    rows = x[..., low::factor, :] + x[..., high::factor, :]
+    return (rows[..., low::factor] + rows[..., high::factor]) / 4
+
+
+def _allowed(mask_logits: Tensor) -> Tensor:
+    """(B, Q, S) bool: where a mask has probability 1/2 or more; everywhere if nowhere."""
+    inside = mask_logits >= 0
+    return inside | ~inside.any(-1, keepdim=True)

@@ -1,0 +1,260 @@
+"""RGB-T Mask2Former: backbone, pixel decoder and query decoder put together."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice, check_range, check_shape
+from rgbt.geometry import pad_to, padded_hw
+from rgbt.models.mask2former.backbone import VIEWS, RgbtBackbone, View
+from rgbt.models.mask2former.decoder import Predictions, Predictor
+from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
+from rgbt.models.mask2former.swin import PATCH, SwinShape
+from rgbt.types import MaskPair, Output
+
+
+class Head(nn.Module):
+    """Pixel decoder, then query decoder."""
+
+    def __init__(self, pixel_decoder: PixelDecoder, predictor: Predictor) -> None:
+        super().__init__()
+        self.pixel_decoder = pixel_decoder
+        self.predictor = predictor
+
+    def forward(self, features: list[Tensor]) -> Predictions:
+        """Features at strides 4, 8, 16, 32 -> predictions of all layers."""
+        predictions: Predictions = self.predictor(self.pixel_decoder(features))
+        return predictions
+
+
+class Mask2Former(nn.Module):
+    """Two-branch Mask2Former of CRM and SpatialSeg.
+
+    Source: CRM, Sec. III; SpatialSeg, Sec. III-A.   Released: UkcheolShin/CRM_RGBTSeg,
+    lab-sun/SpatialSeg (the same network).
+
+    Args:
+        num_classes: K, without the no-object class.
+        embed_dim: channels of the first stage; doubles from stage to stage.
+        depths: blocks per stage.
+        num_heads: attention heads per stage.
+        window_size: side of an attention window, in tokens.
+        mlp_ratio: width of a block's MLP over the block's.
+        drop_path_rate: stochastic depth of a branch's last block, 0 at the first, in [0, 1).
+        share_start: stages from this index on (0..4) are the same in both branches; 4 = none.
+        fusion: "max" or "add" of the two branches.
+        hidden_dim: channels of both decoders, a multiple of 32.
+        num_queries: Q.
+        encoder_layers: deformable layers of the pixel decoder.
+        encoder_ffn_dim: width of their feed-forward networks.
+        decoder_layers: layers of the query decoder, without the initial prediction.
+        decoder_ffn_dim: width of their feed-forward networks.
+        attention_heads: heads of both decoders.
+        pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
+        pixel_mean: of R, G, B, thermal, in 0..255.
+        pixel_std: of R, G, B, thermal, in 0..255.
+    """
+
+    pixel_mean: Tensor
+    pixel_std: Tensor
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: int,
+        embed_dim: int,
+        depths: tuple[int, int, int, int],
+        num_heads: tuple[int, int, int, int],
+        window_size: int,
+        mlp_ratio: float,
+        drop_path_rate: float,
+        share_start: int,
+        fusion: Literal["max", "add"],
+        hidden_dim: int,
+        num_queries: int,
+        encoder_layers: int,
+        encoder_ffn_dim: int,
+        decoder_layers: int,
+        decoder_ffn_dim: int,
+        attention_heads: int,
+        pixel_decoder_fp32: bool,
+        pixel_mean: tuple[float, float, float, float],
+        pixel_std: tuple[float, float, float, float],
+    ) -> None:
+        super().__init__()
+        shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
+        _check(shape, share_start, fusion, hidden_dim, attention_heads)
+        self.num_classes = num_classes
+        self.drop_path_rate = drop_path_rate
+        self.backbone = RgbtBackbone(shape, share_start=share_start, fusion=fusion)
+        pixel_decoder = PixelDecoder(
+            shape.widths,
+            hidden_dim=hidden_dim,
+            encoder_layers=encoder_layers,
+            heads=attention_heads,
+            ffn_dim=encoder_ffn_dim,
+            fp32=pixel_decoder_fp32,
+        )
+        predictor = Predictor(
+            num_classes,
+            hidden_dim=hidden_dim,
+            num_queries=num_queries,
+            num_layers=decoder_layers,
+            heads=attention_heads,
+            ffn_dim=decoder_ffn_dim,
+        )
+        self.sem_seg_head = Head(pixel_decoder, predictor)
+        for name, values in (("pixel_mean", pixel_mean), ("pixel_std", pixel_std)):
+            scaled = torch.tensor(values).view(4, 1, 1) / 255
+            self.register_buffer(name, scaled, persistent=False)
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        passes: int = 1,
+        views: tuple[View, ...] = ("rgbt",),
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Predictions of every view and pass, as one batch through the head.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1], N = passes * B, pass by pass.
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: cells of the padded image, (N, h, w) bool each, True = tokens are hidden;
+                a cell is a square of a multiple of 4 pixels. None: nothing is hidden.
+            passes: stacked copies of one batch. The fusion's batch normalisation sees them one
+                after the other, as successive calls would show them.
+            views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
+                "thermal". A branch that no view needs is not computed.
+            generator: draws stochastic depth, per sample and branch; needed in training mode
+                unless `drop_path_rate` is 0.
+
+        Returns:
+            logits: (B, K, H, W) float32 semantic scores in evaluation mode when there is one view
+                and one pass, else None. They are sums over queries, not normalised.
+            aux: with P = len(views) * passes, view by view, then pass by pass, and
+                L = decoder_layers + 1, the last one final:
+                "class_logits" (L, P, B, Q, K + 1), last column = no object;
+                "mask_logits" (L, P, B, Q, h, w) at 1/4 of the padded size; in memory the order
+                is P, B, L, Q, h, w.
+
+        Raises:
+            ValueError: shapes, passes or views that do not fit; no generator where one is needed.
+            InputError: mask cells that do not divide the padded image.
+        """
+        sizes = self._check_inputs(rgb, thermal, passes, views)
+        if self.training and self.drop_path_rate > 0 and generator is None:
+            raise ValueError("training with drop_path_rate > 0 needs `generator`, got None.")
+        image_hw = sizes["H"], sizes["W"]
+        full_hw = padded_hw(image_hw)
+        mean, std = self.pixel_mean, self.pixel_std
+        images = (
+            pad_to((rgb - mean[:3]) / std[:3], full_hw),
+            pad_to((thermal - mean[3:]) / std[3:], full_hw),
+        )
+        hidden = None if masks is None else _to_tokens(masks, sizes["N"], full_hw)
+        features = self.backbone(images, hidden, passes=passes, views=views, generator=generator)
+
+        classes, mask_logits = self.sem_seg_head(features)
+        logits = None
+        if not self.training and len(views) * passes == 1:
+            logits = semantic_logits(classes[-1], mask_logits[-1], image_hw, full_hw)
+        stacked = (len(views) * passes, sizes["N"] // passes)
+        aux = {
+            "class_logits": classes.unflatten(1, stacked),
+            "mask_logits": mask_logits.unflatten(1, stacked),
+        }
+        return Output(logits, aux)
+
+    def _check_inputs(
+        self, rgb: Tensor, thermal: Tensor, passes: int, views: tuple[View, ...]
+    ) -> dict[str, int]:
+        sizes = check_shape("rgb", rgb, "N C H W", C=3)
+        check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
+        if passes < 1 or sizes["N"] % passes:
+            raise ValueError(f"{sizes['N']} images are not {passes} stacked passes of one batch.")
+        if not views or len(set(views)) < len(views):
+            raise ValueError(
+                f"views must name each view at most once and at least one, got {views}."
+            )
+        for view in views:
+            check_choice("view", view, VIEWS)
+        return sizes
+
+
+def semantic_logits(
+    class_logits: Tensor, mask_logits: Tensor, image_hw: tuple[int, int], padded: tuple[int, int]
+) -> Tensor:
+    """Score of every class at every pixel, at the size of the image.
+
+        score(k, pixel) = sum over queries of softmax(class)(k) * sigmoid(mask)(pixel)
+
+    Source: Mask2Former release, semantic inference; the no-object class is dropped.
+
+    Args:
+        class_logits: (B, Q, K + 1).
+        mask_logits: (B, Q, h, w).
+        image_hw: size to return.
+        padded: size that h, w stand for; the image is its top left part.
+
+    Returns:
+        (B, K, H, W) float32, >= 0.
+    """
+    with torch.autocast(class_logits.device.type, enabled=False):
+        masks = F.interpolate(
+            mask_logits.float(), size=padded, mode="bilinear", align_corners=False
+        )
+        masks = masks[..., : image_hw[0], : image_hw[1]].sigmoid()
+        classes = class_logits.float().softmax(-1)[..., :-1]
+        scores = classes.transpose(1, 2) @ masks.flatten(2)
+        return scores.view(*scores.shape[:2], *image_hw)
+
+
+def _to_tokens(masks: MaskPair, count: int, image_hw: tuple[int, int]) -> MaskPair:
+    """Cells to tokens of 4 x 4 pixels, (N, H/4, W/4) bool each."""
+    rgb, thermal = (
+        _expand(name, mask, count, image_hw)
+        for name, mask in zip(MaskPair._fields, masks, strict=True)
+    )
+    return MaskPair(rgb, thermal)
+
+
+def _expand(name: str, mask: Tensor, count: int, image_hw: tuple[int, int]) -> Tensor:
+    sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
+    grid = sizes["h"], sizes["w"]
+    cell = image_hw[0] // grid[0]
+    if cell % PATCH or (grid[0] * cell, grid[1] * cell) != image_hw:
+        raise InputError(
+            f"masker: a grid of {grid[0]} x {grid[1]} cells does not divide the padded image of "
+            f"{image_hw[0]} x {image_hw[1]} pixels into squares of a multiple of {PATCH} pixels "
+            f"(patch size {image_hw[0] / grid[0]:g} x {image_hw[1] / grid[1]:g}); choose a "
+            "masker.patch_size that divides both sides."
+        )
+    repeat = cell // PATCH
+    return mask.repeat_interleave(repeat, 1).repeat_interleave(repeat, 2)
+
+
+def _check(shape: SwinShape, share_start: int, fusion: str, hidden: int, heads: int) -> None:
+    """Refuse sizes that do not fit each other, naming the key."""
+    check_range("model.share_start", share_start, 0, 4)
+    check_range("model.drop_path_rate", shape.drop_path_rate, 0, 0.999)
+    check_choice("model.fusion", fusion, ("max", "add"))
+    if min(shape.depths) < 1:
+        raise InputError(f"model.depths needs at least one block per stage, got {shape.depths}.")
+    if hidden % GROUPS or hidden % heads:
+        raise InputError(
+            f"model.hidden_dim must be a multiple of {GROUPS} and of model.attention_heads "
+            f"({heads}), got {hidden}."
+        )
+    for index, (width, stage_heads) in enumerate(zip(shape.widths, shape.num_heads, strict=True)):
+        if width % stage_heads:
+            raise InputError(
+                f"model.num_heads[{index}] = {stage_heads} must divide the {width} channels."
+            )

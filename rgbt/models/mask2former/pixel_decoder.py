@@ -1,0 +1,166 @@
+"""Pixel decoder: deformable attention over strides 32, 16, 8, then one step up to stride 4."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.models.mask2former.deformable import EncoderLayer, Levels
+from rgbt.models.mask2former.position import sine_code
+
+GROUPS = 32
+"""Groups of every group normalisation (Mask2Former release)."""
+NUM_LEVELS = 3
+
+
+class Pyramid(NamedTuple):
+    """What the pixel decoder returns.
+
+    Mask features are W f + b with the last 1 x 1 convolution (W, b). They are handed on as the
+    three factors: e (W f + b) = (e W) f + e b costs less, for fewer embeddings e than pixels.
+
+    Attributes:
+        fine: f, (B, C, H/4, W/4).
+        weight: W, (C, C).
+        bias: b, (C,).
+        tokens: (B, S_l, C) at strides 32, 16, 8, row-major.
+        levels: rows and columns of these three.
+    """
+
+    fine: Tensor
+    weight: Tensor
+    bias: Tensor
+    tokens: tuple[Tensor, ...]
+    levels: Levels
+
+
+class ConvNorm(nn.Conv2d):
+    """Convolution without bias, then group normalisation, under the released names."""
+
+    def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
+        super().__init__(in_channels, out_channels, kernel, padding=kernel // 2, bias=False)
+        nn.init.kaiming_uniform_(self.weight, a=1)
+        self.norm = nn.GroupNorm(GROUPS, out_channels)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(B, c, H, W) -> (B, C, H, W)."""
+        out: Tensor = self.norm(super().forward(input))
+        return out
+
+
+class LevelEncoder(nn.Module):
+    """Encoder layers over the tokens of all levels.
+
+    Args:
+        dim: channels.
+        num_layers: encoder layers.
+        heads: attention heads.
+        ffn_dim: width of the feed-forward networks.
+    """
+
+    def __init__(self, dim: int, *, num_layers: int, heads: int, ffn_dim: int) -> None:
+        super().__init__()
+        layers = nn.ModuleList(
+            EncoderLayer(dim, heads=heads, num_levels=NUM_LEVELS, ffn_dim=ffn_dim)
+            for _ in range(num_layers)
+        )
+        self.encoder = nn.ModuleDict({"layers": layers})
+        self.level_embed = nn.Parameter(torch.empty(NUM_LEVELS, dim))
+        nn.init.normal_(self.level_embed)
+
+    def forward(self, tokens: Tensor, levels: Levels) -> Tensor:
+        """(B, S, C) -> (B, S, C)."""
+        codes = (sine_code(hw, tokens.shape[-1], tokens.device) for hw in levels)
+        position = torch.cat([c + e for c, e in zip(codes, self.level_embed, strict=True)])
+        layers = self.encoder["layers"]
+        assert isinstance(layers, nn.ModuleList), "set in the constructor"
+        for layer in layers:
+            tokens = layer(tokens, position, levels)
+        return tokens
+
+
+class PixelDecoder(nn.Module):
+    """Features of four strides to mask features and three levels of tokens.
+
+    Source: Mask2Former, Sec. 3.2 and 4.1; MSDeformAttn variant of its release.
+
+    Args:
+        widths: channels of the features at strides 4, 8, 16, 32.
+        hidden_dim: channels of the result, a multiple of 32 and of `heads`.
+        encoder_layers: deformable layers.
+        heads: heads of their attention.
+        ffn_dim: width of their feed-forward networks.
+        fp32: run in single precision under autocast too.   Released: true.
+    """
+
+    def __init__(
+        self,
+        widths: tuple[int, int, int, int],
+        *,
+        hidden_dim: int,
+        encoder_layers: int,
+        heads: int,
+        ffn_dim: int,
+        fp32: bool,
+    ) -> None:
+        super().__init__()
+        self.fp32 = fp32
+        self.input_proj = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(width, hidden_dim, 1), nn.GroupNorm(GROUPS, hidden_dim))
+            for width in reversed(widths[1:])
+        )
+        self.transformer = LevelEncoder(
+            hidden_dim, num_layers=encoder_layers, heads=heads, ffn_dim=ffn_dim
+        )
+        self.adapter_1 = ConvNorm(widths[0], hidden_dim, 1)
+        self.layer_1 = ConvNorm(hidden_dim, hidden_dim, 3)
+        self.mask_features = nn.Conv2d(hidden_dim, hidden_dim, 1)
+        nn.init.kaiming_uniform_(self.mask_features.weight, a=1)
+        biased = [self.mask_features]
+        for projection in self.input_proj:
+            conv = projection.get_submodule("0")
+            assert isinstance(conv, nn.Conv2d), "set above"
+            nn.init.xavier_uniform_(conv.weight)
+            biased.append(conv)
+        for conv in biased:
+            assert conv.bias is not None, "these convolutions have a bias"
+            nn.init.zeros_(conv.bias)
+
+    def forward(self, features: list[Tensor]) -> Pyramid:
+        """Decode.
+
+        Args:
+            features: (B, C_s, H/s, W/s), s = 4, 8, 16, 32.
+
+        Returns:
+            mask features and tokens.
+        """
+        with self._precision(features[0].device.type):
+            return self._decode([f.float() for f in features] if self.fp32 else features)
+
+    def _precision(self, device_type: str) -> AbstractContextManager[object]:
+        return torch.autocast(device_type, enabled=False) if self.fp32 else nullcontext()
+
+    def _decode(self, features: list[Tensor]) -> Pyramid:
+        fine, *coarse = features
+        maps = [project(x) for project, x in zip(self.input_proj, reversed(coarse), strict=True)]
+        levels = tuple((x.shape[2], x.shape[3]) for x in maps)
+        tokens = torch.cat([x.flatten(2).transpose(1, 2) for x in maps], dim=1)
+        tokens = self.transformer(tokens, levels)
+
+        per_level = tokens.split([rows * columns for rows, columns in levels], dim=1)
+        stride_8 = per_level[-1].unflatten(1, levels[-1]).permute(0, 3, 1, 2)
+        upsampled = F.interpolate(
+            stride_8, size=fine.shape[-2:], mode="bilinear", align_corners=False
+        )
+        # Contiguous, because group normalisation's gradient is slow where channels come last.
+        summed = self.adapter_1(fine.contiguous()) + upsampled
+        last = self.mask_features
+        assert last.bias is not None, "set in the constructor"
+        return Pyramid(
+            F.relu(self.layer_1(summed)), last.weight.flatten(1), last.bias, per_level, levels
+        )

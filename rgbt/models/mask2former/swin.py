@@ -1,0 +1,275 @@
+"""Swin Transformer branch that can replace tokens by a learned mask token after its embedding.
+
+Maps are (N, H, W, C) throughout. Sizes need not be multiples of the window: a map is padded
+before it is rolled, and neither window nor shift shrinks on small maps, as in the detection code
+of Swin and in the CRM and SpatialSeg releases, and unlike the ImageNet classifier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.models.mask2former.windows import relative_index, shift_mask
+
+PATCH = 4
+
+
+@dataclass(frozen=True)
+class SwinShape:
+    """Sizes of one branch; see `Mask2Former` for their meaning."""
+
+    embed_dim: int
+    depths: tuple[int, int, int, int]
+    num_heads: tuple[int, int, int, int]
+    window_size: int
+    mlp_ratio: float
+    drop_path_rate: float
+
+    @property
+    def widths(self) -> tuple[int, int, int, int]:
+        """Channels of the four stages."""
+        c = self.embed_dim
+        return c, 2 * c, 4 * c, 8 * c
+
+
+class PatchEmbed(nn.Module):
+    """One token per 4 x 4 pixels: linear map of the pixels, then layer normalisation."""
+
+    def __init__(self, in_channels: int, dim: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(in_channels, dim, PATCH, stride=PATCH)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(N, c, H, W), sides multiples of 4 -> (N, H/4, W/4, C)."""
+        n, c, height, width = image.shape
+        # The patches do not overlap: as a matrix product the result has tokens last at once.
+        patches = image.view(n, c, height // PATCH, PATCH, width // PATCH, PATCH)
+        patches = patches.permute(0, 2, 4, 1, 3, 5).flatten(3)
+        tokens = F.linear(patches, self.proj.weight.flatten(1), self.proj.bias)
+        normed: Tensor = self.norm(tokens)
+        return normed
+
+
+class WindowAttention(nn.Module):
+    """Multi-head attention inside windows, with a learned bias per relative position.
+
+        softmax(q k' / sqrt(d) + bias + shift mask) v
+
+    Source: Swin Transformer, Eq. (4).
+    """
+
+    relative_position_index: Tensor
+
+    def __init__(self, dim: int, heads: int, window: int) -> None:
+        super().__init__()
+        self.heads, self.window = heads, window
+        self.scale = (dim // heads) ** -0.5
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.proj = nn.Linear(dim, dim)
+        self.relative_position_bias_table = nn.Parameter(torch.empty((2 * window - 1) ** 2, heads))
+        nn.init.trunc_normal_(self.relative_position_bias_table, std=0.02)
+        index = relative_index(window)
+        self.register_buffer("relative_position_index", index, persistent=False)
+
+    def forward(self, x: Tensor, shift: int) -> Tensor:
+        """Attention in every window of a map, before the output projection.
+
+        Args:
+            x: (N, H, W, C), H and W multiples of the window, rolled by -`shift` already.
+            shift: tokens the map was rolled by.
+
+        Returns:
+            (N, H, W, C).
+        """
+        n, height, width, dim = x.shape
+        side, rows, columns = self.window, height // self.window, width // self.window
+        # Windows and heads are cut out of the projected map in one copy.
+        qkv = self.qkv(x).view(n, rows, side, columns, side, 3, self.heads, -1)
+        qkv = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(
+            3, n, rows * columns, self.heads, side * side, -1
+        )
+        q, k, v = qkv.unbind(0)
+
+        scores = (q * self.scale) @ k.transpose(-2, -1)
+        scores = scores + self._bias((height, width), shift)
+        out = scores.softmax(-1) @ v
+
+        out = out.view(n, rows, columns, self.heads, side, side, -1)
+        merged: Tensor = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
+        return merged
+
+    def _bias(self, hw: tuple[int, int], shift: int) -> Tensor:
+        """(heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2."""
+        bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)
+        bias = bias.permute(2, 0, 1)
+        if shift == 0:
+            return bias
+        return bias + shift_mask(hw, self.window, shift, bias.device)
+
+
+class Mlp(nn.Module):
+    """Linear, exact GELU, linear."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.fc2 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., C) -> (..., C)."""
+        out: Tensor = self.fc2(F.gelu(self.fc1(x)))
+        return out
+
+
+class Block(nn.Module):
+    """Window attention and MLP, each normalised before and added to its input."""
+
+    def __init__(self, dim: int, heads: int, shape: SwinShape, *, shift: int) -> None:
+        super().__init__()
+        self.shift = shift
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = WindowAttention(dim, heads, shape.window_size)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, int(dim * shape.mlp_ratio))
+
+    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
+        """One block.
+
+        Args:
+            x: (N, H, W, C).
+            keep: (2, N, 1, 1, 1) factors of the two residuals (stochastic depth); None for ones.
+
+        Returns:
+            (N, H, W, C).
+        """
+        first, second = (None, None) if keep is None else keep.unbind()
+        x = _add(x, self._attend(self.norm1(x)), first)
+        return _add(x, self.mlp(self.norm2(x)), second)
+
+    def _attend(self, x: Tensor) -> Tensor:
+        """Window attention on a map of any size."""
+        height, width = x.shape[1:3]
+        below, right = (-height) % self.attn.window, (-width) % self.attn.window
+        if below or right:
+            x = F.pad(x, (0, 0, 0, right, 0, below))
+        if self.shift:
+            x = x.roll((-self.shift, -self.shift), (1, 2))
+        x = self.attn(x, self.shift)
+        if self.shift:
+            x = x.roll((self.shift, self.shift), (1, 2))
+        out: Tensor = self.attn.proj(x[:, :height, :width])
+        return out
+
+
+def _add(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
+    return x + residual if factor is None else torch.addcmul(x, residual, factor)
+
+
+class PatchMerging(nn.Module):
+    """Four neighbouring tokens become one of twice the width."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(4 * dim)
+        self.reduction = nn.Linear(4 * dim, 2 * dim, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) -> (N, ceil(H/2), ceil(W/2), 2C)."""
+        n, height, width, dim = x.shape
+        if height % 2 or width % 2:
+            x = F.pad(x, (0, 0, 0, width % 2, 0, height % 2))
+        x = x.view(n, (height + 1) // 2, 2, (width + 1) // 2, 2, dim)
+        # Released order of the four: the row changes fastest.
+        x = x.permute(0, 1, 3, 4, 2, 5).flatten(3)
+        out: Tensor = self.reduction(self.norm(x))
+        return out
+
+
+class Stage(nn.Module):
+    """Blocks of one width, every second one shifted, and the merging that follows them."""
+
+    def __init__(self, shape: SwinShape, index: int) -> None:
+        super().__init__()
+        dim, heads = shape.widths[index], shape.num_heads[index]
+        shifts = (0, shape.window_size // 2)
+        self.blocks = nn.ModuleList(
+            Block(dim, heads, shape, shift=shifts[block % 2])
+            for block in range(shape.depths[index])
+        )
+        self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
+
+    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C), before merging; `keep` is (blocks, 2, N, 1, 1, 1)."""
+        for number, block in enumerate(self.blocks):
+            x = block(x, None if keep is None else keep[number])
+        return x
+
+
+class Swin(nn.Module):
+    """One modality's branch: four maps at strides 4, 8, 16, 32, each layer-normalised.
+
+    Args:
+        in_channels: channels of the image, 3 for RGB and 1 for thermal.
+        shape: sizes.
+        shared: stages to use instead of own ones, by index (Python objects are shared).
+    """
+
+    def __init__(self, in_channels: int, *, shape: SwinShape, shared: dict[int, Stage]) -> None:
+        super().__init__()
+        self.shape = shape
+        self.patch_embed = PatchEmbed(in_channels, shape.embed_dim)
+        self.mask_token = nn.Parameter(torch.empty(1, shape.embed_dim, 1, 1))
+        nn.init.trunc_normal_(self.mask_token, std=0.02)
+        self.layers = nn.ModuleList(
+            shared[index] if index in shared else Stage(shape, index) for index in range(4)
+        )
+        for index, width in enumerate(shape.widths):
+            self.add_module(f"norm{index}", nn.LayerNorm(width))
+
+    def forward(
+        self, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
+    ) -> list[Tensor]:
+        """Normalised maps of the four stages.
+
+        Args:
+            image: (N, c, H, W) normalised, sides multiples of 32.
+            hidden: (N, H/4, W/4) bool, True = the token is replaced by the mask token; None: none.
+            generator: draws stochastic depth; only read in training mode with a rate above 0.
+
+        Returns:
+            four (N, C_s, H/s, W/s), s = 4, 8, 16, 32, channels last in memory.
+        """
+        x = self.patch_embed(image)
+        if hidden is not None:
+            x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
+        keeps: list[Tensor | None] = [None] * 4
+        if self.training and self.shape.drop_path_rate > 0:
+            keeps = list(torch.split(self._draw_keep(x, generator), list(self.shape.depths)))
+        maps = []
+        for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):
+            x = stage(x, keep)
+            maps.append(self.get_submodule(f"norm{index}")(x).permute(0, 3, 1, 2))
+            x = stage.get_submodule("downsample")(x)
+        return maps
+
+    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Factors 0 or 1/p of every residual of every sample, p falling from 1 to 1 - rate.
+
+        Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
+
+        Returns:
+            (blocks, 2, N, 1, 1, 1) float32 on the device of `x`.
+        """
+        if generator is None:
+            raise ValueError("stochastic depth needs a generator in training mode, got None.")
+        blocks = sum(self.shape.depths)
+        probability = 1 - torch.linspace(0, self.shape.drop_path_rate, blocks).view(-1, 1, 1)
+        draw = torch.rand(blocks, 2, len(x), generator=generator, device=generator.device)
+        probability = probability.to(draw.device)
+        factor = (draw < probability) / probability
+        return factor.view(blocks, 2, -1, 1, 1, 1).to(x.device, non_blocking=True)

@@ -1,0 +1,101 @@
+"""The way to an MLflow store: quiet, quick to give up, safe when many processes start at once."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rgbt.tracking.files import holding
+from rgbt.tracking.mlflow_view import view_tags
+
+ENVIRONMENT = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DO_NOT_TRACK": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+    # A server that is gone must cost a training seconds, not the minutes of the defaults (7, 120).
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+    "GIT_PYTHON_REFRESH": "quiet",
+}
+"""Set before the first import of mlflow, unless the user set them."""
+
+EXPERIMENT_NOTE = """\
+One run per configuration and seed. **mIoU**, **Var**, **region/...**, **class/...** are of the last
+evaluation (test split); **val/...** and **train/...** are curves over training steps. Scores are
+in percent; Var is the variance over regions in squared percent points. The two layouts under
+*Views* show the scores first, for every run or as means over seeds.
+
+**profile/iou_by_region** is a line over the *regions*: its "step" is the number of the region,
+1 = innermost ring. Group the charts by a parameter to see its mean and its spread over seeds.
+
+The table of classes and regions is the artifact `tables/iou.json`; every run's
+description holds it too.
+"""
+
+
+@dataclass(frozen=True)
+class Store:
+    """An open store: MLflow's client and the experiment that runs go to."""
+
+    client: Any
+    experiment_id: str
+
+
+def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
+    """Connect, making database and experiment where they do not exist.
+
+    Args:
+        uri: sqlite:///..., postgresql://..., http://...
+        artifact_uri: where a new experiment keeps its files; None: the store decides.
+        experiment: its name.
+
+    Raises:
+        Exception: whatever MLflow raises when the store cannot be used.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    # Takes seconds, hence not at the top.
+    from mlflow import MlflowClient
+
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    with _alone(uri):
+        client = MlflowClient(tracking_uri=uri)
+        found = _experiment(client, experiment, artifact_uri)
+    tags = {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}
+    for name, value in tags.items():
+        if found.tags.get(name) != value:
+            client.set_experiment_tag(found.experiment_id, name, value)
+    return Store(client, str(found.experiment_id))
+
+
+@contextmanager
+def _alone(uri: str) -> Iterator[None]:
+    """One process at a time: two that create the tables of one SQLite file together break it."""
+    if not uri.startswith("sqlite:///"):
+        yield
+        return
+    database = Path(uri.removeprefix("sqlite:///"))
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with holding(database.with_name(f".{database.name}.lock"), wait=True):
+        yield
+
+
+def _experiment(client: Any, name: str, artifact_uri: str | None) -> Any:
+    """The experiment of that name; another machine may be creating it at this moment."""
+    found = client.get_experiment_by_name(name)
+    if found is not None:
+        return found
+    try:
+        client.create_experiment(name, artifact_location=artifact_uri)
+    except Exception:
+        time.sleep(1.0)
+        if client.get_experiment_by_name(name) is None:
+            raise
+    return client.get_experiment_by_name(name)

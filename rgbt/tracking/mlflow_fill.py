@@ -1,0 +1,286 @@
+"""Fills one MLflow run from one run folder; called again, it sends only what is new.
+
+What was sent is remembered in the folder's ``mlflow.json``: per kind of line the last step, so that
+a run which resumes at an earlier step and writes the same lines again does not send them twice.
+"""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from rgbt.metrics import names
+from rgbt.tracking.files import write_atomic
+from rgbt.tracking.folder import MetricLine, RunFolder
+from rgbt.tracking.mlflow_client import Store
+from rgbt.tracking.tables import ResultTables, result_grids
+
+Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+
+PARAM_LENGTH = 500
+"""Characters of a parameter's value that are sent; MLflow's pages show far fewer."""
+
+BATCH_LENGTH = 1000
+"""Metrics in one call, MLflow's limit."""
+
+FILES = (
+    "config.yaml",
+    "provenance.json",
+    "result.json",
+    "*.patch",
+    "counts_*.npz",
+    "figures/*.png",
+)
+TABLE_FILE = "tables/iou.json"
+FRACTIONS = {names.MIOU, names.MACC, names.MPRECISION, names.MF1, names.PIXEL_ACCURACY}
+
+
+@dataclass
+class Sent:
+    """What a store already has of a run; lies in the folder as ``mlflow.json``.
+
+    Attributes:
+        uri: the store, passwords hidden.
+        experiment: name of the experiment.
+        artifact_uri: where a new experiment keeps files, or None.
+        experiment_id: "" before the first contact.
+        run_id: "" before the first contact.
+        steps: kind of line -> last step sent.
+        files: path in the folder -> digest of the content sent.
+        profile: whether the region profile was sent.
+    """
+
+    uri: str
+    experiment: str
+    artifact_uri: str | None = None
+    experiment_id: str = ""
+    run_id: str = ""
+    steps: dict[str, int] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    profile: bool = False
+
+
+def read_sent(folder: RunFolder) -> Sent | None:
+    """What was sent from this folder, or None if nothing ever was."""
+    path = folder.path / "mlflow.json"
+    return Sent(**json.loads(path.read_text())) if path.exists() else None
+
+
+def write_sent(folder: RunFolder, sent: Sent) -> None:
+    """Remember what was sent."""
+    write_atomic(folder.path / "mlflow.json", json.dumps(asdict(sent), indent=1).encode())
+
+
+def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
+    """Bring the MLflow run of `folder` up to date; `sent` is changed and written.
+
+    Args:
+        store: open store.
+        folder: its `describe` must have been called.
+        sent: what that store has.
+        status: the state to show.
+    """
+    known_params, seen = _find_run(store, folder, sent)
+    tables = _tables(folder)
+    lines = [line for line in folder.lines() if line.step > sent.steps.get(line.kind, -1)]
+    metrics = list(_metrics(lines))
+    if tables is not None and tables.split == "test" and not sent.profile:
+        metrics += _profile(tables, folder)
+        sent.profile = True
+    _send(store, sent, (metrics, _params(folder, known_params), _tags(folder, tables)))
+    sent.steps |= {line.kind: line.step for line in lines}
+    _send_table(store, sent, tables)
+    _send_files(store, folder, sent)
+    if status == "RUNNING" and seen != status:
+        store.client.update_run(sent.run_id, status=status)
+    elif status != seen:
+        store.client.set_terminated(sent.run_id, status=status, end_time=_end_time(folder))
+    write_sent(folder, sent)
+
+
+def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], str]:
+    """Names of the parameters the run has, and its status; made if the store does not know it."""
+    from mlflow.exceptions import MlflowException
+
+    if sent.run_id:
+        try:
+            run = store.client.get_run(sent.run_id)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+        else:
+            # A run deleted in the pages takes nothing more; a folder that goes on gets a new one.
+            if run.info.lifecycle_stage == "active":
+                return set(run.data.params), str(run.info.status)
+    description = folder.description()
+    assert description is not None, f"{folder.path}: describe() comes before fill()"
+    run = store.client.create_run(
+        store.experiment_id, start_time=_start_time(folder), run_name=description.name
+    )
+    sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
+    sent.steps, sent.files, sent.profile = {}, {}, False
+    # Written at once: a crash after this line must not leave a second run behind.
+    write_sent(folder, sent)
+    return set(), str(run.info.status)
+
+
+def _send(store: Store, sent: Sent, entities: tuple[list[Any], list[Any], list[Any]]) -> None:
+    """One call with everything new; more only beyond MLflow's limits on one call."""
+    metrics, params, tags = entities
+    store.client.log_batch(
+        sent.run_id, metrics=metrics[:BATCH_LENGTH], params=params[:100], tags=tags
+    )
+    for start in range(BATCH_LENGTH, len(metrics), BATCH_LENGTH):
+        store.client.log_batch(sent.run_id, metrics=metrics[start : start + BATCH_LENGTH])
+    for start in range(100, len(params), 100):
+        store.client.log_batch(sent.run_id, params=params[start : start + 100])
+
+
+def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
+    """Finite values as MLflow metrics.
+
+    The time is the line's own: MLflow's databases drop a metric that is equal in every field, so
+    that a batch sent again after a crash leaves no duplicate.
+    """
+    from mlflow.entities import Metric
+
+    # The compare page draws the metric that came first: scores before losses.
+    for line in sorted(lines, key=lambda line: ("test", "val", "train").index(line.kind)):
+        last = line.kind == "test"
+        prefix = "" if last else f"{line.kind}/"
+        # The pages draw bars over runs for a metric that has step 0 only, else a line over steps.
+        step = 0 if last else line.step
+        for name, value in line.values.items():
+            if math.isfinite(value):
+                yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
+
+
+def shown(name: str, value: float) -> float:
+    """A value as MLflow shows it: scores in percent with two decimals, as the papers print them.
+
+    Its charts write 0.62 for a fraction, and its tables all sixteen digits. The folder keeps the
+    exact value.
+    """
+    first, last = name.split("/")[0], name.split("/")[-1]
+    if last in FRACTIONS or first in ("region", "class"):
+        return round(100 * value, 2)
+    return round(value, 2) if last == names.VAR else value
+
+
+def _profile(tables: ResultTables, folder: RunFolder) -> list[Any]:
+    """IoU over the regions as a line: the step is the region's number."""
+    from mlflow.entities import Metric
+
+    times = [line.time for line in folder.lines()] or [time.time()]
+    return [
+        Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * times[-1]), region)
+        for region, iou in enumerate(tables.regions.region_ious, start=1)
+        if math.isfinite(iou)
+    ]
+
+
+def _params(folder: RunFolder, known: set[str]) -> list[Any]:
+    """Parameters the run does not have yet; MLflow refuses to change one."""
+    from mlflow.entities import Param
+
+    description = folder.description()
+    params = {} if description is None else description.params
+    return [Param(k, v[:PARAM_LENGTH]) for k, v in params.items() if k not in known]
+
+
+def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
+    from mlflow.entities import RunTag
+
+    description = folder.description()
+    first = (folder.provenance() or [{}])[0]
+    tags = {
+        "mlflow.user": getpass.getuser(),
+        "mlflow.source.type": "LOCAL",
+        "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
+        "rgbt.command": first.get("command", ""),
+        "mlflow.source.git.commit": first.get("git_commit") or "",
+        "rgbt.folder": str(folder.path),
+        **({} if description is None else description.tags),
+    }
+    if tables is not None:
+        tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
+        tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
+    return [RunTag(name, value[:5000]) for name, value in tags.items() if value]
+
+
+def _tables(folder: RunFolder) -> ResultTables | None:
+    plain = folder.tables()
+    return None if plain is None else ResultTables.from_json(plain)
+
+
+def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
+    """The result as MLflow's table view wants it.
+
+    That view groups by the first column, which must be unique, and compares the second between
+    runs; it shows few rows on a screen, so summaries come first.
+
+    Returns:
+        ``columns`` and ``data``: row name, IoU in percent (for "Var" its own unit), accuracy.
+    """
+    classes, regions = tables.classes, tables.regions
+    rows: list[tuple[str, float, float]] = [
+        ("mIoU", 100 * regions.miou, math.nan),
+        ("Var", regions.variance, math.nan),
+    ]
+    rows += [(f"mIoU {name}", 100 * v, math.nan) for name, v in classes.subset_mious.items()]
+    pairs = zip(tables.region_names, regions.region_ious, strict=True)
+    rows += [(f"mIoU {name}", 100 * iou, math.nan) for name, iou in pairs]
+    triples = zip(classes.names, classes.ious, classes.accuracies, strict=True)
+    rows += [(name, 100 * iou, 100 * accuracy) for name, iou, accuracy in triples]
+    for name, by_region in zip(classes.names, classes.region_ious, strict=True):
+        pairs = zip(tables.region_names, by_region, strict=True)
+        rows += [(f"{name} / {region}", 100 * iou, math.nan) for region, iou in pairs]
+    data = [[name, *(_two_decimals(value) for value in values)] for name, *values in rows]
+    return {"columns": ["score", "IoU %", "accuracy %"], "data": data}
+
+
+def _two_decimals(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 2)
+
+
+def _send_table(store: Store, sent: Sent, tables: ResultTables | None) -> None:
+    if tables is None:
+        return
+    text = json.dumps(artifact_table(tables))
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    if sent.files.get(TABLE_FILE) != digest:
+        store.client.log_text(sent.run_id, text, TABLE_FILE)
+        sent.files[TABLE_FILE] = digest
+
+
+def _send_files(store: Store, folder: RunFolder, sent: Sent) -> None:
+    """Upload files that are new or changed, under their path in the folder."""
+    for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
+        place = path.relative_to(folder.path)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if sent.files.get(str(place)) != digest:
+            parent = None if place.parent == Path() else str(place.parent)
+            store.client.log_artifact(sent.run_id, str(path), parent)
+            sent.files[str(place)] = digest
+
+
+def _start_time(folder: RunFolder) -> int:
+    """Milliseconds since 1970 at which the first process of the run began."""
+    first = (folder.provenance() or [{}])[0].get("started")
+    seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
+    return round(1000 * seconds)
+
+
+def _end_time(folder: RunFolder) -> int:
+    """Milliseconds since 1970 of the last thing the run wrote."""
+    names = ("result.json", "metrics.jsonl", "run.json")
+    times = [(folder.path / n).stat().st_mtime for n in names if (folder.path / n).exists()]
+    return round(1000 * max(times))

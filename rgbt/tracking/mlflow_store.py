@@ -1,0 +1,211 @@
+"""Trackers a run may be given: MLflow, filled from the run folder, or none.
+
+The run folder is the truth. What MLflow could not take while a run trained is sent later by
+``python -m rgbt.tracking.sync``.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from rgbt.tracking.files import holding
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.mlflow_client import Store, open_store
+from rgbt.tracking.mlflow_fill import Sent, Status, fill, read_sent, write_sent
+from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
+from rgbt.tracking.provenance import without_passwords
+
+Link = tuple[str, str]
+"""(name, command or address), for the last lines of a run."""
+
+PAUSE_S = 300.0
+"""Seconds a running training leaves a store alone after it failed."""
+
+UI_ADDRESS = "http://127.0.0.1:5000"
+
+
+class Tracking(Protocol):
+    """What a run tells its tracker. None of these ever raises because a store is away."""
+
+    def start(
+        self,
+        folder: RunFolder,
+        run_name: str,
+        tags: Mapping[str, str],
+        params: Mapping[str, object],
+    ) -> None:
+        """Begin, or continue, the run of `folder`."""
+        ...
+
+    def update(self) -> None:
+        """Something new lies in the folder; called after every evaluation."""
+        ...
+
+    def finish(self) -> None:
+        """The process leaves the run: finished if there is a result, else failed."""
+        ...
+
+    def links(self) -> list[Link]:
+        """Where a person looks at the run."""
+        ...
+
+
+class NoTracking:
+    """Keeps the run folder alone; `python -m rgbt.tracking.sync` can send it later."""
+
+    def start(
+        self,
+        folder: RunFolder,
+        run_name: str,
+        tags: Mapping[str, str],
+        params: Mapping[str, object],
+    ) -> None:
+        """Write the description that a later sync needs."""
+        folder.describe(described(run_name, tags, params))
+
+    def update(self) -> None:
+        """Nothing to tell."""
+
+    def finish(self) -> None:
+        """Nothing to tell."""
+
+    def links(self) -> list[Link]:
+        """No place but the folder."""
+        return []
+
+
+class MlflowTracking:
+    """Shows runs in MLflow.
+
+    Args:
+        uri: the store: sqlite:///..., postgresql://..., http://...;
+            None is ``sqlite:///<runs_dir>/mlflow.db``.
+        artifact_uri: where a new experiment keeps its files; None is ``<runs_dir>/mlartifacts`` for
+            a database, and the server's own place for http.
+        experiment: its name.
+        runs_dir: the folder of all runs.
+    """
+
+    def __init__(
+        self, uri: str | None, *, artifact_uri: str | None, experiment: str, runs_dir: str
+    ) -> None:
+        root = Path(runs_dir).resolve()
+        self.uri = f"sqlite:///{root / 'mlflow.db'}" if uri is None else uri
+        is_server = self.uri.startswith(("http://", "https://"))
+        default_place = None if is_server else (root / "mlartifacts").as_uri()
+        self.artifact_uri = default_place if artifact_uri is None else artifact_uri
+        self.experiment = experiment
+        self._store: Store | None = None
+        self._folder: RunFolder | None = None
+        self._quiet_until = 0.0
+        self._warned = False
+
+    def start(
+        self,
+        folder: RunFolder,
+        run_name: str,
+        tags: Mapping[str, str],
+        params: Mapping[str, object],
+    ) -> None:
+        """Begin the MLflow run of `folder`, or continue the one it already has."""
+        folder.describe(described(run_name, tags, params))
+        write_sent(folder, self._sent(folder))
+        self._folder = folder
+        self.update()
+
+    def update(self) -> None:
+        """Send what is new, unless the store failed a short time ago."""
+        if time.monotonic() >= self._quiet_until:
+            self._guarded("RUNNING")
+
+    def finish(self) -> None:
+        """Send what is new and close the run."""
+        self._guarded("FAILED")
+
+    def links(self) -> list[Link]:
+        """The command that opens the pages, then the addresses of this run and of the charts."""
+        assert self._folder is not None, "start() comes before links()"
+        sent = self._sent(self._folder)
+        if not sent.run_id:
+            return [("MLflow later", sync_command(self._folder))]
+        is_server = self.uri.startswith(("http://", "https://"))
+        base = self.uri.rstrip("/") if is_server else UI_ADDRESS
+        pages = [
+            ("this run", base + run_path(sent.experiment_id, sent.run_id)),
+            ("compare runs", base + view_path(sent.experiment_id, RUNS_VIEW)),
+            ("over seeds", base + view_path(sent.experiment_id, GROUPS_VIEW)),
+        ]
+        return pages if is_server else [("open MLflow", ui_command(self.uri)), *pages]
+
+    def sync(self, folder: RunFolder, status: Status) -> str:
+        """Bring this store up to date with `folder`; the id of the MLflow run.
+
+        Unlike the calls of a running training this raises what the store raises.
+        """
+        if self._store is None:
+            self._store = open_store(self.uri, self.artifact_uri, self.experiment)
+        # A training and a sync by hand may meet in one folder.
+        with holding(folder.path / "mlflow.lock", wait=True):
+            sent = self._sent(folder)
+            fill(self._store, folder, sent, status)
+        return sent.run_id
+
+    def _sent(self, folder: RunFolder) -> Sent:
+        """What this store has of the run; nothing if the folder was sent to another one."""
+        fresh = Sent(without_passwords(self.uri), self.experiment, self.artifact_uri)
+        sent = read_sent(folder)
+        same = sent is not None and (sent.uri, sent.experiment) == (fresh.uri, fresh.experiment)
+        return sent if sent is not None and same else fresh
+
+    def _guarded(self, unfinished: Status) -> None:
+        """Sync with status `unfinished`, or "FINISHED" where there is a result."""
+        assert self._folder is not None, "start() comes first"
+        try:
+            status = unfinished if self._folder.result() is None else "FINISHED"
+            self.sync(self._folder, status)
+        except Exception as error:  # The one border: a dead tracker never stops a training.
+            self._quiet_until = time.monotonic() + PAUSE_S
+            self._warn(error)
+
+    def _warn(self, error: Exception) -> None:
+        if self._warned or self._folder is None:
+            return
+        self._warned = True
+        reason = (str(error).splitlines() or [""])[0][:120]
+        sys.stderr.write(
+            f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
+            f"({type(error).__name__}: {without_passwords(reason)}); the run goes on, and "
+            f"`{sync_command(self._folder)}` sends it later.\n"
+        )
+
+
+def described(run_name: str, tags: Mapping[str, str], params: Mapping[str, object]) -> Description:
+    """The description of a run, all values as text."""
+    return Description(
+        name=run_name,
+        tags={name: str(value) for name, value in tags.items()},
+        params={name: str(value) for name, value in params.items()},
+    )
+
+
+def sync_command(folder: RunFolder) -> str:
+    """The command that sends a run folder to its store."""
+    return f"{_python()} -m rgbt.tracking.sync run={folder.path}"
+
+
+def ui_command(uri: str) -> str:
+    """The command that opens MLflow's pages on a database; one worker is enough for one person."""
+    return f"{_python()} -m mlflow ui --workers 1 --backend-store-uri {without_passwords(uri)}"
+
+
+def _python() -> str:
+    """How this interpreter is called from here: `make` uses one that is not on the path."""
+    if shutil.which("python") == sys.executable:
+        return "python"
+    here, program = Path.cwd(), Path(sys.executable)
+    return str(program.relative_to(here) if program.is_relative_to(here) else program)

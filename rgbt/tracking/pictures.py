@@ -1,0 +1,249 @@
+"""Pictures of a run: qualitative panel, region heat map, label overlay.
+
+Data first (arrays and small frozen dataclasses), drawing after. Matplotlib is imported when
+something is drawn and never opens a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.types import IGNORE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Image = NDArray[np.uint8]
+
+IGNORED_COLOUR = (128, 128, 128)
+"""Pixels without a label are grey: black is a class in most palettes."""
+
+
+HALF_SPAN = 15.0
+"""Percent points from the mean region to either end of the heat map's colours, at least."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One image of a qualitative panel.
+
+    Attributes:
+        name: shown beside the row.
+        rgb: (H, W, 3) uint8.
+        thermal: (H, W) uint8.
+        label: (H', W') uint8, class index or 255.
+        prediction: (H', W') uint8, class index.
+    """
+
+    name: str
+    rgb: Image
+    thermal: Image
+    label: Image
+    prediction: Image
+
+
+@dataclass(frozen=True)
+class Legend:
+    """Class names and their colours.
+
+    Attributes:
+        names: K names.
+        palette: (K, 3) uint8, RGB.
+    """
+
+    names: tuple[str, ...]
+    palette: Image
+
+
+def colours(label: Image, palette: Image) -> Image:
+    """Class indices as colours.
+
+    Args:
+        label: (H, W) uint8, class index or 255 = ignore.
+        palette: (K, 3) uint8.
+
+    Returns:
+        (H, W, 3) uint8; ignored pixels are `IGNORED_COLOUR`.
+
+    Raises:
+        ValueError: a label is neither below K nor 255.
+    """
+    table = np.full((256, 3), IGNORED_COLOUR, np.uint8)
+    table[: len(palette)] = palette
+    odd = (label >= len(palette)) & (label != IGNORE)
+    if odd.any():
+        raise ValueError(f"label {label[odd][0]} has no colour; the palette has {len(palette)}.")
+    return np.asarray(table[label])
+
+
+def overlay(rgb: Image, label: Image, palette: Image, alpha: float = 0.6) -> Image:
+    """The image with classes painted over it; class 0 (background) and 255 stay unpainted.
+
+        out = round((1 - alpha) * rgb + alpha * palette[label])
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        label: (H, W) uint8, class index or 255.
+        palette: (K, 3) uint8.
+        alpha: opacity of the paint in [0, 1].
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        ValueError: image and label differ in size.
+    """
+    if rgb.shape[:2] != label.shape:
+        raise ValueError(f"overlay: expected one size, got image {rgb.shape}, label {label.shape}.")
+    mixed = (1.0 - alpha) * rgb + alpha * colours(label, palette)
+    painted = ((label != 0) & (label != IGNORE))[..., None]
+    return np.where(painted, np.rint(mixed), rgb).astype(np.uint8)
+
+
+def draw_panel(examples: Sequence[Example], legend: Legend, path: Path) -> None:
+    """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below.
+
+    Raises:
+        ValueError: no examples.
+    """
+    if not examples:
+        raise ValueError("a qualitative panel needs at least one example, got none.")
+    height, width = examples[0].rgb.shape[:2]
+    cell_w = 3.0
+    cell_h = cell_w * height / width
+    figure = _figure(4 * cell_w + 0.4, len(examples) * (cell_h + 0.08) + 0.75)
+    axes = figure.subplots(len(examples), 4, squeeze=False)
+    for row, example in zip(axes, examples, strict=True):
+        pictures = (
+            example.rgb,
+            np.repeat(example.thermal[..., None], 3, axis=2),
+            colours(example.label, legend.palette),
+            colours(example.prediction, legend.palette),
+        )
+        for axis, picture in zip(row, pictures, strict=True):
+            _image(axis, picture)
+        row[0].set_ylabel(example.name, fontsize=8)
+    for axis, title in zip(axes[0], ("RGB", "thermal", "ground truth", "prediction"), strict=True):
+        axis.set_title(title, fontsize=10)
+    _class_legend(figure, legend)
+    figure.savefig(path)
+
+
+@dataclass(frozen=True)
+class RegionHeat:
+    """What the region heat map shows.
+
+    Attributes:
+        title: of the picture.
+        region_map: (H, W) integers in 0..R-1, region of every pixel.
+        ious: R fractions; NaN regions stay white.
+    """
+
+    title: str
+    region_map: NDArray[np.int64]
+    ious: tuple[float, ...]
+
+
+def region_values(heat: RegionHeat) -> NDArray[np.float64]:
+    """(H, W) IoU in percent of the region every pixel lies in.
+
+    Raises:
+        ValueError: the map names a region without an IoU.
+    """
+    if heat.region_map.min() < 0 or heat.region_map.max() >= len(heat.ious):
+        raise ValueError(
+            f"region map holds {heat.region_map.min()}..{heat.region_map.max()}, "
+            f"but there are {len(heat.ious)} IoUs."
+        )
+    return np.asarray(100.0 * np.asarray(heat.ious, np.float64)[heat.region_map])
+
+
+def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple[int, int] | None]:
+    """(row, column) inside each region where a number is easy to read; None for empty regions.
+
+    The pixel of the region nearest to the region's mean, taken over the part above the middle row
+    where the mean itself lies in another region (a ring's mean is the centre of the image).
+    """
+    places: list[tuple[int, int] | None] = []
+    for region in range(num_regions):
+        rows, columns = np.nonzero(region_map == region)
+        if len(rows) == 0:
+            places.append(None)
+            continue
+        centre = np.array([rows.mean(), columns.mean()])
+        if region_map[tuple(np.rint(centre).astype(int))] != region:
+            upper = rows < centre[0]
+            near = np.abs(columns - centre[1]) < 1
+            centre = np.array([np.median(rows[upper & near]), centre[1]])
+        nearest = np.argmin((rows - centre[0]) ** 2 + (columns - centre[1]) ** 2)
+        places.append((int(rows[nearest]), int(columns[nearest])))
+    return places
+
+
+def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
+    """Ends of the colour scale in percent: the mean region, and equally far to both sides.
+
+    At least `HALF_SPAN` to each side, so that the same contrast is the same difference in most runs
+    and pictures of two runs can be compared.
+    """
+    percents = 100.0 * np.asarray(ious, np.float64)
+    mean = float(np.nanmean(percents))
+    half = max(HALF_SPAN, float(np.nanmax(np.abs(percents - mean))))
+    return mean - half, mean + half
+
+
+def draw_region_heat(heat: RegionHeat, path: Path) -> None:
+    """Write a PNG: the regions coloured by their IoU, the IoU in each, a colour bar."""
+    values = region_values(heat)
+    height, width = values.shape
+    low, high = colour_limits(heat.ious)
+    size = 9 if len(heat.ious) <= 5 else 7  # nine rings are narrow
+    figure = _figure(6.4, 5.4 * height / width + 0.5)
+    axis = figure.subplots()
+    shown = axis.imshow(values, cmap="viridis", vmin=low, vmax=high)
+    axis.set(xticks=[], yticks=[])
+    axis.set_title(heat.title, fontsize=10, wrap=True)
+    # Thin lines where the region changes, so that equal neighbours stay two regions.
+    axis.contour(heat.region_map, np.arange(0.5, len(heat.ious)), colors="white", linewidths=0.6)
+    for place, iou in zip(number_places(heat.region_map, len(heat.ious)), heat.ious, strict=True):
+        if place is not None:
+            text = "-" if np.isnan(iou) else f"{100 * iou:.1f}"
+            box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
+            axis.text(place[1], place[0], text, ha="center", va="center", fontsize=size, bbox=box)
+    figure.colorbar(shown, ax=axis, label="mIoU of the region, percent", shrink=0.85)
+    figure.savefig(path)
+
+
+def _figure(width_inches: float, height_inches: float) -> Figure:
+    # Without pyplot: no global state, no display, nothing to close.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_inches, height_inches), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _image(axis: Axes, picture: Image) -> None:
+    axis.imshow(picture, interpolation="nearest")
+    axis.set(xticks=[], yticks=[])
+    for spine in axis.spines.values():
+        spine.set_visible(False)
+
+
+def _class_legend(figure: Figure, legend: Legend) -> None:
+    from matplotlib.patches import Patch
+
+    patches = [
+        Patch(facecolor=colour / 255.0, edgecolor="grey", label=name)
+        for name, colour in zip(legend.names, legend.palette, strict=True)
+    ]
+    columns = min(len(patches), 9)
+    figure.legend(handles=patches, loc="outside lower center", ncols=columns, fontsize=8)

@@ -1,0 +1,113 @@
+"""Where a number comes from: command, code, versions, machine. Works outside a git checkout."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+DIFF_LIMIT = 2_000_000
+"""Characters of uncommitted changes that are kept; a longer diff ends with a line that says so."""
+
+
+def provenance() -> dict[str, Any]:
+    """What is needed to say how this process's results were made.
+
+    Returns:
+        ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords in addresses hidden), ``cwd``,
+        ``pid``, ``git_commit`` and ``git_dirty`` (None where this code is not under git),
+        ``untracked`` (files the diff does not show), ``diff`` (text), ``python``, ``packages``
+        (name -> version), ``host``, ``platform``, ``cpu``, ``cpu_count``, ``cpu_usable``,
+        ``memory_gib``, ``gpus`` (names), ``cuda``.
+    """
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": without_passwords(shlex.join(sys.orig_argv)),
+        "cwd": str(Path.cwd()),
+        "pid": os.getpid(),
+        **_code(Path(__file__).resolve()),
+        "python": platform.python_version(),
+        "packages": _packages(),
+        **_machine(),
+    }
+
+
+def without_passwords(text: str) -> str:
+    """`text` with the password of every ``scheme://user:password@host`` replaced by ``***``."""
+    return re.sub(r"(://[^/\s:@]+):[^/\s@]+@", r"\1:***@", text)
+
+
+def _code(file: Path) -> dict[str, Any]:
+    """Commit and uncommitted changes of the checkout that tracks `file`."""
+    unknown: dict[str, Any] = {"git_commit": None, "git_dirty": None, "untracked": [], "diff": ""}
+    # An installed copy may lie inside some other project's checkout: that commit would mislead.
+    if _git(file.parent, "ls-files", "--error-unmatch", file.name) is None:
+        return unknown
+    root = Path((_git(file.parent, "rev-parse", "--show-toplevel") or "").strip())
+    commit = _git(root, "rev-parse", "HEAD")
+    if commit is None:
+        return unknown
+    diff = _git(root, "diff", "HEAD") or ""
+    untracked = (_git(root, "ls-files", "--others", "--exclude-standard") or "").splitlines()
+    if len(diff) > DIFF_LIMIT:
+        diff = f"{diff[:DIFF_LIMIT]}\n(cut after {DIFF_LIMIT} characters)\n"
+    return {
+        "git_commit": commit.strip(),
+        "git_dirty": bool(diff or untracked),
+        "untracked": untracked,
+        "diff": diff,
+    }
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """Output of a git command, or None where git is missing or refuses."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=20,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout
+
+
+def _packages() -> dict[str, str]:
+    found = {dist.metadata["Name"]: dist.version for dist in metadata.distributions()}
+    return {name: found[name] for name in sorted(found, key=str.lower)}
+
+
+def _machine() -> dict[str, Any]:
+    # Imported here, so that reading provenance does not cost the start of torch.
+    import torch
+
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return {
+        "host": platform.node(),
+        "platform": platform.platform(),
+        "cpu": _cpu_model(Path("/proc/cpuinfo")),
+        "cpu_count": os.cpu_count(),
+        "cpu_usable": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "memory_gib": round(memory / 2**30, 1),
+        "gpus": [torch.cuda.get_device_name(index) for index in gpus],
+        "cuda": torch.version.cuda,
+    }
+
+
+def _cpu_model(cpuinfo: Path) -> str:
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

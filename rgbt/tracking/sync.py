@@ -1,0 +1,115 @@
+"""Sends run folders to MLflow: ``python -m rgbt.tracking.sync runs_dir=runs`` or ``run=runs/KEY``.
+
+Safe to repeat: only what a store does not have is sent. ``uri=``, ``artifact_uri=`` and
+``experiment=`` choose another store than the one the run was started with.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rgbt.checks import InputError, nearest
+from rgbt.tracking.folder import RunFolder, runs_in
+from rgbt.tracking.mlflow_fill import Status, read_sent
+from rgbt.tracking.mlflow_store import MlflowTracking, ui_command
+
+KEYS = ("run", "runs_dir", "uri", "artifact_uri", "experiment")
+EXPERIMENT = "rgbt"
+
+
+def parse(arguments: Sequence[str]) -> dict[str, str]:
+    """``key=value`` words as a dictionary.
+
+    Raises:
+        InputError: a word of another form, an unknown key, both or none of run and runs_dir.
+    """
+    options: dict[str, str] = {}
+    for word in arguments:
+        key, equals, value = word.partition("=")
+        if not equals or not value:
+            raise InputError(f"'{word}': expected key=value; known: {', '.join(KEYS)}.")
+        if key not in KEYS:
+            raise InputError(f"'{key}' is not a key of this command; {nearest(key, KEYS)}.")
+        options[key] = value
+    if ("run" in options) == ("runs_dir" in options):
+        raise InputError("give either run=<run folder> or runs_dir=<folder of runs>.")
+    return options
+
+
+def folders_of(options: dict[str, str]) -> list[RunFolder]:
+    """The run folders that were asked for.
+
+    Raises:
+        InputError: the folder is missing or is no run folder.
+    """
+    if "runs_dir" in options:
+        return runs_in(options["runs_dir"])
+    path = Path(options["run"])
+    if not (path / "run.json").exists():
+        raise InputError(f"{path} is not a run folder (it has no run.json).")
+    return [RunFolder(path)]
+
+
+def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
+    """The store of one folder: as asked for, else the one it was started with, else the default.
+
+    Raises:
+        InputError: the store needs a password, which is not kept in the folder.
+    """
+    sent = read_sent(folder)
+    uri = options.get("uri", sent.uri if sent else None)
+    if uri is not None and ":***@" in uri:
+        raise InputError(f"{folder.path}: the password of {uri} is not kept; give uri=... with it.")
+    same_store = sent is not None and uri == sent.uri
+    artifact_uri = sent.artifact_uri if sent is not None and same_store else None
+    return MlflowTracking(
+        uri,
+        artifact_uri=options.get("artifact_uri", artifact_uri),
+        experiment=options.get("experiment", sent.experiment if sent else EXPERIMENT),
+        runs_dir=str(folder.path.parent),
+    )
+
+
+def status_of(folder: RunFolder) -> Status:
+    """Finished, running (a process holds the folder), or killed."""
+    if folder.result() is not None:
+        return "FINISHED"
+    return "RUNNING" if folder.is_locked() else "KILLED"
+
+
+def sync_all(options: dict[str, str]) -> int:
+    """Send every folder; 1 if a store could not take one of them."""
+    stores: dict[tuple[str, str], MlflowTracking] = {}
+    failed = 0
+    for folder in folders_of(options):
+        asked = tracking_of(folder, options)
+        tracking = stores.setdefault((asked.uri, asked.experiment), asked)
+        try:
+            run_id = tracking.sync(folder, status_of(folder))
+        except InputError:
+            raise
+        except Exception as error:  # Any store may fail in its own way; the next folder may do.
+            failed += 1
+            reason = (str(error).splitlines() or [""])[0]
+            sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
+        else:
+            sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")
+    for uri, _ in stores:
+        if not uri.startswith("http"):
+            sys.stdout.write(f"open MLflow  {ui_command(uri)}\n")
+    return 1 if failed else 0
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The exit code: 0 sent, 1 a store failed, 2 the input was wrong."""
+    try:
+        return sync_all(parse(arguments))
+    except InputError as error:
+        sys.stderr.write(f"rgbt: {error}\n")
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,193 @@
+"""The tables of a result as data, and as grids of text that terminal and MLflow both show.
+
+Nothing is computed here but percentages; the scores come from `rgbt.metrics.scores`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+ABSENT = "-"
+"""Shown for a score that does not exist, e.g. the IoU of a class that occurs nowhere."""
+
+
+@dataclass(frozen=True)
+class RegionTable:
+    """One row of a per-region table, as the papers print it.
+
+    Attributes:
+        row_label: what the row stands for, e.g. "grbm (ours, seed 0)" or "GRBM (paper)".
+        region_ious: R mean IoUs, fractions; region 1 first.
+        miou: mean IoU of the whole image (pooled over regions), fraction.
+        variance: population variance over regions of the IoU in percent (squared percent points).
+    """
+
+    row_label: str
+    region_ious: tuple[float, ...]
+    miou: float
+    variance: float
+
+
+@dataclass(frozen=True)
+class ClassTable:
+    """Scores by class.
+
+    Attributes:
+        names: K class names.
+        ious: K fractions over the whole image; NaN where the class is absent.
+        accuracies: K fractions (recall), same rule.
+        region_ious: K rows of R fractions, IoU of the class inside each region.
+        subset_mious: mean IoU of subsets of the images, e.g. {"day": 0.41, "night": 0.38}.
+    """
+
+    names: tuple[str, ...]
+    ious: tuple[float, ...]
+    accuracies: tuple[float, ...]
+    region_ious: tuple[tuple[float, ...], ...]
+    subset_mious: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ResultTables:
+    """Everything that is shown of one evaluation.
+
+    Attributes:
+        split: "val" or "test".
+        step: optimiser steps done.
+        region_names: R names, e.g. "ring_1", the innermost ring.
+        regions: the per-region row.
+        classes: the per-class table.
+    """
+
+    split: str
+    step: int
+    region_names: tuple[str, ...]
+    regions: RegionTable
+    classes: ClassTable
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for `RunFolder.write_tables`; NaN becomes None."""
+        return dict(_without_nan(asdict(self)))
+
+    @classmethod
+    def from_json(cls, plain: Mapping[str, Any]) -> ResultTables:
+        """The inverse of `to_json`."""
+        regions, classes = plain["regions"], plain["classes"]
+        return cls(
+            split=plain["split"],
+            step=plain["step"],
+            region_names=tuple(plain["region_names"]),
+            regions=RegionTable(
+                row_label=regions["row_label"],
+                region_ious=_numbers(regions["region_ious"]),
+                miou=_number(regions["miou"]),
+                variance=_number(regions["variance"]),
+            ),
+            classes=ClassTable(
+                names=tuple(classes["names"]),
+                ious=_numbers(classes["ious"]),
+                accuracies=_numbers(classes["accuracies"]),
+                region_ious=tuple(_numbers(row) for row in classes["region_ious"]),
+                subset_mious={k: _number(v) for k, v in classes["subset_mious"].items()},
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of text: first column labels, the others numbers."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def to_markdown(self) -> str:
+        """The table in Markdown, with the title in bold above it."""
+        rule = ["---", *["---:"] * (len(self.header) - 1)]
+        lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
+        return "\n".join([f"**{self.title}**", "", *lines]) + "\n"
+
+
+def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> Grid:
+    """Per-region rows, one below the other, in the form of the papers' tables.
+
+    Args:
+        rows: all with the same number R of regions.
+        title: shown above.
+
+    Returns:
+        columns: label, IoU1 .. IoUR, mIoU (percent), Var (squared percent points).
+
+    Raises:
+        ValueError: no rows, or rows of different R.
+    """
+    counts = {len(row.region_ious) for row in rows}
+    if len(counts) != 1:
+        raise ValueError(f"{title}: expected rows with one number of regions, got {counts}.")
+    header = ("", *(f"IoU{index + 1}" for index in range(counts.pop())), "mIoU", "Var")
+    text = tuple(
+        (row.row_label, *map(percent, (*row.region_ious, row.miou)), number(row.variance))
+        for row in rows
+    )
+    return Grid(title, header, text)
+
+
+def class_grid(tables: ResultTables) -> Grid:
+    """IoU and accuracy by class over the image, then the class's IoU in every region; percent."""
+    classes = tables.classes
+    header = ("class", "IoU", "Acc", *tables.region_names)
+    rows = [
+        (name, *map(percent, (iou, accuracy, *by_region)))
+        for name, iou, accuracy, by_region in zip(
+            classes.names, classes.ious, classes.accuracies, classes.region_ious, strict=True
+        )
+    ]
+    regions = tables.regions
+    mean = ("mean", percent(regions.miou), "", *map(percent, regions.region_ious))
+    return Grid("IoU and accuracy by class", header, (*rows, mean))
+
+
+def subset_grid(tables: ResultTables) -> Grid:
+    """MIoU of all images and of each subset, percent."""
+    subsets = {"all images": tables.regions.miou, **tables.classes.subset_mious}
+    rows = tuple((name, percent(value)) for name, value in subsets.items())
+    return Grid("mIoU by subset", ("images", "mIoU"), rows)
+
+
+def result_grids(tables: ResultTables) -> tuple[Grid, ...]:
+    """The tables that stand at the end of a run."""
+    where = f"{tables.split}, step {tables.step}"
+    return (
+        region_grid([tables.regions], f"IoU by region ({where})"),
+        class_grid(tables),
+        subset_grid(tables),
+    )
+
+
+def percent(fraction: float) -> str:
+    """A fraction as percent with two decimals, as the papers print it."""
+    return number(100.0 * fraction)
+
+
+def number(value: float) -> str:
+    """Two decimals; `ABSENT` for NaN."""
+    return ABSENT if math.isnan(value) else f"{value:.2f}"
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(child) for key, child in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(child) for child in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _numbers(values: Sequence[float | None]) -> tuple[float, ...]:
+    return tuple(_number(value) for value in values)

@@ -1,0 +1,60 @@
+"""Synthetic scenes per second on one thread: rendered only, and rendered and written as PNG.
+
+Run: python -m tests.benchmarks.bench_synth [num_scenes]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rgbt.data.synth.factors import SceneFactors
+from rgbt.data.synth.scene import render_scene
+from rgbt.data.synth.writer import Plan, write_index
+
+WANTED = 100.0
+"""Scenes per second and core at 120 x 160, rendered only (issue: dataset synth)."""
+
+ROUNDS = 5
+
+
+def rate(work: Callable[[int], object], num_scenes: int) -> tuple[float, float]:
+    """Scenes per CPU second: median round, and each scene at the best of all rounds."""
+    seconds = np.empty((ROUNDS, num_scenes))
+    for turn in range(ROUNDS):
+        for index in range(num_scenes):
+            start = time.process_time()
+            work(index)
+            seconds[turn, index] = time.process_time() - start
+    return num_scenes / float(np.median(seconds.sum(1))), num_scenes / float(seconds.min(0).sum())
+
+
+def main(num_scenes: int) -> None:
+    cv2.setNumThreads(1)
+    factors = SceneFactors()
+    for index in range(20):
+        render_scene(0, index, factors)
+    plan = Plan(seed=0, num_train=num_scenes, num_val=1, num_test=1, factors=factors)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        (folder / "images").mkdir()
+        (folder / "labels").mkdir()
+        rows = {
+            "render": rate(lambda index: render_scene(0, index, factors), num_scenes),
+            "render + PNG": rate(lambda index: write_index(plan, folder, index), num_scenes),
+        }
+    print(f"{factors.height} x {factors.width}, one thread, {num_scenes} scenes, CPU time")
+    print(f"{'':<14}{'median':>10}{'best':>10}   scenes/s")
+    for name, (median, best) in rows.items():
+        print(f"{name:<14}{median:>10.0f}{best:>10.0f}")
+    print(f"wanted: {WANTED:.0f} rendered scenes/s")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)

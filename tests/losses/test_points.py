@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rgbt.losses.points import PointSource, class_shares, most_uncertain, sample
+
+CPU = torch.device("cpu")
+
+
+def source(seed: int = 0) -> PointSource:
+    return PointSource(torch.Generator().manual_seed(seed), device=CPU)
+
+
+@pytest.mark.parametrize("count", [1, 3, 64])
+def test_draws_do_not_depend_on_how_many_sets_are_asked_for(count: int) -> None:
+    together = source().loss(5, 3, count)
+    one_by_one = source()
+    pieces = [one_by_one.loss(n, 3, count) for n in (1, 3, 1)]
+    assert together.shape == (5, 3, count, 2)
+    assert torch.equal(together, torch.cat(pieces))
+
+
+def test_no_points_for_no_masks() -> None:
+    assert source().loss(4, 0, 10).shape == (4, 0, 10, 2)
+
+
+def test_points_are_uniform_and_independent() -> None:
+    points = source().matcher(2, 4, 50_000).reshape(-1, 2)
+    assert points.abs().max() < 1
+    # Uniform on [-1, 1]: mean 0, variance 1/3. 400,000 draws: five standard errors are below 0.005.
+    assert torch.allclose(points.mean(0), torch.zeros(2), atol=5e-3)
+    assert torch.allclose(points.var(0), torch.full((2,), 1 / 3), atol=5e-3)
+    neighbours = torch.cat([points[:-1], points[1:]], dim=1)
+    assert torch.corrcoef(neighbours.T).fill_diagonal_(0)[:2].abs().triu(1).max() < 0.01
+    share, _ = torch.histogram(points[:, 0], bins=16, range=(-1.0, 1.0))
+    assert torch.allclose(share / len(points), torch.full((16,), 1 / 16), atol=3e-3)
+
+
+def test_different_seeds_differ() -> None:
+    assert not torch.equal(source(0).matcher(1, 1, 9), source(1).matcher(1, 1, 9))
+
+
+def test_sample_by_hand() -> None:
+    # 1 x 2 pixels [4, 8]: their centres lie at x = -1/2 and 1/2.
+    maps = torch.tensor([[[[4.0, 8.0]]]])
+    points = torch.tensor([[[[-0.5, 0.0], [0.0, 0.0], [0.25, 0.0], [-1.0, 0.0]]]])
+    assert sample(maps, points).flatten().tolist() == [4.0, 6.0, 7.0, 2.0]  # the last half outside
+    assert sample(maps, points, "border").flatten().tolist() == [4.0, 6.0, 7.0, 4.0]
+
+
+def test_class_shares_equal_the_sampled_one_hot_label() -> None:
+    generator = torch.Generator().manual_seed(0)
+    label = torch.randint(0, 5, (3, 10, 14), generator=generator)
+    label[label == 4] = 255
+    points = 2 * torch.rand(2, 3, 500, 2, generator=generator) - 1
+    points[0, 0, 0] = torch.tensor([1.0, 1.0])
+    points[0, 0, 1] = torch.tensor([-1.0, -1.0])
+    one_hot = torch.stack([label == k for k in range(4)], 1).float()
+    expected = sample(one_hot, points.transpose(0, 1)).permute(2, 0, 1, 3)
+    assert torch.allclose(class_shares(label, points, 4), expected, atol=1e-5)
+
+
+def test_class_shares_by_hand() -> None:
+    label = torch.tensor([[[2, 0]]])
+    points = torch.tensor([[[[0.25, 0.0], [-0.5, 0.0]]]])
+    assert class_shares(label, points, 3)[0, 0].T.tolist() == [[0.75, 0.0, 0.25], [0.0, 0.0, 1.0]]
+
+
+def test_most_uncertain_keeps_the_smallest_magnitudes() -> None:
+    logits = torch.tensor([[3.0, -1.0, 0.5, -0.0], [-9.0, 8.0, -7.0, 6.0]])
+    points = torch.arange(16.0).reshape(2, 4, 2)
+    kept = most_uncertain(logits.clone(), points, 2)
+    assert sorted(kept[0, :, 0].tolist()) == [4.0, 6.0]
+    assert sorted(kept[1, :, 0].tolist()) == [12.0, 14.0]
+    assert most_uncertain(logits.clone(), points, 0).shape == (2, 0, 2)
+
+
+def test_gradient_of_sample() -> None:
+    double = {"dtype": torch.float64, "generator": torch.Generator().manual_seed(0)}
+    maps = torch.randn(2, 2, 3, 4, **double).requires_grad_()
+    points = 2 * torch.rand(2, 1, 5, 2, **double) - 1
+    assert torch.autograd.gradcheck(lambda m: sample(m, points), maps)

@@ -1,0 +1,172 @@
+"""Mask2Former against tensors recorded from the released CRM network.
+
+Needs the reference material beside the checkout (outputs of the release for weights that are
+filled by a stated rule); skipped where it is missing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from rgbt.models.mask2former.backbone import LEVELS
+from rgbt.models.mask2former.model import Mask2Former
+from rgbt.types import MaskPair
+
+ROOT = Path(__file__).resolve().parents[2]
+GOLDEN = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "golden"
+NOT_OURS = ("relative_position_index", "criterion.empty_weight")
+HEADS = {"rgbt": "", "rgb": "rgb_head.", "thermal": "thermal_head."}
+
+pytestmark = pytest.mark.skipif(
+    not (GOLDEN / "fill.py").exists(), reason="reference material is not here"
+)
+
+
+def load_fill() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("golden_fill", GOLDEN / "fill.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def filled(name: str, fill: ModuleType) -> Mask2Former:
+    """The network of a YAML with every tensor filled under its released name."""
+    values = OmegaConf.load(ROOT / "conf" / "model" / f"mask2former_{name}.yaml")
+    values.num_classes = 9
+    arguments = OmegaConf.to_container(values)
+    assert isinstance(arguments, dict)
+    del arguments["_target_"]
+    net = Mask2Former(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in arguments.items()}
+    ).eval()
+    state = {
+        key: torch.from_numpy(fill.fill(f"network.{key}", value.shape))
+        for key, value in net.state_dict().items()
+        if value.is_floating_point()
+    }
+    net.load_state_dict(state, strict=False)
+    return net
+
+
+def record(net: Mask2Former) -> dict[str, Tensor]:
+    """Outputs of inner modules under the names of the reference, refilled by each forward."""
+    seen: dict[str, Tensor] = {}
+    decoder = net.sem_seg_head.pixel_decoder
+    watched = {
+        "rgb.patch_embed": (net.backbone.RGB_branch.patch_embed, "map"),
+        "thermal.patch_embed": (net.backbone.THR_branch.patch_embed, "map"),
+        "pixel_decoder.adapter_1": (decoder.adapter_1, "same"),
+    }
+    for stage in range(4):
+        rgb, thermal = (
+            b.layers[stage].blocks for b in (net.backbone.RGB_branch, net.backbone.THR_branch)
+        )
+        watched[f"rgb.stage{stage}.block0"] = (rgb[0], "tokens")
+        watched[f"thermal.stage{stage}.block1"] = (thermal[1], "tokens")
+    for level in range(3):
+        watched[f"pixel_decoder.input_proj.{level}"] = (decoder.input_proj[level], "same")
+    for layer in (0, 2, 5):
+        module = decoder.transformer.encoder["layers"][layer]
+        watched[f"pixel_decoder.encoder_layer.{layer}"] = (module, "same")
+    for layer, ffn in enumerate(net.sem_seg_head.predictor.transformer_ffn_layers):
+        watched[f"decoder.layer.{layer}"] = (ffn, "queries")
+    arrange = {
+        "same": lambda x: x,
+        "map": lambda x: x.permute(0, 3, 1, 2),
+        "tokens": lambda x: x.flatten(1, 2),
+        "queries": lambda x: x.transpose(0, 1),
+    }
+    for name, (module, kind) in watched.items():
+        module.register_forward_hook(
+            lambda _m, _i, out, name=name, kind=kind: seen.update({name: arrange[kind](out)})
+        )
+    net.backbone.register_forward_hook(
+        lambda _m, args, out: seen.update(
+            zip((*LEVELS, "network_input"), (*out, torch.cat(args[0], 1)), strict=True)
+        )
+    )
+    decoder.register_forward_hook(lambda _m, _i, out: seen.update(pyramid(net, out)))
+    return seen
+
+
+def pyramid(net: Mask2Former, out: Any) -> dict[str, Tensor]:
+    """What the pixel decoder returned, with its last convolution applied."""
+    named = {
+        "pixel_decoder.layer_1": out.fine,
+        "pixel_decoder.mask_features": net.sem_seg_head.pixel_decoder.mask_features(out.fine),
+    }
+    for level, (tokens, hw) in enumerate(zip(out.tokens, out.levels, strict=True)):
+        named[f"pixel_decoder.scale.{level}"] = tokens.transpose(1, 2).unflatten(2, hw)
+    return named
+
+
+def all_outputs(net: Mask2Former, image: Tensor, hidden: MaskPair) -> dict[str, Tensor]:
+    """Every tensor of one clean and one masked forward of each view."""
+    seen = record(net)
+    found: dict[str, Tensor] = {}
+    logits = {}
+    for prefix, masks in (("", None), ("masked.", hidden)):
+        for view, head in HEADS.items():
+            out = net(image[:, :3], image[:, 3:], masks, views=(view,))
+            classes, mask_logits = out.aux["class_logits"][:, 0], out.aux["mask_logits"][:, 0]
+            for layer in range(10):
+                name = f"aux.{layer}." if layer < 9 else ""
+                found[f"{prefix}{head}{name}pred_logits"] = classes[layer]
+                found[f"{prefix}{head}{name}pred_masks"] = mask_logits[layer]
+            label = "fused" if view == "rgbt" else view
+            found |= {f"{prefix}{label}.{level}": seen.pop(level) for level in LEVELS}
+            found |= {f"{prefix}{head}{name}": value for name, value in seen.items()}
+            logits[prefix + head] = classes[-1]
+            if not prefix and not head:
+                assert out.logits is not None
+                found["sem_seg"] = out.logits[0]
+    found["distill.sdc"] = (logits[""] - logits["masked."]).abs().mean()
+    found["distill.sdn"] = sum(
+        (
+            (logits[""] - logits[f"masked.{head}"]).abs().mean()
+            for head in ("rgb_head.", "thermal_head.")
+        ),
+        start=torch.zeros(()),
+    )
+    return found
+
+
+@pytest.mark.parametrize("name", ["swin_t", pytest.param("swin_s", marks=pytest.mark.slow)])
+def test_every_recorded_tensor(name: str) -> None:
+    fill = load_fill()
+    facts = json.loads((GOLDEN / f"crm_{name}.json").read_text())
+    with np.load(GOLDEN / f"crm_{name}.npz") as archive:
+        expected = dict(archive)
+    net = filled(name, fill)
+    names = {key for key in facts["keys"] if not key.endswith(NOT_OURS)}
+    assert {f"network.{key}" for key in net.state_dict()} == names
+    image = torch.from_numpy(expected["image_uint8"]).float()[None] / 255
+    hidden = torch.from_numpy(expected["mask_pair"]).bool()[:, :, 0]
+    with torch.no_grad():
+        found = all_outputs(net, image, MaskPair(hidden[:, 0], hidden[:, 1]))
+
+    wrong, compared = {}, set(facts["outputs"]) - {"mask_pair", "argmax"}
+    assert compared <= set(found), compared - set(found)
+    for key in sorted(compared):
+        about, value = facts["outputs"][key], found[key].contiguous().numpy()
+        assert list(value.shape) == about["shape"], key
+        if about["stored"] == "sampled":
+            value = value.ravel()[fill.sample_positions(key, value.size, about["count"])]
+        difference = float(np.abs(value - expected[key]).max())
+        if not difference <= about["tol_abs"]:
+            wrong[key] = (difference, about["tol_abs"])
+    assert wrong == {}
+    assert np.array_equal(found["sem_seg"].argmax(0).numpy(), expected["argmax"])

@@ -1,0 +1,189 @@
+"""Parts of Mask2Former against loops and against torch's own modules."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.models.mask2former.decoder import Attention, shrink
+from rgbt.models.mask2former.deformable import DeformableAttention
+from rgbt.models.mask2former.position import centre_grid, sine_code
+from rgbt.models.mask2former.swin import Block, PatchMerging, SwinShape
+from rgbt.models.mask2former.windows import relative_index, shift_mask
+
+CPU = torch.device("cpu")
+
+
+def seeded(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def randomise(module: nn.Module, scale: float = 0.3) -> None:
+    with torch.no_grad():
+        for number, parameter in enumerate(module.parameters()):
+            parameter.copy_(scale * seeded(*parameter.shape, seed=number))
+
+
+def test_relative_index_by_hand() -> None:
+    # Tokens (0,0) (0,1) (1,0) (1,1); (dy + 1) * 3 + (dx + 1).
+    expected = [[4, 3, 1, 0], [5, 4, 2, 1], [7, 6, 4, 3], [8, 7, 5, 4]]
+    assert relative_index(2).tolist() == expected
+
+
+def test_shift_mask_by_hand() -> None:
+    """4 x 4 tokens, windows of 2, rolled by 1: the last row and column came from the front."""
+    mask = shift_mask((4, 4), 2, 1, CPU)
+    assert mask.shape == (4, 1, 4, 4)
+    blocked = mask[:, 0] < 0
+    assert not blocked[0].any()
+    columns_apart = torch.tensor([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0]]).bool()
+    rows_apart = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 0, 0], [1, 1, 0, 0]]).bool()
+    assert torch.equal(blocked[1], columns_apart)
+    assert torch.equal(blocked[2], rows_apart)
+    assert torch.equal(blocked[3], columns_apart | rows_apart)
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_block_attention_equals_a_loop_over_tokens(shift: int) -> None:
+    """5 x 7 tokens padded to 6 x 9, windows of 3; padding is attended to, as released."""
+    block = Block(8, 2, SwinShape(8, (1,) * 4, (2,) * 4, 3, 2.0, 0.0), shift=shift)
+    randomise(block)
+    x = seeded(1, 5, 7, 8, seed=9)
+    with torch.no_grad():
+        found = block._attend(x)[0]
+        expected = _attend_by_loop(block, x[0], shift)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def _attend_by_loop(block: Block, x: Tensor, shift: int) -> Tensor:
+    attn, out = block.attn, torch.zeros_like(x)
+    padded = F.pad(x, (0, 0, 0, 2, 0, 1))
+    q, k, v = attn.qkv(padded).chunk(3, -1)
+    table = attn.relative_position_bias_table.view(5, 5, 2)
+    for r in range(5):
+        for c in range(7):
+            peers = [
+                (y, z)
+                for y in range(6)
+                for z in range(9)
+                if _window(y, 6, shift) == _window(r, 6, shift)
+                and _window(z, 9, shift) == _window(c, 9, shift)
+            ]
+            heads = []
+            for h in range(2):
+                part = slice(4 * h, 4 * h + 4)
+                scores = [
+                    q[r, c, part] @ k[y, z, part] / 2 + table[r - y + 2, c - z + 2, h]
+                    for y, z in peers
+                ]
+                values = torch.stack([v[y, z, part] for y, z in peers])
+                heads.append(torch.stack(scores).softmax(0) @ values)
+            out[r, c] = attn.proj(torch.cat(heads))
+    return out
+
+
+def _window(position: int, size: int, shift: int) -> int:
+    """Number of the window; the first `shift` tokens wrap around into a group of their own."""
+    return -1 if position < shift else (position - shift) // 3
+
+
+def test_patch_merging_order() -> None:
+    """Four neighbours in the order (0,0) (1,0) (0,1) (1,1); an odd side is padded with zeros."""
+    merge = PatchMerging(1)
+    merge.norm = nn.Identity()
+    merge.reduction = nn.Identity()
+    x = torch.tensor([[1.0, 2, 3], [4, 5, 6]]).view(1, 2, 3, 1)
+    assert merge(x).view(2, 4).tolist() == [[1, 4, 2, 5], [3, 6, 0, 0]]
+
+
+def test_sine_code_equals_its_formula() -> None:
+    code = sine_code((2, 3), 8, CPU).view(2, 3, 8)
+    for y in range(2):
+        for x in range(3):
+            expected = []
+            for position, size in ((y, 2), (x, 3)):
+                for k in range(4):
+                    angle = (
+                        2 * math.pi * (position + 1) / (size + 1e-6) / 10000 ** (2 * (k // 2) / 4)
+                    )
+                    expected.append(math.cos(angle) if k % 2 else math.sin(angle))
+            torch.testing.assert_close(code[y, x], torch.tensor(expected), rtol=1e-5, atol=1e-5)
+
+
+def test_centre_grid_by_hand() -> None:
+    assert centre_grid(((1, 2),), CPU).tolist() == [[-0.5, 0.5], [0.0, 0.0]]
+
+
+def test_deformable_attention_equals_a_loop_over_samples() -> None:
+    levels = ((2, 3), (4, 5))
+    layer = DeformableAttention(8, heads=2, num_levels=2)
+    randomise(layer)
+    query, tokens = seeded(2, 26, 8, seed=50), seeded(2, 26, 8, seed=51)
+    with torch.no_grad():
+        found = layer(query, tokens, levels)
+        value = layer.value_proj(tokens).view(2, 26, 2, 4)
+        offsets = layer.sampling_offsets(query).view(2, 26, 2, 2, 4, 2)
+        weights = layer.attention_weights(query).view(2, 26, 2, 8).softmax(-1).view(2, 26, 2, 2, 4)
+        out = torch.zeros(2, 26, 2, 4)
+        centres = [
+            ((r + 0.5) / h, (c + 0.5) / w) for h, w in levels for r in range(h) for c in range(w)
+        ]
+        for b, s, m, e, j in torch.cartesian_prod(
+            *(torch.arange(n) for n in (2, 26, 2, 2, 4))
+        ).tolist():
+            (h, w), start = levels[e], (0, 6)[e]
+            dx, dy = offsets[b, s, m, e, j].tolist()
+            row, column = centres[s][0] * h + dy - 0.5, centres[s][1] * w + dx - 0.5
+            grid = value[b, start : start + h * w, m].view(h, w, 4)
+            out[b, s, m] += weights[b, s, m, e, j] * _bilinear(grid, row, column)
+        expected = layer.output_proj(out.flatten(2))
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def _bilinear(grid: Tensor, row: float, column: float) -> Tensor:
+    """Bilinear sample at a position in pixels; zero outside."""
+    total = torch.zeros(grid.shape[-1])
+    top, left = math.floor(row), math.floor(column)
+    for r in (top, top + 1):
+        for c in (left, left + 1):
+            if 0 <= r < grid.shape[0] and 0 <= c < grid.shape[1]:
+                total += (1 - abs(row - r)) * (1 - abs(column - c)) * grid[r, c]
+    return total
+
+
+def test_deformable_attention_starts_by_looking_around() -> None:
+    """Four heads look right, down, left, up, at 1..4 pixels."""
+    layer = DeformableAttention(8, heads=4, num_levels=1)
+    bias = layer.sampling_offsets.bias.view(4, 4, 2)
+    for head, direction in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
+        for point in range(4):
+            expected = torch.tensor(direction) * (point + 1.0)
+            torch.testing.assert_close(bias[head, point], expected, rtol=0, atol=1e-6)
+    assert not layer.sampling_offsets.weight.any()
+
+
+def test_attention_equals_torch_module() -> None:
+    ours, theirs = Attention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
+    randomise(ours)
+    theirs.load_state_dict(ours.state_dict())
+    query, key, value = seeded(2, 3, 8, seed=1), seeded(2, 5, 8, seed=2), seeded(2, 5, 8, seed=3)
+    allowed = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(4)) < 0.6
+    allowed |= ~allowed.any(-1, keepdim=True)
+    blocked = ~allowed.repeat_interleave(2, dim=0)
+    torch.testing.assert_close(
+        ours(query, key, value, allowed), theirs(query, key, value, attn_mask=blocked)[0]
+    )
+    torch.testing.assert_close(ours(query, key, value, None), theirs(query, key, value)[0])
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_shrink_equals_bilinear_interpolation(factor: int) -> None:
+    x = seeded(2, 3, 16, 24)
+    expected = F.interpolate(
+        x, size=(16 // factor, 24 // factor), mode="bilinear", align_corners=False
+    )
+    torch.testing.assert_close(shrink(x, factor), expected)

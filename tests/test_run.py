@@ -1,0 +1,386 @@
+"""The commands as a user calls them: end to end, resumed, killed, and with bad input."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbt.metrics.counts import Counts
+
+ROOT = Path(__file__).resolve().parents[1]
+SPLITS = {
+    "train": [f"{n:05d}{'DN'[n % 2]}" for n in range(1, 9)],
+    "val": ["00101D", "00102N"],
+    "test": ["00201D", "00202N", "00203D"],
+}
+SMALL = (
+    *("scale.batch_size=2", "scale.eval_batch_size=2", "scale.num_points=64"),
+    *("scale.crop_hw=[48,64]", "scale.train_sizes=[48,56]", "scale.test_short_edge=48"),
+    *(
+        "masker.patch_size=32",
+        "trainer.log_every=1",
+        "trainer.accelerator=cpu",
+        "trainer.threads=1",
+    ),
+)
+Call = Callable[..., tuple[int, str, str]]
+
+
+def short(steps: int) -> tuple[str, ...]:
+    return f"trainer.max_steps={steps}", f"trainer.eval_every={steps}", "trainer.checkpoint_every=2"
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Call:
+    """Call a command's entry in this process: (exit code, stdout, stderr)."""
+
+    def run(entry: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["rgbt", *arguments])
+        with pytest.raises(SystemExit) as left:
+            entry()
+        out, err = capfd.readouterr()
+        return int(left.value.code or 0), out, err
+
+    return run
+
+
+@pytest.fixture
+def data(write_mfnet: Callable[..., Path]) -> Path:
+    return write_mfnet(SPLITS, hw=(48, 64))
+
+
+def train(call: Call, data: Path, runs: Path, *overrides: str) -> tuple[int, str, str]:
+    from rgbt.run import main
+
+    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
+    return call(main, *place, *SMALL, *overrides)
+
+
+def only_run(runs: Path) -> Path:
+    (result,) = runs.glob("*/result.json")
+    return result.parent
+
+
+@pytest.mark.parametrize(
+    "experiment", sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
+)
+def test_every_experiment_trains_evaluates_and_leaves_its_folder(
+    call: Call, data: Path, tmp_path: Path, experiment: str
+) -> None:
+    patch = [] if experiment != "baseline" else ["masker.patch_size=null"]
+    code, out, err = train(call, data, tmp_path, f"+experiment={experiment}", *patch, *short(2))
+    assert code == 0, err
+    assert "IoU1" in out
+    assert "mIoU" in out
+    assert "unlabeled" in out
+    folder = only_run(tmp_path)
+    counts = Counts.load(folder / "counts_test.npz")
+    assert counts.names == tuple(SPLITS["test"])
+    assert counts.counts.sum() == 3 * 48 * 64
+    written = {path.name for path in folder.iterdir()}
+    assert {"config.yaml", "metrics.jsonl", "provenance.json", "tables.json", "best.pt"} <= written
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [(line["kind"], line["step"]) for line in lines] == [
+        *(("train", 1), ("train", 2), ("val", 2), ("test", 2))
+    ]
+    assert {"loss", "grad_norm", "images_per_s", "wait_share"} <= set(lines[0]["values"])
+
+
+def test_a_finished_run_says_so_and_shows_its_tables(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    first = train(call, data, tmp_path, "+experiment=grbm", *short(1))
+    again = train(call, data, tmp_path, "+experiment=grbm", *short(1))
+    assert again[0] == 0
+    assert "is finished" in again[2]
+    assert again[1] == first[1]
+
+
+def test_the_same_seed_gives_the_same_losses_and_another_seed_another_run(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    losses = {}
+    for where, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(call, data, tmp_path / where, "+experiment=crm", f"seed={seed}", *short(2))
+        text = (only_run(tmp_path / where) / "metrics.jsonl").read_text().splitlines()
+        losses[where] = [json.loads(line)["values"].get("loss") for line in text]
+    assert losses["a"] == losses["b"]
+    assert losses["a"] != losses["c"]
+    assert only_run(tmp_path / "a").name == only_run(tmp_path / "b").name
+    assert only_run(tmp_path / "a").name != only_run(tmp_path / "c").name
+
+
+def command(data: Path, runs: Path, *overrides: str) -> list[str]:
+    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
+    return [sys.executable, "-m", "rgbt.run", *place, *SMALL, *overrides]
+
+
+def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_path: Path) -> None:
+    overrides = ("+experiment=grbm", *short(12))
+    process = subprocess.Popen(
+        command(data, tmp_path / "killed", *overrides),
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )
+    wait_for_step(tmp_path / "killed", 5)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (folder,) = (path.parent for path in (tmp_path / "killed").glob("*/metrics.jsonl"))
+    assert not (folder / "result.json").exists()
+
+    code, _, err = train(call, data, tmp_path / "killed", *overrides)
+    assert code == 0, err
+    assert "continues at step" in err
+    train(call, data, tmp_path / "straight", *overrides)
+
+    resumed, straight = only_run(tmp_path / "killed"), only_run(tmp_path / "straight")
+    assert resumed.name == straight.name
+    for split in ("val", "test"):
+        a, b = (Counts.load(f / f"counts_{split}.npz").counts for f in (resumed, straight))
+        assert np.array_equal(a, b)
+    steps = [json.loads(line) for line in (resumed / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in steps if line["kind"] == "train"] == list(range(1, 13))
+
+
+def wait_for_step(runs: Path, step: int, seconds: float = 120.0) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        text = "".join(path.read_text() for path in runs.glob("*/metrics.jsonl"))
+        if f'"step": {step}' in text:
+            return
+        time.sleep(0.02)
+    pytest.fail(f"step {step} was not reached in {seconds} s")
+
+
+BAD_OVERRIDES = {
+    "unknown experiment": (["+experiment=gbrm"], "no experiment 'gbrm'; did you mean 'grbm'?"),
+    "unknown option": (["masker=grm"], "there is no masker 'grm'"),
+    "misspelt group": (["optimiser=adamw"], "optimiser"),
+    "misspelt key": (["optimizer.lrr=1"], "'optimizer.lrr' is not a key"),
+    "misspelt key after plus": (["+optimizer.lrr=1"], "'optimizer.lrr' is not a setting"),
+    "misspelt deep key": (["+loss.spatial.alfa=1"], "'loss.spatial.alfa' is not a setting"),
+    "misspelt top-level key": (["+sead=1"], "'sead' is not a key of the configuration"),
+    "word for a number": (["optimizer.lr=fast"], "'optimizer.lr'"),
+    "number for a choice": (["schedule.per=week"], "'schedule.per'"),
+    "fraction for a count": (["trainer.accumulate=1.5"], "'trainer.accumulate'"),
+    "collaborator as a setting": (["+scheme.model=1"], "'scheme.model'"),
+    "missing root": (["dataset=mfnet", "~dataset.root"], "'dataset.root'"),
+    "root without value": (["dataset=mfnet", "dataset.root=???"], "'dataset.root' has no value"),
+    "no such folder": (["dataset.root=/no/such"], "dataset.root: there is no folder '/no/such'"),
+    "patch that does not divide": (["masker.patch_size=48"], "masker.patch_size"),
+    "patch of no tokens": (["masker.patch_size=6"], "masker.patch_size"),
+    "distillation without masks": (["masker=none", "scheme=crm"], "hides nothing"),
+    "batch above the split": (["data.batch_size=9"], "data.batch_size is 9"),
+}
+
+
+@pytest.mark.parametrize(("overrides", "sentence"), BAD_OVERRIDES.values(), ids=BAD_OVERRIDES)
+def test_a_wrong_configuration_is_one_sentence_and_exit_code_2(
+    call: Call, data: Path, tmp_path: Path, overrides: list[str], sentence: str
+) -> None:
+    start = [] if overrides[0].startswith("+exp") else ["+experiment=grbm"]
+    given = [item for item in SMALL if item.partition("=")[0] != overrides[0].partition("=")[0]]
+    if "masker=none" in overrides:
+        given.remove("masker.patch_size=32")
+    if overrides[0] != "dataset=mfnet":
+        start.append("dataset=mfnet")
+    if not any("dataset.root" in item for item in overrides):
+        start.append(f"dataset.root={data}")
+    from rgbt.run import main
+
+    code, out, err = call(
+        main, *start, f"runs_dir={tmp_path}", "tracking=none", *given, *overrides, *short(1)
+    )
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
+
+
+def assert_one_sentence(err: str, sentence: str) -> None:
+    told = [line for line in err.splitlines() if line.startswith("rgbt: ")]
+    assert len(told) == 1, err
+    assert sentence in told[0]
+    assert "Traceback" not in err
+
+
+def test_a_misspelt_key_in_an_experiment_file_is_refused(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    mine = tmp_path / "conf" / "experiment"
+    mine.mkdir(parents=True)
+    (mine / "mine.yaml").write_text("# @package _global_\ntrainer: {max_step: 3}\n")
+    code, _, err = train(
+        call, data, tmp_path, "+experiment=mine", f"hydra.searchpath=[file://{tmp_path / 'conf'}]",
+        "masker.patch_size=null",
+    )  # fmt: skip
+    assert code == 2
+    assert_one_sentence(err, "'trainer.max_step' is not a setting of")
+    assert "did you mean 'max_steps'?" in err
+
+
+def label_of_nine(data: Path) -> str:
+    path = data / "labels" / "00003N.png"
+    assert cv2.imwrite(str(path), np.full((48, 64), 9, np.uint8))
+    return "label value 9 is out of range"
+
+
+def other_size(data: Path) -> str:
+    assert cv2.imwrite(str(data / "labels" / "00003N.png"), np.zeros((24, 32), np.uint8))
+    return "the image is 48x64 pixels but its label is 24x32"
+
+
+def three_channels(data: Path) -> str:
+    assert cv2.imwrite(str(data / "images" / "00003N.png"), np.zeros((48, 64, 3), np.uint8))
+    return "expected 4 channels"
+
+
+def corrupted(data: Path) -> str:
+    path = data / "images" / "00003N.png"
+    path.write_bytes(path.read_bytes()[:100])
+    return "00003N.png cannot be decoded"
+
+
+def empty_split(data: Path) -> str:
+    (data / "val.txt").write_text("\n")
+    return "val.txt' is empty"
+
+
+@pytest.mark.parametrize(
+    "spoil", [label_of_nine, other_size, three_channels, corrupted, empty_split]
+)
+def test_bad_files_are_named_in_one_sentence(
+    call: Call, data: Path, tmp_path: Path, spoil: Callable[[Path], str]
+) -> None:
+    sentence = spoil(data)
+    code, _, err = train(call, data, tmp_path / "runs", "+experiment=crm", *short(4))
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
+    assert not list((tmp_path / "runs").glob("*/result.json"))
+
+
+def test_an_unreadable_file_can_be_skipped_and_is_reported(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    corrupted(data)
+    code, _, err = train(
+        call, data, tmp_path / "runs", "+experiment=crm", "data.on_error=skip", *short(4)
+    )
+    assert code == 0, err
+    result = json.loads((only_run(tmp_path / "runs") / "result.json").read_text())
+    assert result["skipped"] == ["00003N"]
+
+
+def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    train(call, data, runs, "+experiment=crm", *short(1))
+    (only_run(runs) / "result.json").unlink()
+    (data / "train.txt").write_text("\n".join(SPLITS["train"][:-1]) + "\n")
+    code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
+    assert code == 2
+    assert_one_sentence(err, "was trained on other files")
+
+
+def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Path) -> None:
+    from rgbt import evaluate, predict
+    from rgbt.command import plain_command
+
+    runs = tmp_path / "runs"
+    train(call, data, runs, "+experiment=crm", *short(1))
+    folder = only_run(runs)
+    evaluate_entry = plain_command(evaluate.OWN, evaluate.main)
+
+    code, out, err = call(evaluate_entry, f"run={folder}")
+    assert code == 0, err
+    stored = Counts.load(folder / "evaluations" / "mfnet_test_rgbt_ring5.npz")
+    assert np.array_equal(stored.counts, Counts.load(folder / "counts_test.npz").counts)
+
+    code, out, err = call(
+        evaluate_entry, f"run={folder.name}", f"runs_dir={runs}", "modality=rgb", "regions=ring9"
+    )
+    assert code == 0, err
+    assert "IoU9" in out
+    assert (folder / "evaluations" / "mfnet_test_rgb_ring9.npz").exists()
+
+    other = tmp_path / "images"
+    other.mkdir()
+    (other / "a.png").write_bytes((data / "images" / "00201D.png").read_bytes())
+    code, out, err = call(
+        plain_command(predict.OWN, predict.main),
+        *(f"run={folder}", f"input={other}", f"out={tmp_path / 'out'}"),
+    )
+    assert code == 0, err
+    classes = cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert classes.shape == (48, 64)
+    assert classes.max() < 9
+    assert cv2.imread(str(tmp_path / "out" / "a_overlay.png")).shape == (48, 64, 3)
+
+
+def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Path) -> None:
+    from rgbt import evaluate
+    from rgbt.command import plain_command
+
+    runs = tmp_path / "runs"
+    train(call, data, runs, "+experiment=crm", *short(1))
+    folder = only_run(runs)
+    entry = plain_command(evaluate.OWN, evaluate.main)
+    cases = {
+        ("run=nowhere",): "run=nowhere: neither a run folder",
+        (f"run={folder}", "modality=infrared"): "modality: 'infrared' is not a choice",
+        (f"run={folder}", "split=tset"): "no split 'tset'",
+        (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
+        (f"run={folder}", "data.batch=1"): "did you mean 'data.batch_size'?",
+        (): "'run' has no value",
+    }
+    for arguments, sentence in cases.items():
+        code, _, err = call(entry, *arguments)
+        assert code == 2, err
+        assert_one_sentence(err, sentence)
+
+    (folder / "best.pt").rename(folder / "kept.pt")
+    code, _, err = call(entry, f"run={folder}")
+    assert code == 2
+    assert_one_sentence(err, "there is no such checkpoint")
+
+
+def test_a_checkpoint_of_another_model_is_refused(call: Call, data: Path, tmp_path: Path) -> None:
+    train(call, data, tmp_path / "runs", "+experiment=crm", *short(1))
+    folder = only_run(tmp_path / "runs")
+    code, _, err = train(
+        *(call, data, tmp_path / "other", "+experiment=crm", "model.num_queries=7"),
+        *(f"trainer.init_from={folder}", *short(1)),
+    )
+    assert code == 2
+    assert_one_sentence(err, "is a checkpoint of another model")
+
+
+def test_multirun_finishes_the_other_points_when_one_is_wrong(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    code, _, err = train(
+        call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
+    )
+    assert code == 2
+    assert_one_sentence(err, "masker.sigma_div")
+    assert len(list(tmp_path.glob("*/result.json"))) == 2
+
+
+def test_help_needs_neither_torch_nor_mlflow() -> None:
+    script = (
+        "import sys, runpy\nsys.argv = ['rgbt', '--help']\n"
+        "try:\n    runpy.run_module('rgbt.run', run_name='__main__')\n"
+        "except SystemExit as left:\n    assert not left.code\n"
+        "heavy = {'torch', 'mlflow', 'pandas', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert "+experiment=grbm" in done.stdout

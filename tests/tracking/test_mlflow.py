@@ -1,0 +1,333 @@
+"""MLflow filled from run folders: live, later, again, and with no store at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import build, check_node
+from rgbt.tracking import sync
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.mlflow_fill import artifact_table, read_sent, shown, write_sent
+from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.mlflow_view import SECTIONS, view_tags
+from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+
+CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
+DEAD = "http://127.0.0.1:9"
+TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}
+PARAMS = {"seed": 0, "masker.sigma_div": 2, "long": "x" * 900}
+TABLES = ResultTables(
+    split="test",
+    step=20,
+    region_names=("ring 1", "ring 2"),
+    regions=RegionTable("grbm", (0.25, 0.5), 0.4, 156.25),
+    classes=ClassTable(
+        names=("road", "car"),
+        ious=(0.5, 0.3),
+        accuracies=(0.6, math.nan),
+        region_ious=((0.25, 0.75), (0.25, math.nan)),
+        subset_mious={"day": 0.4},
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def runs_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder of runs, so that the store is made once."""
+    return tmp_path_factory.mktemp("runs")
+
+
+def tracking(runs_dir: Path, uri: str | None = None) -> MlflowTracking:
+    return MlflowTracking(uri, artifact_uri=None, experiment="rgbt", runs_dir=str(runs_dir))
+
+
+def begin(folder: RunFolder, tracker: MlflowTracking | NoTracking) -> None:
+    tracker.start(folder, "grbm seed=0", TAGS, PARAMS)
+
+
+def conclude(folder: RunFolder) -> None:
+    """What a run writes at its end."""
+    folder.append(20, "test", {"mIoU": 0.4, "Var": 156.25, "region/1": 0.25, "class/car": math.nan})
+    folder.write_tables(TABLES.to_json())
+    folder.figure_path("region_iou").write_bytes(b"png")
+    folder.counts_path("test").write_bytes(b"npz")
+    folder.finish({"mIoU": 0.4})
+
+
+def client(runs_dir: Path) -> Any:
+    from mlflow import MlflowClient
+
+    return MlflowClient(tracking_uri=f"sqlite:///{runs_dir / 'mlflow.db'}")
+
+
+def points(store: Any, run_id: str, name: str) -> list[tuple[int, float]]:
+    return [(point.step, point.value) for point in store.get_metric_history(run_id, name)]
+
+
+@pytest.fixture(scope="module")
+def finished(runs_dir: Path) -> RunFolder:
+    """A run killed after step 10 with its checkpoint at step 5, continued, finished."""
+    folder = RunFolder(runs_dir / "killed")
+    folder.write_config("seed: 0\n")
+    folder.add_provenance({"command": "python -m rgbt.run", "started": "2026-01-01T00:00:00+00:00"})
+    first = tracking(runs_dir)
+    begin(folder, first)
+    folder.append(5, "train", {"loss": 3.0})
+    folder.append(10, "train", {"loss": 2.0})
+    folder.append(10, "val", {"mIoU": 0.123456})
+    first.update()
+    first.update()
+    (folder.path / "first_run_id").write_text(run_id(folder))
+
+    # The lines beyond the checkpoint are written again, at another time.
+    folder.truncate_after(5)
+    second = tracking(runs_dir)
+    begin(folder, second)
+    folder.append(10, "train", {"loss": 2.0})
+    folder.append(10, "val", {"mIoU": 0.123456})
+    folder.append(15, "train", {"loss": 1.0})
+    second.update()
+    conclude(folder)
+    second.finish()
+    second.finish()
+    return folder
+
+
+def run_id(folder: RunFolder) -> str:
+    sent = read_sent(folder)
+    assert sent is not None
+    assert sent.run_id
+    return sent.run_id
+
+
+def test_a_killed_run_continues_in_the_same_mlflow_run_without_duplicates(
+    runs_dir: Path, finished: RunFolder
+) -> None:
+    store, run = client(runs_dir), run_id(finished)
+    assert run == (finished.path / "first_run_id").read_text()
+    assert points(store, run, "train/loss") == [(5, 3.0), (10, 2.0), (15, 1.0)]
+    assert points(store, run, "val/mIoU") == [(10, 12.35)]
+    assert points(store, run, "mIoU") == [(0, 40.0)]
+    assert points(store, run, "Var") == [(0, 156.25)]
+    assert points(store, run, "profile/iou_by_region") == [(1, 25.0), (2, 50.0)]
+
+
+def test_sending_lines_again_after_a_crash_leaves_no_duplicate(runs_dir: Path) -> None:
+    folder = RunFolder(runs_dir / "crashed")
+    NoTracking().start(folder, "grbm", TAGS, PARAMS)
+    folder.append(5, "train", {"loss": 3.0})
+    conclude(folder)
+    tracking(runs_dir).sync(folder, "FINISHED")
+    sent = read_sent(folder)
+    assert sent is not None
+    write_sent(folder, replace(sent, steps={}, profile=False))
+    tracking(runs_dir).sync(folder, "FINISHED")
+    assert points(client(runs_dir), sent.run_id, "train/loss") == [(5, 3.0)]
+    assert points(client(runs_dir), sent.run_id, "profile/iou_by_region") == [(1, 25.0), (2, 50.0)]
+    assert read_sent(folder) == sent
+
+
+def test_the_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None:
+    run = client(runs_dir).get_run(run_id(finished))
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "grbm seed=0"
+    assert run.info.start_time == 1767225600000
+    assert TAGS.items() <= run.data.tags.items()
+    assert run.data.params["masker.sigma_div"] == "2"
+    assert len(run.data.params["long"]) == 500
+    assert "class/car" not in run.data.metrics, "a score that does not exist is not drawn"
+    assert "| grbm | 25.00 | 50.00 | 40.00 | 156.25 |" in run.data.tags["mlflow.note.content"]
+
+
+def test_the_mlflow_run_holds_table_and_files(runs_dir: Path, finished: RunFolder) -> None:
+    store, run = client(runs_dir), run_id(finished)
+    table = Path(store.download_artifacts(run, "tables/iou.json"))
+    assert json.loads(table.read_text()) == artifact_table(TABLES)
+    logged = json.loads(store.get_run(run).data.tags["mlflow.loggedArtifacts"])
+    assert logged == [{"path": "tables/iou.json", "type": "table"}]
+    names = {item.path for item in store.list_artifacts(run)}
+    assert {"config.yaml", "provenance.json", "counts_test.npz", "figures", "result.json"} <= names
+
+
+def test_experiment_carries_the_saved_views(runs_dir: Path) -> None:
+    begin(RunFolder(runs_dir / "views"), tracking(runs_dir))
+    experiment = client(runs_dir).get_experiment_by_name("rgbt")
+    assert view_tags().items() <= experiment.tags.items()
+    assert experiment.artifact_location == (runs_dir / "mlartifacts").as_uri()
+    assert max(map(len, view_tags().values())) < 5000, "MLflow's limit on a tag"
+    assert next(iter(SECTIONS.values())), "the first section is unfolded"
+
+
+def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> None:
+    folder = RunFolder(runs_dir / "failed")
+    tracker = tracking(runs_dir)
+    begin(folder, tracker)
+    tracker.finish()
+    sent = read_sent(folder)
+    assert sent is not None
+    store = client(runs_dir)
+    assert store.get_run(sent.run_id).info.status == "FAILED"
+    begin(folder, tracking(runs_dir))
+    assert store.get_run(sent.run_id).info.status == "RUNNING"
+
+
+def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
+    folder = RunFolder(runs_dir / "deleted")
+    NoTracking().start(folder, "grbm", TAGS, PARAMS)
+    tracker = tracking(runs_dir)
+    folder.append(5, "train", {"loss": 3.0})
+    first = tracker.sync(folder, "RUNNING")
+    store = client(runs_dir)
+    store.delete_run(first)
+    second = tracker.sync(folder, "RUNNING")
+    assert second != first
+    assert points(store, second, "train/loss") == [(5, 3.0)]
+
+
+def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
+    runs_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = RunFolder(runs_dir / "dead")
+    tracker = tracking(runs_dir, DEAD)
+    begin(folder, tracker)
+    for step in (5, 10):
+        folder.append(step, "train", {"loss": float(step)})
+        tracker.update()
+    conclude(folder)
+    tracker.finish()
+    warning = capsys.readouterr().err
+    assert warning.count("rgbt: MLflow at http://127.0.0.1:9 cannot be used") == 1
+    assert f"-m rgbt.tracking.sync run={folder.path}" in warning
+    assert tracker.links()[0][0] == "MLflow later"
+
+    uri = f"sqlite:///{runs_dir / 'mlflow.db'}"
+    assert sync.main([f"run={folder.path}", f"uri={uri}"]) == 0
+    assert sync.main([f"run={folder.path}"]) == 0, "the store that was asked for is remembered"
+    sent = read_sent(folder)
+    assert sent is not None
+    assert sent.uri == uri
+    assert sent.run_id in capsys.readouterr().out
+    assert points(client(runs_dir), sent.run_id, "train/loss") == [(5, 5.0), (10, 10.0)]
+
+
+def test_sync_of_all_folders_sends_runs_made_without_tracker(
+    runs_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = RunFolder(runs_dir / "untracked")
+    tracker = NoTracking()
+    begin(folder, tracker)
+    tracker.update()
+    tracker.finish()
+    assert tracker.links() == []
+    assert read_sent(folder) is None
+    shutil.rmtree(runs_dir / "dead", ignore_errors=True)  # has no reachable store if it ran alone
+    assert sync.main([f"runs_dir={runs_dir}"]) == 0
+    output = capsys.readouterr().out
+    assert f"{folder.path}  ->  MLflow run " in output
+    assert "mlflow ui --workers 1 --backend-store-uri sqlite:///" in output
+    sent = read_sent(folder)
+    assert sent is not None
+    assert client(runs_dir).get_run(sent.run_id).info.status == "KILLED"
+
+
+def test_links_open_the_pages(runs_dir: Path) -> None:
+    tracker = tracking(runs_dir)
+    begin(RunFolder(runs_dir / "links"), tracker)
+    links = dict(tracker.links())
+    assert links["open MLflow"].endswith(f"sqlite:///{runs_dir / 'mlflow.db'}")
+    assert links["compare runs"].startswith("http://127.0.0.1:5000/#/experiments/1/runs?")
+    assert "viewStateShareKey=rgbt-runs" in links["compare runs"]
+
+
+@pytest.mark.slow
+def test_many_processes_may_start_on_a_fresh_store(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from rgbt.tracking.folder import RunFolder\n"
+        "from rgbt.tracking.mlflow_store import MlflowTracking\n"
+        "runs, key = sys.argv[1:]\n"
+        "t = MlflowTracking(None, artifact_uri=None, experiment='rgbt', runs_dir=runs)\n"
+        "t.start(RunFolder(f'{runs}/{key}'), key, {}, {})\n"
+    )
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path), key], stderr=subprocess.PIPE, text=True
+        )
+        for key in "abcd"
+    ]
+    errors = [worker.communicate()[1] for worker in workers]
+    assert errors == [""] * 4, "no warning of ours, no noise of MLflow's"
+    assert len(client(tmp_path).search_runs(["1"])) == 4
+
+
+def test_values_are_shown_as_the_papers_print_them() -> None:
+    assert shown("mIoU", 0.61236) == 61.24
+    assert shown("night/mIoU", 0.5) == 50.0
+    assert shown("region/1", 0.55283) == 55.28
+    assert shown("class/car", 0.1) == 10.0
+    assert shown("day/Var", 10.899) == 10.9
+    assert shown("loss/class", 0.123456) == 0.123456
+    assert shown("seconds", 0.123456) == 0.123456
+
+
+def test_artifact_table_has_unique_first_column_and_summaries_first() -> None:
+    table = artifact_table(TABLES)
+    assert table["columns"] == ["score", "IoU %", "accuracy %"]
+    firsts = [row[0] for row in table["data"]]
+    assert len(set(firsts)) == len(firsts)
+    assert firsts[:5] == ["mIoU", "Var", "mIoU day", "mIoU ring 1", "mIoU ring 2"]
+    assert table["data"][5:7] == [["road", 50.0, 60.0], ["car", 30.0, None]]
+    assert table["data"][-1] == ["car / ring 2", None, None]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "give either run=<run folder> or runs_dir=<folder of runs>"),
+        (["run=a", "runs_dir=b"], "give either run="),
+        (["run"], "expected key=value"),
+        (["runs_dri=a"], "did you mean 'runs_dir'"),
+        (["runs_dir=/nowhere"], "no such folder"),
+        (["run=/nowhere"], "not a run folder"),
+    ],
+)
+def test_sync_refuses_in_one_sentence(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sync.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rgbt: ")
+    assert sentence in error
+    assert error.count("\n") == 1
+
+
+def test_sync_asks_for_a_password_that_is_not_kept(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "key")
+    (folder.path / "mlflow.json").write_text(
+        json.dumps({"uri": "postgresql://me:***@host/db", "experiment": "rgbt"})
+    )
+    with pytest.raises(InputError, match="give uri="):
+        sync.tracking_of(folder, {})
+
+
+@pytest.mark.parametrize(("name", "kind"), [("mlflow", MlflowTracking), ("none", NoTracking)])
+def test_configuration_builds(name: str, kind: type) -> None:
+    loaded = OmegaConf.load(CONF / f"{name}.yaml")
+    config = OmegaConf.create({"runs_dir": "runs", "tracking": loaded})
+    check_node(config.tracking, "tracking")
+    tracker = build(config.tracking)
+    assert isinstance(tracker, kind)
+    if isinstance(tracker, MlflowTracking):
+        assert tracker.uri == f"sqlite:///{Path('runs').resolve() / 'mlflow.db'}"
+        assert tracker.artifact_uri == (Path("runs").resolve() / "mlartifacts").as_uri()

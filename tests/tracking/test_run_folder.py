@@ -1,0 +1,162 @@
+"""The run folder: whole files, a lock that dies with its process, lines without duplicates."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.tracking.files import is_held, write_atomic
+from rgbt.tracking.folder import Description, RunFolder, runs_in
+
+
+def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_atomic(path, b"old")
+    write_atomic(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_failed_write_keeps_the_old_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.json"
+    write_atomic(path, b"old")
+
+    def no_disk(_: int) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "fsync", no_disk)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomic(path, b"new")
+    assert path.read_bytes() == b"old"
+
+
+def test_result_exists_only_when_finished(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "runs" / "key")
+    assert folder.result() is None
+    folder.finish({"mIoU": 0.5})
+    assert folder.result() == {"mIoU": 0.5}
+
+
+def test_lines_are_read_as_written(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    assert folder.lines() == []
+    folder.append(10, "train", {"loss": 2.0})
+    folder.append(10, "val", {"mIoU": 0.25, "class/bump": math.nan})
+    first, second = folder.lines()
+    assert (first.step, first.kind, first.values) == (10, "train", {"loss": 2.0})
+    assert second.values["mIoU"] == 0.25
+    assert math.isnan(second.values["class/bump"])
+    written = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[1])
+    assert set(written) == {"step", "kind", "time", "values"}
+    assert written["values"]["class/bump"] is None
+
+
+def test_truncate_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    for step in (10, 20, 30):
+        folder.append(step, "train", {"loss": 1.0 / step, "odd": math.nan})
+    folder.append(20, "test", {"mIoU": 0.5})
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 40, "ki')  # cut short by a crash
+    before = folder.lines()
+    assert [line.step for line in before] == [10, 20, 30, 20]
+    folder.truncate_after(20)
+    after = folder.lines()
+    assert [(line.step, line.kind) for line in after] == [(10, "train"), (20, "train")]
+    assert after[1].time == before[1].time
+    assert math.isnan(after[1].values["odd"])
+    folder.append(30, "train", {"loss": 0.1})
+    assert [line.step for line in folder.lines()] == [10, 20, 30]
+
+
+def test_lock_refuses_a_second_holder_and_names_the_first(tmp_path: Path) -> None:
+    first, second = RunFolder(tmp_path), RunFolder(tmp_path)
+    assert not first.is_locked()
+    with first.lock():
+        assert second.is_locked()
+        with pytest.raises(InputError, match=f"process {os.getpid()} on "), second.lock():
+            pass
+        assert second.is_locked(), "a refused lock must not free the other's"
+    assert not second.is_locked()
+    with second.lock():
+        pass
+
+
+def test_lock_is_freed_when_its_process_is_killed_though_a_forked_child_lives_on(
+    tmp_path: Path,
+) -> None:
+    code = (
+        "import os, sys, time\n"
+        "from pathlib import Path\n"
+        "from rgbt.tracking.files import holding\n"
+        "with holding(Path(sys.argv[1])):\n"
+        "    child = os.fork()\n"
+        "    if child: print(child, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    path = tmp_path / "lock"
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+    )
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    try:
+        assert is_held(path)
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        deadline = time.monotonic() + 20
+        while is_held(path) and time.monotonic() < deadline:
+            time.sleep(0.05)  # the child may not have reached its first instruction yet
+        assert not is_held(path)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        parent.stdout.close()
+
+
+def test_provenance_is_a_list_and_the_diff_a_file(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    assert folder.provenance() == []
+    folder.add_provenance({"command": "a", "diff": "--- x\n"})
+    folder.add_provenance({"command": "b", "diff": ""})
+    folder.add_provenance({"command": "c", "diff": "--- y\n"})
+    assert [(entry["command"], entry["diff"]) for entry in folder.provenance()] == [
+        ("a", "diff.patch"),
+        ("b", None),
+        ("c", "diff_3.patch"),
+    ]
+    assert (tmp_path / "diff.patch").read_text() == "--- x\n"
+
+
+def test_small_files_come_back(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "key")
+    assert (folder.description(), folder.tables()) == (None, None)
+    description = Description("grbm", {"rgbt.seed": "0"}, {"seed": "0"})
+    folder.describe(description)
+    folder.write_tables({"split": "test"})
+    folder.write_config("seed: 0\n")
+    assert folder.description() == description
+    assert folder.tables() == {"split": "test"}
+    assert (folder.path / "config.yaml").read_text() == "seed: 0\n"
+    assert folder.counts_path("test").name == "counts_test.npz"
+    assert folder.figure_path("panel") == folder.path / "figures" / "panel.png"
+    assert folder.figure_path("panel").parent.is_dir()
+    assert [run.path for run in runs_in(tmp_path)] == [folder.path]
+
+
+def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text("{")
+    with pytest.raises(InputError, match=r"result\.json is not JSON"):
+        RunFolder(tmp_path).result()
+    with pytest.raises(InputError, match="no such folder"):
+        runs_in(tmp_path / "missing")

@@ -1,0 +1,105 @@
+"""Result tables: from counts, as JSON, as Markdown, in the terminal."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from rgbt.tracking import terminal
+from rgbt.tracking.tables import (
+    ClassTable,
+    RegionTable,
+    ResultTables,
+    class_grid,
+    region_grid,
+    result_grids,
+    subset_grid,
+)
+
+
+@pytest.fixture
+def tables() -> ResultTables:
+    return ResultTables(
+        split="test",
+        step=400,
+        region_names=("ring_1", "ring_2"),
+        regions=RegionTable("grbm", (0.625, 0.4), 0.555555, 126.5625),
+        classes=ClassTable(
+            names=("road", "car"),
+            ious=(0.777777, 0.333333),
+            accuracies=(0.823529, 0.666666),
+            region_ious=((0.75, 0.8), (0.5, 0.0)),
+            subset_mious={"day": 0.4, "night": 0.3},
+        ),
+    )
+
+
+def test_json_round_trip_keeps_nan(tables: ResultTables) -> None:
+    odd = replace(tables, classes=replace(tables.classes, ious=(0.5, math.nan)))
+    text = json.dumps(odd.to_json(), allow_nan=False)
+    back = ResultTables.from_json(json.loads(text))
+    assert back.classes.ious[0] == 0.5
+    assert math.isnan(back.classes.ious[1])
+    assert ResultTables.from_json(json.loads(json.dumps(tables.to_json()))) == tables
+
+
+def test_region_grid_has_the_papers_columns_and_two_decimals() -> None:
+    ours = RegionTable("ours", (0.55283, 0.6279), 0.6124, 10.899)
+    paper = RegionTable("paper", (0.5, math.nan), 0.6, 1.0)
+    grid = region_grid([ours, paper])
+    assert grid.header == ("", "IoU1", "IoU2", "mIoU", "Var")
+    assert grid.rows[0] == ("ours", "55.28", "62.79", "61.24", "10.90")
+    assert grid.rows[1] == ("paper", "50.00", "-", "60.00", "1.00")
+
+
+@pytest.mark.parametrize("rows", [[], [RegionTable("a", (0.5,), 1, 0), RegionTable("b", (), 1, 0)]])
+def test_region_grid_raises(rows: list[RegionTable]) -> None:
+    with pytest.raises(ValueError, match="one number of regions"):
+        region_grid(rows)
+
+
+def test_class_and_subset_grids(tables: ResultTables) -> None:
+    grid = class_grid(tables)
+    assert grid.header == ("class", "IoU", "Acc", "ring_1", "ring_2")
+    assert grid.rows[1] == ("car", "33.33", "66.67", "50.00", "0.00")
+    assert grid.rows[-1] == ("mean", "55.56", "", "62.50", "40.00")
+    assert [row[0] for row in subset_grid(tables).rows] == ["all images", "day", "night"]
+
+
+def test_markdown_has_one_line_per_row(tables: ResultTables) -> None:
+    lines = class_grid(tables).to_markdown().strip().splitlines()
+    assert lines[0] == "**IoU and accuracy by class**"
+    assert lines[2].startswith("| class | IoU |")
+    assert lines[3] == "| --- | ---: | ---: | ---: | ---: |"
+    assert len(lines) == 4 + 3
+
+
+def test_terminal_shows_the_same_cells_and_where_the_run_is(tables: ResultTables) -> None:
+    links = [("open MLflow", "mlflow ui --backend-store-uri sqlite:////x/mlflow.db")]
+    stream = io.StringIO()
+    view = terminal.result_view(tables, Path("/x/runs/key"), links)
+    Console(file=stream, width=terminal.WIDTH).print(view, soft_wrap=True)
+    text = stream.getvalue()
+    for grid in result_grids(tables):
+        assert grid.title in text
+        assert all(cell in text for row in grid.rows for cell in row)
+    assert "run folder   /x/runs/key\n" in text
+    assert "open MLflow  mlflow ui --backend-store-uri sqlite:////x/mlflow.db\n" in text
+
+
+def test_show_prints_to_stdout_and_never_cuts(
+    tables: ResultTables, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    long = Path("/a" * 150)
+    terminal.show(terminal.result_view(tables, long, []))
+    output = capsys.readouterr()
+    assert f"run folder  {long}\n" in output.out
+    assert "62.50" in output.out
+    assert output.err == ""
