@@ -40,6 +40,8 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
         @wraps(main)
         def entry() -> None:
             codes: list[int] = []
+            # argparse takes overrides on one side of an option only; people write -m anywhere.
+            sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
                 codes.append(_report(lambda: _checked(main, config)))

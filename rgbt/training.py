@@ -50,19 +50,10 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         tracking.finish()
     else:
         with folder.lock():
-            _finished_either_way(Run(config, folder, tracking, name))
+            Run(config, folder, tracking, name).complete()
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
     show(result_view(ResultTables.from_json(tables), folder.path, tracking.links()))
-
-
-def _finished_either_way(run: Run) -> None:
-    try:
-        run.complete()
-    finally:
-        # A run that stops on an error is shown as failed, not as running for ever.
-        if run.folder.description() is not None:
-            run.tracking.finish()
 
 
 def run_name(config: DictConfig, overrides: Sequence[str]) -> str:
@@ -104,11 +95,20 @@ class Run:
         """Train to the last step, evaluate the best checkpoint, write the result."""
         started = time.time()
         session = open_session(self.config)
+        state = State(seed=self.config.seed)
+        # Everything is built before the folder is begun: a wrong value leaves nothing behind.
+        trainer = self._trainer(session, state)
         self._claim(session)
         _track(self.tracking, self.folder, self.config, self.name)
-        state = State(seed=self.config.seed)
-        self._train(session, state)
-        self._test(session, state)
+        try:
+            self._train(session, trainer, state)
+            self._test(session, state)
+            self._finish(session, state, time.time() - started)
+        finally:
+            # A run that stops on an error is shown as failed, not as running for ever.
+            self.tracking.finish()
+
+    def _finish(self, session: Session, state: State, seconds: float) -> None:
         self.folder.finish(
             {
                 "name": self.name,
@@ -117,7 +117,7 @@ class Run:
                 "steps": state.step,
                 "best_step": state.best_step,
                 "best_score": state.best_score,
-                "seconds": round(time.time() - started, 1),
+                "seconds": round(seconds, 1),
                 "skipped": sorted(set(state.skipped)),
             }
         )
@@ -136,8 +136,7 @@ class Run:
         self.folder.write_config(OmegaConf.to_yaml(self.config, resolve=True))
         self.folder.add_provenance(provenance())
 
-    def _train(self, session: Session, state: State) -> None:
-        trainer = self._trainer(session, state)
+    def _train(self, session: Session, trainer: Trainer, state: State) -> None:
         if trainer.resume(state):
             _say(f"{self.name} continues at step {state.step} ({self.folder.path}).")
         elif session.trainer.init_from is not None:

@@ -28,7 +28,15 @@ ALLOWED = {
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""
 
-MEETING_PLACES = {"run.py", "evaluate.py", "predict.py", "session.py", "stored.py", "training.py", "__init__.py"}
+MEETING_PLACES = {
+    "run.py",
+    "evaluate.py",
+    "predict.py",
+    "session.py",
+    "stored.py",
+    "training.py",
+    "__init__.py",
+}
 
 
 def imports(tree: ast.AST) -> Iterator[str]:

@@ -36,7 +36,9 @@ CASES = {
 """name -> scale, model, batch size, repetitions."""
 
 
-def make(scale: str, model: str, batch_size: int) -> tuple[Mask2Former, SetCriterion, Batch, MaskPair]:
+def make(
+    scale: str, model: str, batch_size: int
+) -> tuple[Mask2Former, SetCriterion, Batch, MaskPair]:
     register_resolvers()
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = hydra.compose(
@@ -103,7 +105,9 @@ def reference_loss(
             outputs.append(network.sem_seg_head([level.chunk(3)[view] for level in features]))
     total = outputs[0][0].new_zeros(())
     for index, (classes, mask_logits) in enumerate(outputs[:4]):
-        alone = Output(None, {"class_logits": classes[:, None], "mask_logits": mask_logits[:, None]})
+        alone = Output(
+            None, {"class_logits": classes[:, None], "mask_logits": mask_logits[:, None]}
+        )
         parts = reference_criterion(criterion, alone, batch, draws.one_pass(index))
         total = total + sum(part.sum() for part in parts.values())
     final = [classes[-1] for classes, _ in outputs]

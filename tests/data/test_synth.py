@@ -168,10 +168,11 @@ def test_persons_are_warmer_than_the_street_at_night_and_thermal_is_no_copy_of_t
         scene = render_scene(0, index, NIGHT)
         person = (scene.label == PERSON) & (scene.depth < 15)
         if person.sum() > 60:
-            gaps.append(scene.thermal[person].mean() - scene.thermal[scene.label == 0].mean())
+            street = (scene.label == 0) & (scene.depth < 15)
+            gaps.append(scene.thermal[person].mean() - scene.thermal[street].mean())
             spread.append(scene.thermal[person].std())
-    assert np.mean(gaps) > 40
-    assert min(gaps) < 0.5 * np.mean(gaps)
+    assert np.mean(gaps) > 30
+    assert min(gaps) < 0.5 * np.mean(gaps)  # some are dressed so warmly that they hardly show
     assert np.mean(spread) > 10
 
 
@@ -192,16 +193,15 @@ def test_label_and_depth_of_one_box_follow_from_the_camera() -> None:
     facets = scene.facets_of(ground, placed)
     drawing = draw(facets, camera)
     label = np.concatenate([[0], facets.label])[drawing.ids]
-    depth = 1 / drawing.inverse_depth(camera.rays())
-    # Top edge of the front: 100 * (1.5 - 1.0) / 10 = 5 rows below the centre row 50; bottom 15.
-    # Left and right: columns 100 -+ 100 * 1 / 10. The top face reaches up to row 50 + 50/12 = 54.2.
+    inverse_depth = drawing.inverse_depth(camera.rays())
+    # The front stands from row 50 + 100 * 1.5 / 10 = 65 up to 55, columns 100 -+ 10; above it the
+    # top is seen up to row 50 + 100 * 0.5 / 12 = 54.2. Outlines belong to the box.
     rows, columns = np.nonzero(label == CAR)
-    assert (rows.min(), rows.max()) in {(54, 65), (54, 64)}
-    assert abs(columns.min() - 90) <= 1
-    assert abs(columns.max() - 110) <= 1
-    assert depth[60, 100] == pytest.approx(10.0, rel=1e-4)
+    assert (rows.min(), rows.max()) == (54, 65)
+    assert (columns.min(), columns.max()) == (90, 110)
+    assert 1 / inverse_depth[60, 100] == pytest.approx(10.0, rel=1e-4)
     # The ground 20 rows below the horizon is 1.5 * 100 / 20 = 7.5 m ahead.
-    assert depth[70, 150] == pytest.approx(7.5, rel=1e-3)
+    assert 1 / inverse_depth[70, 150] == pytest.approx(7.5, rel=1e-3)
 
 
 def test_near_objects_hide_far_ones() -> None:
@@ -264,17 +264,18 @@ def test_ground_homography_agrees_with_the_flow_on_the_ground() -> None:
 
 @pytest.mark.parametrize("motion", [EgoMotion(0.6, 0.0), EgoMotion(0.5, 2.0), EgoMotion(-0.7, -3)])
 def test_flow_carries_labels_from_frame_to_frame(motion: EgoMotion) -> None:
-    agree, visible = [], []
+    agree, labelled, visible = [], [], []
     for index in range(8):
         pair = render_pair(0, index, FACTORS, motion)
         rows, columns = np.mgrid[:120, :160].astype(np.float32)
         target = (columns + pair.flow[..., 1], rows + pair.flow[..., 0])
         warped = cv2.remap(pair.first.label, *target, cv2.INTER_NEAREST)
         agree.append((warped == pair.second.label)[pair.visible])
+        labelled.append(agree[-1][pair.second.label[pair.visible] > 0])
         visible.append(pair.visible.mean())
     assert np.mean(np.concatenate(agree)) > 0.97
-    labelled = np.mean(np.concatenate(agree))
-    assert labelled > 0.95
+    # Pixels of objects lie on outlines more often, where the nearest pixel may be the neighbour's.
+    assert np.mean(np.concatenate(labelled)) > 0.9
     assert np.mean(visible) > 0.75
 
 

@@ -68,8 +68,9 @@ class Camera:
 
     def to_camera(self, points: NDArray[Real]) -> NDArray[Real]:
         """World points (..., 3) in camera coordinates, in the precision they come in."""
-        position = np.asarray(self.position, points.dtype)
-        return (points - position) @ self.rotation.T.astype(points.dtype)
+        # As one list of points: a stack of small matrices would be multiplied one by one.
+        moved = points.reshape(-1, 3) - np.asarray(self.position, points.dtype)
+        return (moved @ self.rotation.T.astype(points.dtype)).reshape(points.shape)
 
     def project(self, points_in_camera: Floats) -> Floats:
         """Points (..., 3) in camera coordinates as (column, row); depth is held above `NEAR_M`."""

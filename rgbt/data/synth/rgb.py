@@ -44,7 +44,9 @@ def render_rgb(
     colour = average(_colour_table(surface, light), surface.drawing)
     glow = average(_glow_table(surface.facets, light), surface.drawing)
     image = _decoded(colour)
-    image *= np.maximum(1.0 + _TEXTURES[surface.material] * strength * surface.texture, 0.1)
+    image *= np.maximum(
+        1.0 + np.take(_TEXTURES, surface.material) * strength * surface.texture, 0.1
+    )
     image += surface.window * (_GLASS - image)
     image *= _lamplight(surface, light, lamps) if light.is_night else 1.0 - 0.72 * surface.shadow
 

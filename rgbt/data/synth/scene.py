@@ -124,7 +124,7 @@ def _frame(
     return Scene(
         rgb=rgb.develop(image, factors, rgb_noise),
         thermal=thermal.develop(heat, factors, seed, index, thermal_noise),
-        label=np.concatenate([[0], facets.label]).astype(np.uint8)[drawing.ids],
+        label=np.take(np.concatenate([[0], facets.label]).astype(np.uint8), drawing.ids),
         depth=surface.depth,
         is_night=light.is_night,
         camera=camera,

@@ -75,8 +75,8 @@ def surface_of(
     rays = camera.rays()
     inverse_depth = drawing.inverse_depth(rays)
     world = camera.to_world(rays, inverse_depth)
-    on_ground = np.concatenate([[False], facets.on_ground])[drawing.ids]
-    material = np.concatenate([[0], facets.material])[drawing.ids]
+    on_ground = np.take(np.concatenate([[False], facets.on_ground]), drawing.ids)
+    material = np.take(np.concatenate([[0], facets.material]), drawing.ids)
     with np.errstate(divide="ignore"):
         depth = 1.0 / inverse_depth
     pixel_m = depth / np.float32(camera.focal)

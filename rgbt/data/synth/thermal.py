@@ -46,7 +46,7 @@ def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
     table[0, 1] = 255
     mean = average(table, surface.drawing)
     heat = mean[..., 0].astype(np.float32) * np.float32(_SPAN / 255) + np.float32(_COLDEST)
-    heat += _TEXTURES[surface.material] * strength * surface.patches
+    heat += np.take(_TEXTURES, surface.material) * strength * surface.patches
     heat -= surface.window * np.where(
         surface.window_lit < light.lit_windows, np.float32(-4), np.float32(5)
     )

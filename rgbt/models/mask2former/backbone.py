@@ -60,11 +60,11 @@ class RgbtBackbone(nn.Module):
             hidden: per token, (N, H/4, W/4) bool each; None: nothing is hidden.
             passes: N holds this many stacked copies of a batch; the fusion's batch normalisation
                 takes them one after the other, so that each is normalised on its own.
-            views: which sets of features, in this order along the batch.
+            views: which sets of features, in this order within each pass.
             generator: draws stochastic depth, first the RGB branch's, then the thermal one's.
 
         Returns:
-            four (len(views) N, C_s, H/s, W/s), s = 4, 8, 16, 32.
+            four (len(views) N, C_s, H/s, W/s), s = 4, 8, 16, 32: pass by pass, then view by view.
         """
         maps: dict[str, list[Tensor]] = {}
         if views != ("thermal",):
@@ -78,17 +78,21 @@ class RgbtBackbone(nn.Module):
     def _join(
         self, level: int, maps: dict[str, list[Tensor]], passes: int, views: tuple[View, ...]
     ) -> Tensor:
-        """The maps of one level, views along the batch."""
-        parts: list[Tensor] = []
+        """The maps of one level along the batch: every view of the first pass, then the next."""
+        by_view: list[tuple[Tensor, ...]] = []
         for view in views:
             if view == "rgbt":
                 fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
-                parts += self._normalise(level, fused, passes)
+                by_view.append(self._normalise(level, fused, passes))
             else:
-                parts.append(maps[view][level])
+                by_view.append(maps[view][level].chunk(passes))
+        parts = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
-    def _normalise(self, level: int, fused: Tensor, passes: int) -> list[Tensor]:
+    def _normalise(self, level: int, fused: Tensor, passes: int) -> tuple[Tensor, ...]:
         """Batch normalisation of each pass; without batch statistics all are one call."""
         norm = self.norm_layers[LEVELS[level]]
-        return [norm(part) for part in fused.chunk(passes if self.training else 1)]
+        if self.training:
+            return tuple(norm(part) for part in fused.chunk(passes))
+        normalised: Tensor = norm(fused)
+        return normalised.chunk(passes)

@@ -139,7 +139,7 @@ class Mask2Former(nn.Module):
         Returns:
             logits: (B, K, H, W) float32 semantic scores in evaluation mode when there is one view
                 and one pass, else None. They are sums over queries, not normalised.
-            aux: with P = len(views) * passes, view by view, then pass by pass, and
+            aux: with P = len(views) * passes, pass by pass, within it view by view, and
                 L = decoder_layers + 1, the last one final:
                 "class_logits" (L, P, B, Q, K + 1), last column = no object;
                 "mask_logits" (L, P, B, Q, h, w) at 1/4 of the padded size; in memory the order
@@ -159,7 +159,7 @@ class Mask2Former(nn.Module):
             pad_to((rgb - mean[:3]) / std[:3], full_hw),
             pad_to((thermal - mean[3:]) / std[3:], full_hw),
         )
-        hidden = None if masks is None else _to_tokens(masks, sizes["N"], full_hw)
+        hidden = None if masks is None else expand_to_tokens(masks, sizes["N"], full_hw)
         features = self.backbone(images, hidden, passes=passes, views=views, generator=generator)
 
         classes, mask_logits = self.sem_seg_head(features)
@@ -217,7 +217,7 @@ def semantic_logits(
         return scores.view(*scores.shape[:2], *image_hw)
 
 
-def _to_tokens(masks: MaskPair, count: int, image_hw: tuple[int, int]) -> MaskPair:
+def expand_to_tokens(masks: MaskPair, count: int, image_hw: tuple[int, int]) -> MaskPair:
     """Cells to tokens of 4 x 4 pixels, (N, H/4, W/4) bool each."""
     rgb, thermal = (
         _expand(name, mask, count, image_hw)
