@@ -44,7 +44,7 @@ def open_run(folder: Path, overrides: list[str]) -> Session:
             whole node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
 
     Raises:
-        InputError: overrides that do not fit, no checkpoint, or classes other than the trained ones.
+        InputError: overrides that do not fit, no checkpoint, other classes than trained.
     """
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"

@@ -44,6 +44,11 @@ class Replayed:
     def loss_of(self, layer: int, one_pass: int, *_: int) -> Tensor:
         return self._loss[layer * self._passes + one_pass]
 
+    def one_pass(self, index: int) -> Replayed:
+        """The draws of pass `index` alone."""
+        one = slice(index, None, self._passes)
+        return Replayed(self._matcher[one], self._loss[one], 1)
+
     def _take(self, name: str, draws: Tensor, shape: tuple[int, ...]) -> Tensor:
         start = self._next[name]
         self._next[name] += shape[0]

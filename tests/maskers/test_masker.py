@@ -24,7 +24,7 @@ VARIANTS = ["none", "crm", "irm", "square", "grbm_paper", "grbm_released"]
 def configured(variant: str, scale: str = "paper", **changes: object) -> Masker:
     """The masker of conf/masker/<variant>.yaml at a scale, with some settings changed."""
     register_resolvers()
-    factor = OmegaConf.load(conf_dir() / "scale" / f"{scale}.yaml").pixel_factor
+    factor = OmegaConf.load(conf_dir() / "scale" / f"{scale}.yaml").scale.pixel_factor
     masker = OmegaConf.load(conf_dir() / "masker" / f"{variant}.yaml")
     config = OmegaConf.create({"scale": {"pixel_factor": factor}, "masker": masker})
     config.masker.update(changes)
