@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was 
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -66,6 +67,8 @@ def _checked(main: Main, config: DictConfig) -> int | None:
 def _compose(config_name: str, job: Callable[[DictConfig], None]) -> None:
     # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    # Hydra's root logger shows the INFO lines of every library.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
     register_resolvers()
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
 
