@@ -1,0 +1,118 @@
+"""Every file composes, the schema is the constructor, and the key names what matters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import hydra
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import NODES, build, check, conf_dir, flatten, register_resolvers, run_key
+
+
+@dataclass(frozen=True, kw_only=True)
+class Knob:
+    size: tuple[int, int]
+    kind: Literal["a", "b"]
+    inner: Knob | None = None
+    model: object = None
+
+
+def compose(*overrides: str) -> DictConfig:
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", list(overrides))
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("scale", options("scale"))
+@pytest.mark.parametrize("experiment", options("experiment"))
+def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
+    config = compose(f"+experiment={experiment}", f"scale={scale}", "dataset=mfnet",
+                     "dataset.root=unused")  # fmt: skip
+    check(config)
+    assert config.name == experiment
+    assert config.scale.pixel_factor == {"demo": 0.5, "paper": 1.0}[scale]
+
+
+@pytest.mark.parametrize(
+    ("group", "option"), [(g, o) for g in NODES if (conf_dir() / g).is_dir() for o in options(g)]
+)
+def test_every_option_of_every_group_passes_the_check(group: str, option: str) -> None:
+    rooted = option in ("mfnet", "paper")
+    check(compose(f"{group}={option}", *(["dataset.root=unused"] if rooted else [])))
+
+
+def test_paper_scale_is_the_released_recipe() -> None:
+    config = compose("+experiment=grbm_released", "scale=paper", "dataset.root=unused")
+    assert (config.data.batch_size, config.trainer.max_steps) == (5, 70000)
+    assert list(config.transform.sizes) == [int(0.1 * k * 480) for k in range(5, 21)]
+    assert (config.optimizer.lr, config.optimizer.backbone_multiplier) == (1e-4, 0.1)
+    assert (config.trainer.clip_norm, config.optimizer.weight_decay) == (0.01, 0.05)
+    assert (config.masker.patch_size, config.loss.num_points) == (64, 112 * 112)
+    assert compose("+experiment=crm", "scale=paper").masker.patch_size == 32
+    assert compose("+experiment=grbm", "scale=demo").masker.patch_size == 32
+
+
+def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
+    same = [
+        *("dataset.root=/a", "runs_dir=/b", "tracking=none", "data.num_workers=3"),
+        *("trainer.accelerator=cpu", "trainer.threads=1", "name=other", "data.eval_batch_size=1"),
+    ]
+    base = ["+experiment=grbm", "dataset=mfnet", "dataset.root=/elsewhere"]
+    key = run_key(compose(*base))
+    assert run_key(compose(*base, *same)) == key
+    for change in ("seed=1", "masker.sigma_div=2", "dataset.name=mine", "trainer.max_steps=7"):
+        assert run_key(compose(*base, change)) != key, change
+
+
+def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
+    inner = {"_target_": f"{__name__}.Knob", "size": [3, 4], "kind": "b"}
+    node = OmegaConf.create({"knob": {**inner, "kind": "a", "inner": inner}}).knob
+    offered = object()
+    knob = build(node, model=offered, unused=1)
+    assert (knob.size, knob.kind, knob.model) == ((3, 4), "a", offered)
+    assert (knob.inner.size, knob.inner.kind, knob.inner.model) == ((3, 4), "b", None)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"size": [1]}, "'knob.size'"),
+        ({"size": [1, 2.5]}, r"'knob.size'\[1\]"),
+        ({"size": [1, True]}, r"'knob.size'\[1\]"),
+        ({"kind": "c"}, "'knob.kind': input should be 'a' or 'b', got \"c\""),
+        ({"kin": "a"}, "'knob.kin' is not a setting of .*did you mean 'kind'"),
+        ({"kind": "???"}, "'knob.kind' has no value"),
+        ({"kind": "${nowhere}"}, "'knob.kind' cannot be resolved"),
+        ({"_target_": "no.such.Thing"}, "'knob._target_': cannot import no.such.Thing"),
+    ],
+)
+def test_wrong_values_are_named_with_their_key(change: dict, sentence: str) -> None:
+    good = {"_target_": f"{__name__}.Knob", "size": [1, 2], "kind": "a"}
+    from rgbt.config import check_node
+
+    with pytest.raises(InputError, match=sentence):
+        check_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
+
+
+def test_a_missing_value_is_named_when_the_object_is_built() -> None:
+    node = OmegaConf.create({"knob": {"_target_": f"{__name__}.Knob", "kind": "a"}}).knob
+    with pytest.raises(InputError, match="'knob.size' has no value"):
+        build(node)
+
+
+def test_flatten_gives_dotted_keys() -> None:
+    config = OmegaConf.create({"a": {"b": 1, "c": [1, 2]}, "d": "${a.b}"})
+    assert flatten(config) == {"a.b": 1, "a.c": [1, 2], "d": 1}
+
+
+def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
+    assert conf_dir() == Path(__file__).resolve().parents[1] / "conf"
