@@ -11,10 +11,11 @@ import re
 import sys
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -41,11 +42,13 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
         @wraps(main)
         def entry() -> None:
             codes: list[int] = []
-            # argparse takes overrides on one side of an option only; people write -m anywhere.
-            sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))
+            # Shells keep ~ after "=", and Hydra cannot read it. argparse takes overrides on
+            # one side of an option only, and people write -m anywhere.
+            words = [re.sub(r"=~(?=/|$)", f"={Path.home()}", word) for word in sys.argv[1:]]
+            sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
-                codes.append(_report(lambda: _checked(main, config)))
+                codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
 
             sys.exit(max([_report(lambda: _compose(config_name, job)), *codes]))
 
@@ -73,8 +76,13 @@ def _compose(config_name: str, job: Callable[[DictConfig], None]) -> None:
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
 
 
-def _report(work: Callable[[], int | None]) -> int:
-    """Exit code of `work`; a user's mistake is told in one sentence on stderr."""
+def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
+    """Exit code of `work`; a user's mistake is told in one sentence on stderr.
+
+    Args:
+        work: what to do.
+        catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
+    """
     try:
         return work() or 0
     except InputError as error:
@@ -83,8 +91,12 @@ def _report(work: Callable[[], int | None]) -> int:
         return _say(str(error), 1)
     except (HydraException, OmegaConfBaseException) as error:
         return _say(_hydra_sentence(error), 2)
+    except OSError as error:
+        return _say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
     except KeyboardInterrupt:
-        return _say("interrupted; the same command continues from the last checkpoint.", 130)
+        if not catch_interrupt:
+            raise
+        return _say("interrupted; a training called again goes on from its checkpoint.", 130)
 
 
 def _say(sentence: str, code: int) -> int:
@@ -103,6 +115,11 @@ def _hydra_sentence(error: Exception) -> str:
         match = re.search(r"'([^']+?)(?:/[^'/]*)?'", str(error))
         group = match.group(1) if match else "?"
         return f"there is no group '{group}'; {nearest(group, known)}."
+    if isinstance(error, OverrideParseException):
+        return (
+            f"'{error.override}' is no override; expected key=value, with quotes around a value that "
+            "holds commas, brackets or spaces: 'key=\"a, b\"'."
+        )
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:

@@ -30,11 +30,13 @@ NODES = (
 )
 
 NOT_IN_KEY = (
-    *("name", "runs_dir", "out", "recipe", "tracking", "dataset.root", "dataset.cache_dir"),
+    *("name", "runs_dir", "out", "scale", "recipe", "tracking"),
+    *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
-    *("trainer.accelerator", "trainer.threads", "trainer.log_every"),
+    *("trainer.accelerator", "trainer.threads", "trainer.log_every", "trainer.checkpoint_every"),
 )
-"""What may differ between two runs that are the same run: labels, paths, hardware, tracking."""
+"""What may differ between two runs that are the same run: labels, paths, hardware, tracking, and
+the sizes of `scale` and `recipe`, which count where other nodes take them up."""
 
 
 def conf_dir() -> Path:
@@ -94,7 +96,7 @@ def check_node(node: DictConfig, path: str) -> None:
         if isinstance(value, DictConfig) and "_target_" in value:
             check_node(value, f"{path}.{key}")
         else:
-            _check_value(f"{path}.{key}", value, hints[key])
+            _check_value(f"{path}.{key}", value, hints.get(key, Any))
 
 
 def build(node: DictConfig, **offered: Any) -> Any:
@@ -117,7 +119,9 @@ def build(node: DictConfig, **offered: Any) -> Any:
     values = {}
     for key, value in _items(node, path):
         nested = isinstance(value, DictConfig) and "_target_" in value
-        values[key] = build(value) if nested else _check_value(f"{path}.{key}", value, hints[key])
+        values[key] = (
+            build(value) if nested else _check_value(f"{path}.{key}", value, hints.get(key, Any))
+        )
     parameters = inspect.signature(target).parameters
     values |= {key: value for key, value in offered.items() if key in parameters}
     needed = [key for key, parameter in parameters.items() if parameter.default is parameter.empty]

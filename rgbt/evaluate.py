@@ -40,7 +40,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
-    session = open_run(folder, overrides)
+    stored = open_run(folder, overrides)
+    session = stored.session
     found = evaluate(session, session.model, arguments["split"], modality=modality)
     counts = found.counts
     stem = f"{session.dataset.name}_{counts.split}_{modality}_{counts.partition}"
@@ -48,7 +49,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)
     label = f"{session.config.name} {session.dataset.name} {modality}"
-    tables = result_tables(counts, session.regions, label, session.trainer.max_steps)
+    tables = result_tables(counts, session.regions, label, stored.step)
     show(result_view(tables, folder, [("counts", str(path))]))
     return 0
 

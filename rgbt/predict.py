@@ -31,7 +31,6 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     modality  rgbt, or rgb / thermal to decode one branch alone
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
-    import cv2
     import numpy as np
 
     from rgbt.engine.evaluate import MODALITIES
@@ -40,20 +39,35 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.pictures import overlay
 
     check_choice("modality", arguments["modality"], MODALITIES)
-    session = open_run(find_run(arguments["run"], Path(arguments["runs_dir"])), overrides)
+    folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
+    session = open_run(folder, overrides).session
     samples, total = _samples(session, arguments["input"])
     out = Path(arguments["out"])
+    if out.resolve() in (
+        Path(arguments["input"]).resolve(),
+        Path(arguments["input"]).parent.resolve(),
+    ):
+        raise InputError(
+            f"out={out} holds the input images, which would be overwritten; take another."
+        )
     out.mkdir(parents=True, exist_ok=True)
     palette = np.array(session.dataset.palette, np.uint8)
     with progress() as display:
         task = display.add_task("predicting", total=total, note="images")
         for sample, classes in _classes(session, samples, arguments["modality"]):
             painted = overlay(sample.rgb, classes, palette)
-            cv2.imwrite(str(out / f"{sample.name}_overlay.png"), painted[..., ::-1])
-            cv2.imwrite(str(out / f"{sample.name}.png"), classes)
+            _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
+            _write(out / f"{sample.name}.png", classes)
             display.advance(task)
     print(f"{total} images in {out.resolve()}")
     return 0
+
+
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), image):
+        raise InputError(f"{path} could not be written; is the folder writable, the disk full?")
 
 
 def _classes(

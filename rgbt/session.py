@@ -63,13 +63,19 @@ def open_session(config: DictConfig) -> Session:
     trainer: TrainerSettings = build(config.trainer)
     if trainer.threads is not None:
         torch.set_num_threads(trainer.threads)
-    fabric = Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+    fabric = _fabric(trainer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(config.seed, "weights"))
         model: nn.Module = build(config.model)
+    dataset: MFNet = build(config.dataset)
+    if config.model.get("num_classes", dataset.num_classes) != dataset.num_classes:
+        raise InputError(
+            f"model.num_classes is {config.model.num_classes} but {dataset.name} has "
+            f"{dataset.num_classes} classes; leave it to the data set."
+        )
     return Session(
         config=config,
-        dataset=build(config.dataset),
+        dataset=dataset,
         transform=build(config.transform),
         loading=build(config.data),
         regions=build(config.metric),
@@ -77,6 +83,16 @@ def open_session(config: DictConfig) -> Session:
         fabric=fabric,
         model=model.to(fabric.device),
     )
+
+
+def _fabric(trainer: TrainerSettings) -> Fabric:
+    try:
+        return Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"trainer.accelerator={trainer.accelerator} with trainer.precision={trainer.precision} "
+            f"cannot be used on this machine ({str(error).splitlines()[0]})."
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -132,7 +148,7 @@ def evaluate(
     counts = Counts(
         counts=np.stack(list(counted.values())).astype(np.int32),
         names=tuple(counted),
-        night=tuple(dataset.is_night(name) for name in counted),
+        night=dataset.nights(tuple(counted)),
         classes=dataset.classes,
         partition=session.regions.name,
         dataset=dataset.fingerprint(),

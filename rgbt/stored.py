@@ -2,19 +2,39 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
+import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
-from rgbt.config import NODES, check, conf_dir, flatten, register_resolvers
+from rgbt.config import check, conf_dir, flatten, register_resolvers
 from rgbt.engine.checkpoint import load_checkpoint, load_weights
+from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
 
-FIXED = ("model",)
-"""What a stored run cannot be asked to change: the weights belong to it."""
+GROUPS = ("dataset", "metric")
+CHANGEABLE = (
+    *("dataset", "data", "metric", "transform.test_short_edge"),
+    *("trainer.accelerator", "trainer.threads", "trainer.precision"),
+)
+"""What may be changed of a stored run: where images come from and how they are counted."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A stored run.
+
+    Attributes:
+        session: its objects; the network holds the best weights.
+        step: the optimiser step at which these were reached.
+    """
+
+    session: Session
+    step: int
 
 
 def find_run(run: str, runs_dir: Path) -> Path:
@@ -27,7 +47,7 @@ def find_run(run: str, runs_dir: Path) -> Path:
         if (folder / "config.yaml").is_file():
             return folder.resolve()
     for sent in sorted(runs_dir.glob("*/mlflow.json")):
-        if f'"{run}"' in sent.read_text():
+        if json.loads(sent.read_text()).get("run_id") == run:
             return sent.parent.resolve()
     raise InputError(
         f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
@@ -35,59 +55,59 @@ def find_run(run: str, runs_dir: Path) -> Path:
     )
 
 
-def open_run(folder: Path, overrides: list[str]) -> Session:
+def open_run(folder: Path, overrides: list[str]) -> Stored:
     """Session of a stored run with its best weights.
 
     Args:
         folder: the run folder.
-        overrides: Hydra overrides of the stored configuration. ``dataset=mfnet`` replaces the
-            whole node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
+        overrides: of the stored configuration (`CHANGEABLE`). ``dataset=mfnet`` replaces the whole
+            node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
 
     Raises:
         InputError: overrides that do not fit, no checkpoint, other classes than trained.
     """
+    register_resolvers()
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"
-    trained = list(config.dataset.classes) if "classes" in config.dataset else None
-    register_resolvers()
-    _override(config, overrides)
+    _override(config, [_pair(item) for item in overrides])
     config.trainer.init_from = None
     check(config)
-    session = open_session(config)
-    if trained is not None and trained != list(session.dataset.classes):
-        raise InputError(
-            f"{folder} was trained with the classes {', '.join(trained)}, but "
-            f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
-        )
     best = folder / "best.pt"
-    load_weights(session.model, load_checkpoint(best)["model"], best)
-    return session
+    payload = load_checkpoint(best)
+    session = open_session(config)
+    for path in sorted(folder.glob("counts_*.npz"))[:1]:
+        trained = Counts.load(path).classes
+        if trained != tuple(session.dataset.classes):
+            raise InputError(
+                f"{folder} was trained with the classes {', '.join(trained)}, but "
+                f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
+            )
+    load_weights(session.model, payload["model"], best)
+    return Stored(session, payload["step"])
 
 
-def _override(config: DictConfig, overrides: list[str]) -> None:
+def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values."""
-    pairs = [_pair(item) for item in overrides]
-    groups = {key for key, _ in pairs if key in NODES}
+    for key, _ in pairs:
+        if not any(key == each or key.startswith(f"{each}.") for each in CHANGEABLE):
+            raise InputError(
+                f"'{key}' cannot be changed of a stored run; {nearest(key, CHANGEABLE)}."
+            )
+    groups = [key for key, _ in pairs if key in GROUPS]
     for group in groups:
         own = [f"{key}={value}" for key, value in pairs if key.split(".")[0] == group]
         with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            composed = hydra.compose("config", own)
-        # Values that refer to other nodes are settled here: the stored scale may be another one.
-        missing = OmegaConf.missing_keys(composed[group])
-        if missing:
-            name = min(missing)
+            composed = hydra.compose("config", own)[group]
+        for name in OmegaConf.missing_keys(composed):
             raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
-        config[group] = OmegaConf.to_container(composed[group], resolve=True)
+        config[group] = OmegaConf.to_container(composed, resolve=True)
     known = flatten(config)
     for key, value in pairs:
         if key.split(".")[0] in groups:
             continue
-        if key.split(".")[0] in FIXED or key not in known:
-            raise InputError(f"'{key}' cannot be changed of a stored run; {nearest(key, known)}.")
-        try:
-            OmegaConf.update(config, key, _parsed(value))
-        except OmegaConfBaseException as error:
-            raise InputError(f"{key}={value}: {str(error).splitlines()[0]}") from error
+        if key not in known:
+            raise InputError(f"'{key}' is not a key of this run; {nearest(key, known)}.")
+        OmegaConf.update(config, key, _parsed(key, value))
 
 
 def _pair(item: str) -> tuple[str, str]:
@@ -95,5 +115,8 @@ def _pair(item: str) -> tuple[str, str]:
     return key, value
 
 
-def _parsed(value: str) -> object:
-    return OmegaConf.to_container(OmegaConf.from_dotlist([f"v={value}"]))["v"]  # type: ignore[index,call-overload]
+def _parsed(key: str, value: str) -> object:
+    try:
+        return yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise InputError(f"{key}={value}: cannot be read as a value ({error}).") from error

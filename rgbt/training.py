@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, flatten, run_key
-from rgbt.data.loaders import steps_per_epoch, train_batches
+from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.data.mfnet import MFNet
 from rgbt.engine.checkpoint import State, load_checkpoint, load_weights
-from rgbt.engine.trainer import Trainer
+from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
+from rgbt.maskers.masker import Masker
 from rgbt.metrics import names, scores
 from rgbt.session import Session, evaluate, open_session, result_tables
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.files import write_atomic
+from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.pictures import Example, Legend, RegionHeat, draw_panel, draw_region_heat
-from rgbt.tracking.provenance import provenance
+from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.tables import ResultTables
 from rgbt.tracking.terminal import result_view, show
+from rgbt.types import Batch
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
@@ -40,42 +48,61 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     Args:
         config: composed and checked.
         overrides: as typed, for the run's name.
+
+    Raises:
+        InputError: the configuration, the data or the run folder do not fit.
+        RunError: the run cannot go on.
     """
-    folder = RunFolder(Path(config.runs_dir) / run_key(config))
+    if config.out is not None:
+        raise InputError(f"out={config.out}: a run is written to runs_dir=...; leave `out` away.")
+    path = Path(config.runs_dir) / run_key(config)
     tracking: Tracking = build(config.tracking)
-    name = run_name(config, overrides)
-    if folder.result() is not None:
-        _say(f"{name} is finished; showing its result. Another seed is another run: seed=1.")
-        _track(tracking, folder, config, name)
-        tracking.finish()
+    if (path / "result.json").exists():
+        folder = RunFolder(path)
+        _show_again(folder, tracking)
     else:
+        # Everything is built before the folder is made: a wrong value leaves nothing behind.
+        prepared = prepare(config)
+        folder = RunFolder(path)
         with folder.lock():
-            Run(config, folder, tracking, name).complete()
+            Run(prepared, folder, tracking, describe(config, overrides)).complete()
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
     show(result_view(ResultTables.from_json(tables), folder.path, tracking.links()))
 
 
-def run_name(config: DictConfig, overrides: Sequence[str]) -> str:
-    """The experiment and what was changed of it, e.g. "grbm sigma_div=2 seed=1"."""
-    silent = ("experiment=", "runs_dir=", "out=", "tracking", "dataset.root=", "name=")
-    typed = [item.lstrip("+") for item in overrides]
-    changed = [item for item in typed if not item.startswith(silent)]
-    short = [
-        f"{key.rpartition('.')[2]}={value}" for key, _, value in (c.partition("=") for c in changed)
+def _show_again(folder: RunFolder, tracking: Tracking) -> None:
+    known = folder.description()
+    assert known is not None, "a finished run has its description"
+    _say(f"{known.name} is finished; showing its result. Another seed is another run: seed=1.")
+    tracking.start(folder, known.name, known.tags, known.params)
+    tracking.finish()
+
+
+def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
+    """How the run is shown: "grbm sigma_div=2 seed=1", grouped with the same run of other seeds.
+
+    Only what differs from the experiment is named; keys are cut to their last part where that
+    says enough.
+    """
+    silent = ("experiment", "runs_dir", "tracking", "dataset.root", "name", "seed")
+    pairs = [item.lstrip("+").partition("=")[::2] for item in overrides]
+    changed = [(k, v) for k, v in pairs if k not in silent and not k.startswith("tracking.")]
+    ends = [key.rpartition(".")[2] for key, _ in changed]
+    clear = [end != "seed" and ends.count(end) == 1 for end in ends]
+    shown = [
+        f"{end if ok else key}={value}"
+        for (key, value), end, ok in zip(changed, ends, clear, strict=True)
     ]
-    return " ".join([config.name, *short])
-
-
-def _track(tracking: Tracking, folder: RunFolder, config: DictConfig, name: str) -> None:
-    tags = {
-        "rgbt.key": folder.path.name,
-        "rgbt.experiment": config.name,
-        "rgbt.group": name.replace(f" seed={config.seed}", ""),
-        "rgbt.seed": str(config.seed),
+    group = " ".join([config.name, *shown])
+    tags = {"rgbt.experiment": config.name, "rgbt.group": group, "rgbt.seed": str(config.seed)}
+    params = {
+        key: str(value)
+        for key, value in flatten(config).items()
+        # Paths and passwords of the tracker are no property of the run.
+        if not key.endswith("_target_") and not key.startswith("tracking.")
     }
-    params = {key: value for key, value in flatten(config).items() if not key.endswith("_target_")}
-    tracking.start(folder, name, tags, params)
+    return Description(f"{group} seed={config.seed}", {**tags, "rgbt.key": run_key(config)}, params)
 
 
 def _say(text: str) -> None:
@@ -83,25 +110,70 @@ def _say(text: str) -> None:
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """The objects of a training, before anything is written.
+
+    Attributes:
+        session: data, transform, network.
+        model: the network as Fabric wrapped it.
+        optimizer: of the network; schemes call it "main".
+        scheme: yields the phases of a step.
+        init: weights to start from, and the file they came from.
+    """
+
+    session: Session
+    model: nn.Module
+    optimizer: torch.optim.Optimizer
+    scheme: Scheme
+    init: tuple[dict[str, Tensor], Path] | None
+
+
+def prepare(config: DictConfig) -> Prepared:
+    """Build everything and look at all lists that the run will read, so that errors come first."""
+    session = open_session(config)
+    for split in ("train", session.trainer.selection_split, "test"):
+        session.dataset.names(split)
+    steps_per_epoch(session.dataset, session.loading)
+    masker: Masker = build(config.masker)
+    if session.transform.crop_hw is not None and not masker.hides_nothing:
+        masker.grid_hw(session.transform.crop_hw)
+    init = None
+    if session.trainer.init_from is not None:
+        source = Path(session.trainer.init_from)
+        source = source / "best.pt" if source.is_dir() else source
+        init = (load_checkpoint(source)["model"], source)
+        load_weights(session.model, *init)
+    elif config.optimizer.get("backbone_multiplier", 1.0) < 1.0:
+        _say(
+            "the backbone starts from random weights with a learning rate meant for pretrained "
+            "ones; name a checkpoint with trainer.init_from=..., or expect less than published."
+        )
+    builder = build(config.optimizer)
+    model, optimizer = session.fabric.setup(session.model, builder(session.model))
+    scheme: Scheme = build(
+        config.scheme, model=model, loss=build(config.loss), masker=masker, sdc=sdc, sdn=sdn
+    )
+    return Prepared(session, model, optimizer, scheme, init)
+
+
+@dataclass(frozen=True)
 class Run:
     """A run that is not finished: trains, evaluates and fills its folder."""
 
-    config: DictConfig
+    prepared: Prepared
     folder: RunFolder
     tracking: Tracking
-    name: str
+    description: Description
 
     def complete(self) -> None:
         """Train to the last step, evaluate the best checkpoint, write the result."""
         started = time.time()
-        session = open_session(self.config)
-        state = State(seed=self.config.seed)
-        # Everything is built before the folder is begun: a wrong value leaves nothing behind.
-        trainer = self._trainer(session, state)
+        session = self.prepared.session
         self._claim(session)
-        _track(self.tracking, self.folder, self.config, self.name)
+        shown = self.description
+        self.tracking.start(self.folder, shown.name, shown.tags, shown.params)
         try:
-            self._train(session, trainer, state)
+            state = self._train(session)
             self._test(session, state)
             self._finish(session, state, time.time() - started)
         finally:
@@ -111,68 +183,61 @@ class Run:
     def _finish(self, session: Session, state: State, seconds: float) -> None:
         self.folder.finish(
             {
-                "name": self.name,
+                "name": self.description.name,
                 "key": self.folder.path.name,
                 "dataset": session.dataset.fingerprint(),
                 "steps": state.step,
                 "best_step": state.best_step,
                 "best_score": state.best_score,
-                "seconds": round(seconds, 1),
-                "skipped": sorted(set(state.skipped)),
+                "seconds_of_last_process": round(seconds, 1),
+                "skipped": state.skipped,
             }
         )
 
     def _claim(self, session: Session) -> None:
-        """Write what identifies the run; refuse a folder that was begun on other data."""
-        fingerprint = session.dataset.fingerprint()
-        marker = self.folder.path / "dataset.txt"
-        if marker.exists() and marker.read_text() != fingerprint:
+        """Write what identifies the run; refuse a folder that was begun on other images."""
+        marker = self.folder.path / "dataset.json"
+        dataset = session.dataset
+        lists = {split: dataset.names(split) for split in ("train", "test")}
+        names_key = hashlib.sha256(json.dumps(lists).encode()).hexdigest()
+        found = {"names": names_key, "files": dataset.fingerprint()}
+        begun = json.loads(marker.read_text()) if marker.exists() else found
+        if begun["names"] != found["names"]:
             raise InputError(
-                f"{self.folder.path} was trained on other files than those in "
-                f"{session.dataset.root}; give the data set another name (dataset.name=...) or the "
-                "runs another folder (runs_dir=...)."
+                f"{self.folder.path} was begun on other images than the lists of {dataset.root} "
+                "name; give the runs another folder (runs_dir=...), or the data set another name "
+                "(dataset.name=...)."
             )
-        marker.write_text(fingerprint)
-        self.folder.write_config(OmegaConf.to_yaml(self.config, resolve=True))
+        if begun["files"] != found["files"]:
+            _say(f"files of {dataset.root} have changed since this run was begun.")
+        write_atomic(marker, json.dumps(found).encode())
+        config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
+        self.folder.write_config(config)
         self.folder.add_provenance(provenance())
 
-    def _train(self, session: Session, trainer: Trainer, state: State) -> None:
+    def _train(self, session: Session) -> State:
+        state = State(seed=session.config.seed)
+        trainer = self._trainer(session, state)
         if trainer.resume(state):
-            _say(f"{self.name} continues at step {state.step} ({self.folder.path}).")
-        elif session.trainer.init_from is not None:
-            source = Path(session.trainer.init_from)
-            source = source / "best.pt" if source.is_dir() else source
-            load_weights(session.model, load_checkpoint(source)["model"], source)
+            _say(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
         self.folder.truncate_after(state.step)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = train_batches(
             session.dataset, "train", session.transform, session.loading, state.seed, steps
         )
-        trainer.fit(batches, state)
-        state.skipped.extend(batches.skipped)
+        trainer.fit(_noting_skipped(batches, state), state)
+        return state
 
     def _trainer(self, session: Session, state: State) -> Trainer:
-        config = self.config
-        builder = build(config.optimizer)
-        model, optimizer = session.fabric.setup(session.model, builder(session.model))
-        scheme = build(
-            config.scheme,
-            model=model,
-            loss=build(config.loss),
-            masker=build(config.masker),
-            sdc=sdc,
-            sdn=sdn,
-        )
+        split = session.trainer.selection_split
         per_epoch = steps_per_epoch(session.dataset, session.loading)
 
-        split = session.trainer.selection_split
-
         def validate(step: int) -> float:
-            found = evaluate(session, model, split)
+            found = evaluate(session, self.prepared.model, split)
             values = scores.summary(found.counts, session.regions.absent)
             self.folder.append(step, "val", values)
-            state.skipped.extend(found.skipped)
+            state.skip(found.skipped)
             if values[names.MIOU] > state.best_score:
                 found.counts.save(self.folder.counts_path(split))
             self.tracking.update()
@@ -181,10 +246,10 @@ class Run:
         return Trainer(
             fabric=session.fabric,
             settings=session.trainer,
-            scheme=scheme,
-            model=model,
-            optimizers={"main": optimizer},
-            schedule=build(config.schedule),
+            scheme=self.prepared.scheme,
+            model=self.prepared.model,
+            optimizers={"main": self.prepared.optimizer},
+            schedule=build(session.config.schedule),
             steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
             folder=self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
@@ -195,34 +260,43 @@ class Run:
         """Counts, tables and figures of the best checkpoint on the test split."""
         best = self.folder.path / "best.pt"
         load_weights(session.model, load_checkpoint(best)["model"], best)
-        shown = panel_names(session)
-        found = evaluate(session, session.model, "test", keep=shown)
-        state.skipped.extend(found.skipped)
+        found = evaluate(session, session.model, "test", keep=panel_names(session.dataset))
+        state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
         self.folder.append(state.step, "test", values)
-        label = textwrap.shorten(self.name, LABEL_WIDTH, placeholder=" ...")
+        label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
         tables = result_tables(found.counts, session.regions, label, state.best_step)
         self.folder.write_tables(tables.to_json())
-        self._draw(session, tables, found.kept)
+        if found.kept:
+            self._draw(session, tables, found.kept)
+        else:
+            _say("none of the images of the panel could be read; no pictures were drawn.")
 
     def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
         palette = np.array(session.dataset.palette, np.uint8)
         legend = Legend(session.dataset.classes, palette)
         draw_panel(kept, legend, self.folder.figure_path("panel"))
         heat = RegionHeat(
-            title=f"{self.name}: IoU by region, {session.dataset.name} {tables.split}",
+            title=f"{self.description.name}: IoU by region, {session.dataset.name} {tables.split}",
             region_map=session.regions.map(kept[0].label.shape).astype(np.int64),
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
 
 
-def panel_names(session: Session) -> tuple[str, ...]:
+def _noting_skipped(batches: Batches, state: State) -> Iterator[Batch]:
+    """The batches, with unreadable files noted in `state` before a checkpoint is written."""
+    for batch in batches:
+        state.skip(batches.skipped)
+        yield batch
+
+
+def panel_names(dataset: MFNet) -> tuple[str, ...]:
     """The first images of the test split, half by day and half by night where it holds both."""
-    test = session.dataset.names("test")
-    night = [name for name in test if session.dataset.is_night(name)]
-    day = [name for name in test if not session.dataset.is_night(name)]
-    half = NUM_PANELS // 2
-    num_day = max(half, NUM_PANELS - len(night))
-    return tuple(day[:num_day] + night[: NUM_PANELS - min(num_day, len(day))])
+    test = dataset.names("test")
+    at_night = dataset.nights(test) or (False,) * len(test)
+    night = [name for name, dark in zip(test, at_night, strict=True) if dark]
+    day = [name for name, dark in zip(test, at_night, strict=True) if not dark]
+    num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
+    return tuple(day[:num_day] + night[: NUM_PANELS - num_day])

@@ -174,6 +174,14 @@ BAD_OVERRIDES = {
     "number for a choice": (["schedule.per=week"], "'schedule.per'"),
     "fraction for a count": (["trainer.accumulate=1.5"], "'trainer.accumulate'"),
     "collaborator as a setting": (["+scheme.model=1"], "'scheme.model'"),
+    "negative rate": (["optimizer.lr=-1"], "optimizer.lr must be positive"),
+    "negative warm-up": (["schedule.warmup_steps=-5"], "schedule.warmup_steps must lie in"),
+    "no thread": (["trainer.threads=0"], "trainer.threads must be at least 1"),
+    "no such device": (["trainer.accelerator=mps"], "trainer.accelerator=mps"),
+    "other number of classes": (["model.num_classes=5"], "model.num_classes is 5"),
+    "no override": (["learning rate 3"], "expected key=value"),
+    "unknown selection split": (["trainer.selection_split=vall"], "no split 'vall'"),
+    "picture of a run": (["out=x.png"], "leave `out` away"),
     "missing root": (["dataset=mfnet", "~dataset.root"], "'dataset.root'"),
     "root without value": (["dataset=mfnet", "dataset.root=???"], "'dataset.root' has no value"),
     "no such folder": (["dataset.root=/no/such"], "dataset.root: there is no folder '/no/such'"),
@@ -203,6 +211,7 @@ def test_a_wrong_configuration_is_one_sentence_and_exit_code_2(
     )
     assert code == 2, err
     assert_one_sentence(err, sentence)
+    assert not list(tmp_path.glob("*/config.yaml")), "nothing is left behind"
 
 
 def assert_one_sentence(err: str, sentence: str) -> None:
@@ -249,13 +258,18 @@ def corrupted(data: Path) -> str:
     return "00003N.png cannot be decoded"
 
 
+def no_test_list(data: Path) -> str:
+    (data / "test.txt").unlink()
+    return "there is no list"
+
+
 def empty_split(data: Path) -> str:
     (data / "val.txt").write_text("\n")
     return "val.txt' is empty"
 
 
 @pytest.mark.parametrize(
-    "spoil", [label_of_nine, other_size, three_channels, corrupted, empty_split]
+    "spoil", [label_of_nine, other_size, three_channels, corrupted, no_test_list, empty_split]
 )
 def test_bad_files_are_named_in_one_sentence(
     call: Call, data: Path, tmp_path: Path, spoil: Callable[[Path], str]
@@ -286,7 +300,22 @@ def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, tmp_p
     (data / "train.txt").write_text("\n".join(SPLITS["train"][:-1]) + "\n")
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
     assert code == 2
-    assert_one_sentence(err, "was trained on other files")
+    assert_one_sentence(err, "was begun on other images")
+
+
+def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    runs = tmp_path / "runs"
+    train(call, data, runs, "+experiment=crm", *short(1))
+    (only_run(runs) / "result.json").unlink()
+    corrupted_and_repaired = data / "images" / "00003N.png"
+    image = cv2.imread(str(corrupted_and_repaired), cv2.IMREAD_UNCHANGED)
+    image[:24] = 0
+    assert cv2.imwrite(str(corrupted_and_repaired), image)
+    code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
+    assert code == 0, err
+    assert "have changed since this run was begun" in err
 
 
 def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Path) -> None:
@@ -323,6 +352,14 @@ def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Pat
     assert classes.max() < 9
     assert cv2.imread(str(tmp_path / "out" / "a_overlay.png")).shape == (48, 64, 3)
 
+    before = (other / "a.png").read_bytes()
+    code, out, err = call(
+        plain_command(predict.OWN, predict.main), f"run={folder}", f"input={other}", f"out={other}"
+    )
+    assert code == 2
+    assert_one_sentence(err, "would be overwritten")
+    assert (other / "a.png").read_bytes() == before
+
 
 def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Path) -> None:
     from rgbt import evaluate
@@ -338,6 +375,9 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Pa
         (f"run={folder}", "split=tset"): "no split 'tset'",
         (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
         (f"run={folder}", "data.batch=1"): "did you mean 'data.batch_size'?",
+        (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",
+        (f"run={folder}", "model=mask2former_swin_t"): "'model' cannot be changed",
+        (f"run={folder}", "data.eval_batch_size=[1"): "cannot be read as a value",
         (): "'run' has no value",
     }
     for arguments, sentence in cases.items():
@@ -371,6 +411,36 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
     assert code == 2
     assert_one_sentence(err, "masker.sigma_div")
     assert len(list(tmp_path.glob("*/result.json"))) == 2
+
+
+def test_names_say_what_differs_and_groups_leave_the_seed_out() -> None:
+    from omegaconf import OmegaConf
+
+    from rgbt.training import describe
+
+    nodes = ["scale", "recipe", "dataset", "data", "transform", "masker", "model", "loss", "scheme", "optimizer", "schedule", "trainer", "metric", "tracking"]  # fmt: skip
+    config = OmegaConf.create({"name": "grbm", "seed": 1, **{node: {} for node in nodes}})
+    typed = ["+experiment=grbm", "seed=1", "runs_dir=x", "tracking=none", "masker.sigma_div=2"]
+    shown = describe(config, typed)
+    assert (shown.name, shown.tags["rgbt.group"]) == (
+        "grbm sigma_div=2 seed=1",
+        "grbm sigma_div=2",
+    )
+    twice = describe(config, ["dataset.seed=3", "optimizer.lr=1", "scale.lr=2"])
+    assert twice.name == "grbm dataset.seed=3 optimizer.lr=1 scale.lr=2 seed=1"
+
+
+def test_a_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
+    from rgbt.checks import InputError
+    from rgbt.stored import find_run
+
+    folder = tmp_path / "abc"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("")
+    (folder / "mlflow.json").write_text('{"run_id": "f00", "experiment": "rgbt"}')
+    assert find_run("f00", tmp_path) == find_run("abc", tmp_path) == folder
+    with pytest.raises(InputError, match="run=rgbt: neither"):
+        find_run("rgbt", tmp_path)
 
 
 def test_help_needs_neither_torch_nor_mlflow() -> None:

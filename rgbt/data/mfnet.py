@@ -140,6 +140,16 @@ class MFNet:
             )
         return letter == "N"
 
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
+        """`is_night` of every name; None where no name says whether it is day or night.
+
+        Raises:
+            InputError: some names say so and others do not.
+        """
+        if not any(base_name(name)[-1:] in ("D", "N") for name in names):
+            return None
+        return tuple(self.is_night(name) for name in names)
+
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 

@@ -1,7 +1,7 @@
 """Checkpoints: written whole or not at all, read without executing code.
 
 Which checkpoint is taken when a run starts, first match wins:
-1. ``checkpoints/last.pt`` of the run folder (the run continues);
+1. ``last.pt`` of the run folder (the run continues);
 2. `trainer.init_from` (weights only);
 3. fresh weights.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,21 +30,25 @@ class State:
         best_score: highest selection score so far, fraction; -1 before the first evaluation.
         best_step: the step it was reached at.
         seed: run seed, from which every generator is derived together with `step`.
-        tracking_id: the tracker's id of this run, or "".
+        skipped: names of unreadable files that were left out so far, sorted.
     """
 
     seed: int
     step: int = 0
     best_score: float = -1.0
     best_step: int = 0
-    tracking_id: str = ""
     skipped: list[str] = field(default_factory=list)
+
+    def skip(self, names: Iterable[str]) -> None:
+        """Note files that were left out."""
+        self.skipped = sorted({*self.skipped, *names})
 
 
 def save_checkpoint(path: Path, payload: dict[str, Any]) -> None:
     """Write `payload` to a temporary name, flush it to disk, rename it to `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    # One name: what a killed process left half written is overwritten, never piled up.
+    temporary = path.with_name(f".{path.name}.partial")
     with temporary.open("wb") as file:
         torch.save(payload, file)
         file.flush()

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from rgbt.checks import InputError, check_range
+
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table", "absolute_pos_embed")
 
@@ -32,6 +34,14 @@ class AdamW:
     weight_decay: float
     betas: tuple[float, float]
     eps: float
+
+    def __post_init__(self) -> None:
+        if self.lr <= 0:
+            raise InputError(f"optimizer.lr must be positive, got {self.lr:g}.")
+        check_range("optimizer.backbone_multiplier", self.backbone_multiplier, 0.0, 1e6)
+        check_range("optimizer.weight_decay", self.weight_decay, 0.0, 1e6)
+        for beta in self.betas:
+            check_range("optimizer.betas", beta, 0.0, 1.0 - 1e-12)
 
     def __call__(self, model: nn.Module) -> torch.optim.Optimizer:
         """The optimizer of all trainable parameters of `model`."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+from rgbt.checks import check_range
+
 
 class Schedule(Protocol):
     """What the loop asks a schedule."""
@@ -31,6 +33,10 @@ class Poly:
     power: float
     per: Literal["iteration", "epoch"]
     warmup_steps: int
+
+    def __post_init__(self) -> None:
+        check_range("schedule.power", self.power, 0.0, 100.0)
+        check_range("schedule.warmup_steps", self.warmup_steps, 0, 2**40)
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
         """See `Schedule`."""

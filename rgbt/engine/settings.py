@@ -43,6 +43,8 @@ class TrainerSettings:
         for name in ("max_steps", "eval_every", "checkpoint_every", "log_every", "accumulate"):
             if getattr(self, name) < 1:
                 raise InputError(f"trainer.{name} must be at least 1, got {getattr(self, name)}.")
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"trainer.threads must be at least 1 or null, got {self.threads}.")
         if self.clip_norm is not None and self.clip_norm <= 0:
             raise InputError(f"trainer.clip_norm must be positive or null, got {self.clip_norm}.")
 
@@ -54,10 +56,12 @@ class Recipe:
     Attributes:
         batch_size: samples per process and step.
         max_steps: optimiser steps.
+        eval_every: steps between evaluations: five epochs of MFNet's 1568 training images.
     """
 
     batch_size: int
     max_steps: int
+    eval_every: int
 
 
 @dataclass(frozen=True, kw_only=True)

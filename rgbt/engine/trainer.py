@@ -6,6 +6,7 @@ import math
 import resource
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -138,9 +139,9 @@ class Trainer:
             generator_of = partial(
                 torch_generator_of, seed=seed, index=index, device=self.fabric.device
             )
-            for phase in self.scheme.phases(batch, generator_of):
-                for name, value in self._run_phase(phase, step, micro).items():
-                    values[name] = values.get(name, 0.0) + value
+            with _naming(step):
+                for phase in self.scheme.phases(batch, generator_of):
+                    _add(values, self._run_phase(phase, micro))
         elapsed = time.perf_counter() - started
         return {
             **values,
@@ -150,13 +151,13 @@ class Trainer:
             "peak_memory_mib": _peak_memory_mib(self.fabric.device),
         }
 
-    def _run_phase(self, phase: Phase, step: int, micro: int) -> dict[str, float]:
+    def _run_phase(self, phase: Phase, micro: int) -> dict[str, float]:
         optimizer = self.optimizers[phase.optimizer]
         share = 1.0 / self.settings.accumulate
         if micro == 0:
             optimizer.zero_grad()
         total = torch.stack(list(phase.parts.values())).sum()
-        values = _finite_values(phase.parts, step)
+        values = _finite_values(phase.parts)
         self.fabric.backward(total * share)
         logged = {f"loss/{name}": value * share for name, value in values.items()}
         logged["loss"] = sum(values.values()) * share
@@ -168,7 +169,7 @@ class Trainer:
                 error_if_nonfinite=False,
             )
             assert norm is not None, "clipping by norm returns the norm"
-            logged |= {"grad_norm": _finite_values({"gradient norm": norm}, step)["gradient norm"]}
+            logged |= {"grad_norm": _finite_values({"gradient norm": norm})["gradient norm"]}
             optimizer.step()
         return logged
 
@@ -189,16 +190,29 @@ def torch_generator_of(
     return torch_generator(seed, purpose, index, device=device)
 
 
-def _finite_values(parts: dict[str, Tensor], step: int) -> dict[str, float]:
+@contextmanager
+def _naming(step: int) -> Iterator[None]:
+    try:
+        yield
+    except RunError as error:
+        raise RunError(
+            f"step {step + 1}: {error} The last checkpoint is kept; lower optimizer.lr, or use "
+            "trainer.precision=32-true if it was mixed."
+        ) from error
+
+
+def _add(values: dict[str, float], more: dict[str, float]) -> None:
+    for name, value in more.items():
+        values[name] = values.get(name, 0.0) + value
+
+
+def _finite_values(parts: dict[str, Tensor]) -> dict[str, float]:
     # One transfer for all parts: reading them one by one would wait for the device each time.
     numbers = torch.stack([part.detach().float() for part in parts.values()]).tolist()
     values = dict(zip(parts, numbers, strict=True))
     for name, value in values.items():
         if not math.isfinite(value):
-            raise RunError(
-                f"step {step + 1}: {name} is {value}; the last checkpoint is kept. Lower "
-                "optimizer.lr, or use trainer.precision=32-true if it was mixed."
-            )
+            raise RunError(f"{name} is {value}.")
     return values
 
 

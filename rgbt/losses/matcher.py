@@ -192,7 +192,7 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
             f"label: expected 0 to {present_BK.shape[1] - 1} or {IGNORE}, got another value."
         )
     if not np.isfinite(cost_SBQK).all():
-        raise RunError("The matching cost is not finite: the predictions hold NaN or infinity.")
+        raise RunError("the matching cost is not finite, the predictions hold NaN or infinity.")
 
     image, label = np.nonzero(present_BK)
     query = np.full((len(cost_SBQK), len(image)), -1)
