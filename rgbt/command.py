@@ -117,8 +117,8 @@ def _hydra_sentence(error: Exception) -> str:
         return f"there is no group '{group}'; {nearest(group, known)}."
     if isinstance(error, OverrideParseException):
         return (
-            f"'{error.override}' is no override; expected key=value, with quotes around a value that "
-            "holds commas, brackets or spaces: 'key=\"a, b\"'."
+            f"'{error.override}' is no override; expected key=value, with quotes around a value "
+            "that holds commas, brackets or spaces: 'key=\"a, b\"'."
         )
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)

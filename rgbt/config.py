@@ -137,8 +137,8 @@ def run_key(config: DictConfig) -> str:
     Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method with
     the same seed is the same run wherever it is started from.
     """
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict), "the configuration is a mapping"
+    plain: dict[str, Any] = {"seed": config.seed}
+    plain |= {key: _canonical(config[key], key) for key in NODES}
     for dotted in NOT_IN_KEY:
         *parents, last = dotted.split(".")
         node: Any = plain
@@ -147,6 +147,21 @@ def run_key(config: DictConfig) -> str:
         node.pop(last, None)
     text = json.dumps(plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _canonical(node: DictConfig, path: str) -> dict[str, Any]:
+    """Values as their constructors take them: 4 and 4.0 are one value where both mean 4.0."""
+    from pydantic_core import to_jsonable_python
+
+    hints = _annotations(_target(node, path))
+    values: dict[str, Any] = {"_target_": node["_target_"]}
+    for key, value in _items(node, path):
+        if isinstance(value, DictConfig) and "_target_" in value:
+            values[key] = _canonical(value, f"{path}.{key}")
+        else:
+            typed = _check_value(f"{path}.{key}", value, hints.get(key, Any))
+            values[key] = to_jsonable_python(typed)
+    return values
 
 
 def flatten(config: DictConfig) -> dict[str, Any]:

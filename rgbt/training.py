@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor, nn
+from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, flatten, run_key
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.engine.checkpoint import State, load_checkpoint, load_weights
+from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.maskers.masker import Masker
@@ -102,7 +103,7 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
         # Paths and passwords of the tracker are no property of the run.
         if not key.endswith("_target_") and not key.startswith("tracking.")
     }
-    return Description(f"{group} seed={config.seed}", {**tags, "rgbt.key": run_key(config)}, params)
+    return Description(f"{group} seed={config.seed}", tags, params)
 
 
 def _say(text: str) -> None:
@@ -118,14 +119,14 @@ class Prepared:
         model: the network as Fabric wrapped it.
         optimizer: of the network; schemes call it "main".
         scheme: yields the phases of a step.
-        init: weights to start from, and the file they came from.
+        schedule: learning rate factor per step.
     """
 
     session: Session
     model: nn.Module
     optimizer: torch.optim.Optimizer
     scheme: Scheme
-    init: tuple[dict[str, Tensor], Path] | None
+    schedule: Schedule
 
 
 def prepare(config: DictConfig) -> Prepared:
@@ -137,12 +138,10 @@ def prepare(config: DictConfig) -> Prepared:
     masker: Masker = build(config.masker)
     if session.transform.crop_hw is not None and not masker.hides_nothing:
         masker.grid_hw(session.transform.crop_hw)
-    init = None
     if session.trainer.init_from is not None:
         source = Path(session.trainer.init_from)
         source = source / "best.pt" if source.is_dir() else source
-        init = (load_checkpoint(source)["model"], source)
-        load_weights(session.model, *init)
+        load_weights(session.model, load_checkpoint(source)["model"], source)
     elif config.optimizer.get("backbone_multiplier", 1.0) < 1.0:
         _say(
             "the backbone starts from random weights with a learning rate meant for pretrained "
@@ -153,7 +152,7 @@ def prepare(config: DictConfig) -> Prepared:
     scheme: Scheme = build(
         config.scheme, model=model, loss=build(config.loss), masker=masker, sdc=sdc, sdn=sdn
     )
-    return Prepared(session, model, optimizer, scheme, init)
+    return Prepared(session, model, optimizer, scheme, build(config.schedule))
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,8 @@ class Run:
         session = self.prepared.session
         self._claim(session)
         shown = self.description
-        self.tracking.start(self.folder, shown.name, shown.tags, shown.params)
+        tags = {**shown.tags, "rgbt.key": self.folder.path.name}
+        self.tracking.start(self.folder, shown.name, tags, shown.params)
         try:
             state = self._train(session)
             self._test(session, state)
@@ -249,7 +249,7 @@ class Run:
             scheme=self.prepared.scheme,
             model=self.prepared.model,
             optimizers={"main": self.prepared.optimizer},
-            schedule=build(session.config.schedule),
+            schedule=self.prepared.schedule,
             steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
             folder=self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),

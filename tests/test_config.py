@@ -69,6 +69,8 @@ def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
     base = ["+experiment=grbm", "dataset=mfnet", "dataset.root=/elsewhere"]
     key = run_key(compose(*base))
     assert run_key(compose(*base, *same)) == key
+    # The file says 4.0; a user types 4.
+    assert run_key(compose(*base, "masker.sigma_div=4")) == key
     for change in ("seed=1", "masker.sigma_div=2", "dataset.name=mine", "trainer.max_steps=7"):
         assert run_key(compose(*base, change)) != key, change
 
