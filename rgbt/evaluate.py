@@ -16,17 +16,19 @@ OWN = {
     "split": "test",
     "modality": "rgbt",
     "regions": "as trained",
+    "checkpoint": "best",
     "out": "",
 }
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Evaluate the best checkpoint of a run, on its own data set or another one.
+    """Evaluate a run, on its own data set or another one.
 
     run       run folder, config key or MLflow run id
     split     split of the data set
     modality  rgbt, or rgb / thermal to decode one branch alone
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
+    checkpoint  best (by validation mIoU) or last
     out       file of the counts; default: evaluations/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1
     """
@@ -40,11 +42,14 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
-    stored = open_run(folder, overrides)
+    stored = open_run(folder, overrides, arguments["checkpoint"])
     session = stored.session
     found = evaluate(session, session.model, arguments["split"], modality=modality)
     counts = found.counts
-    stem = f"{session.dataset.name}_{counts.split}_{modality}_{counts.partition}"
+    stem = "_".join(
+        [session.dataset.name, counts.split, modality, counts.partition]
+        + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
+    )
     path = Path(arguments["out"] or folder / "evaluations" / f"{stem}.npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)

@@ -1,4 +1,4 @@
-"""A run that lies in its folder, opened again: its configuration and its best weights."""
+"""A run that lies in its folder, opened again: its configuration and its weights."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import hydra
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config import check, conf_dir, flatten, register_resolvers
 from rgbt.engine.checkpoint import load_checkpoint, load_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
 
+CHECKPOINTS = ("best", "last")
 GROUPS = ("dataset", "metric")
 CHANGEABLE = (
     *("dataset", "data", "metric", "transform.test_short_edge"),
@@ -26,10 +27,10 @@ CHANGEABLE = (
 
 @dataclass(frozen=True)
 class Stored:
-    """A stored run.
+    """A stored run, opened.
 
     Attributes:
-        session: its objects; the network holds the best weights.
+        session: its objects; the network holds the weights of the checkpoint.
         step: the optimiser step at which these were reached.
     """
 
@@ -55,13 +56,14 @@ def find_run(run: str, runs_dir: Path) -> Path:
     )
 
 
-def open_run(folder: Path, overrides: list[str]) -> Stored:
-    """Session of a stored run with its best weights.
+def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> Stored:
+    """Session of a stored run with its weights.
 
     Args:
         folder: the run folder.
         overrides: of the stored configuration (`CHANGEABLE`). ``dataset=mfnet`` replaces the whole
             node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
+        checkpoint: "best" by the selection split, or "last".
 
     Raises:
         InputError: overrides that do not fit, no checkpoint, other classes than trained.
@@ -72,8 +74,9 @@ def open_run(folder: Path, overrides: list[str]) -> Stored:
     _override(config, [_pair(item) for item in overrides])
     config.trainer.init_from = None
     check(config)
-    best = folder / "best.pt"
-    payload = load_checkpoint(best)
+    check_choice("checkpoint", checkpoint, CHECKPOINTS)
+    weights = folder / f"{checkpoint}.pt"
+    payload = load_checkpoint(weights)
     session = open_session(config)
     for path in sorted(folder.glob("counts_*.npz"))[:1]:
         trained = Counts.load(path).classes
@@ -82,8 +85,8 @@ def open_run(folder: Path, overrides: list[str]) -> Stored:
                 f"{folder} was trained with the classes {', '.join(trained)}, but "
                 f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
             )
-    load_weights(session.model, payload["model"], best)
-    return Stored(session, payload["step"])
+    load_weights(session.model, payload["model"], weights)
+    return Stored(session, payload["step"] if checkpoint == "best" else payload["state"]["step"])
 
 
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:

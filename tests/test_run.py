@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -339,6 +340,11 @@ def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Pat
     assert "IoU9" in out
     assert (folder / "evaluations" / "mfnet_test_rgb_ring9.npz").exists()
 
+    code, out, err = call(evaluate_entry, f"run={folder}", "checkpoint=last")
+    assert code == 0, err
+    last = Counts.load(folder / "evaluations" / "mfnet_test_rgbt_ring5_last.npz")
+    assert np.array_equal(last.counts, stored.counts)  # one step: the last one is the best one
+
     other = tmp_path / "images"
     other.mkdir()
     (other / "a.png").write_bytes((data / "images" / "00201D.png").read_bytes())
@@ -373,6 +379,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Pa
         ("run=nowhere",): "run=nowhere: neither a run folder",
         (f"run={folder}", "modality=infrared"): "modality: 'infrared' is not a choice",
         (f"run={folder}", "split=tset"): "no split 'tset'",
+        (f"run={folder}", "checkpoint=first"): "'first' is not a choice",
         (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
         (f"run={folder}", "data.batch=1"): "did you mean 'data.batch_size'?",
         (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",
@@ -453,3 +460,25 @@ def test_help_needs_neither_torch_nor_mlflow() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "+experiment=grbm" in done.stdout
+
+
+SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (SHARED / "realdata" / "mfnet200").exists(), reason="reference material")
+def test_real_pairs_train_and_evaluate_like_the_embedded_data(call: Call, tmp_path: Path) -> None:
+    from rgbt.run import main
+
+    real = SHARED / "realdata" / "mfnet200"
+    code, out, err = call(
+        *(main, "+experiment=grbm", "dataset=mfnet", f"dataset.root={real}", "tracking=none"),
+        *("dataset.splits.test=val.txt", f"runs_dir={tmp_path}", "trainer.threads=2", *short(2)),
+    )
+    assert code == 0, err
+    counts = Counts.load(only_run(tmp_path) / "counts_test.npz")
+    assert counts.counts.shape == (100, 5, 9, 9)
+    assert counts.counts.sum() == 100 * 480 * 640
+    # Labelled pixels per class of these 100 images, counted independently of this project.
+    labelled = [29157290, 176251, 290344, 553653, 108846, 134539, 0, 223949, 75128]
+    assert counts.whole().sum(1).tolist() == labelled

@@ -15,7 +15,7 @@ from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.writer import Plan, write
 
-VERSION = 1
+VERSION = 2
 """Of the generator. Raise it with every change that changes a byte, so that no cache is stale."""
 
 

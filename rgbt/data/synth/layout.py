@@ -15,7 +15,7 @@ _MAX_GROUP = 5
 _GOLDEN = 0.6180339887
 
 _KINDS = tuple(groups.GROUPS)
-_NEAR_SHARES = (0.25, 0.52, 0.70, 0.85, 1.0)
+_NEAR_SHARES = (0.22, 0.45, 0.73, 0.87, 1.0)
 _FAR_SHARES = (0.34, 0.72, 0.82, 0.88, 1.0)
 """Cumulative shares of the kinds."""
 
