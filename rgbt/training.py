@@ -57,26 +57,29 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     if config.out is not None:
         raise InputError(f"out={config.out}: a run is written to runs_dir=...; leave `out` away.")
     path = Path(config.runs_dir) / run_key(config)
+    asked = describe(config, overrides)
     tracking: Tracking = build(config.tracking)
     if (path / "result.json").exists():
         folder = RunFolder(path)
-        _show_again(folder, tracking)
+        _show_again(folder, tracking, asked)
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         prepared = prepare(config)
         folder = RunFolder(path)
         with folder.lock():
-            Run(prepared, folder, tracking, describe(config, overrides)).complete()
+            Run(prepared, folder, tracking, asked).complete()
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
     show(result_view(ResultTables.from_json(tables), folder.path, tracking.links()))
 
 
-def _show_again(folder: RunFolder, tracking: Tracking) -> None:
+def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> None:
     known = folder.description()
     assert known is not None, "a finished run has its description"
-    _say(f"{known.name} is finished; showing its result. Another seed is another run: seed=1.")
-    tracking.start(folder, known.name, known.tags, known.params)
+    _say(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
+    # A point of a grid that is the default elsewhere: the name that says more is the one to read.
+    shown = asked if len(asked.name) > len(known.name) else known
+    tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish()
 
 

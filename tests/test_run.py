@@ -104,6 +104,12 @@ def test_a_finished_run_says_so_and_shows_its_tables(
     assert again[0] == 0
     assert "is finished" in again[2]
     assert again[1] == first[1]
+    # The default, typed: the same run, shown under the name that says more.
+    typed = train(call, data, tmp_path, "+experiment=grbm", "masker.sigma_div=4", *short(1))
+    assert "is finished" in typed[2]
+    assert "sigma_div=4" in json.loads((only_run(tmp_path) / "run.json").read_text())["name"]
+    train(call, data, tmp_path, "+experiment=grbm", *short(1))
+    assert "sigma_div=4" in json.loads((only_run(tmp_path) / "run.json").read_text())["name"]
 
 
 def test_the_same_seed_gives_the_same_losses_and_another_seed_another_run(
