@@ -88,7 +88,7 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
         sent: what that store has.
         status: the state to show.
     """
-    known_params, seen = _find_run(store, folder, sent)
+    known_params, seen, name = _find_run(store, folder, sent)
     tables = _tables(folder)
     lines = [line for line in folder.lines() if line.step > sent.steps.get(line.kind, -1)]
     metrics = list(_metrics(lines))
@@ -99,6 +99,9 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     sent.steps |= {line.kind: line.step for line in lines}
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
+    description = folder.description()
+    if description is not None and description.name != name:
+        store.client.update_run(sent.run_id, name=description.name)
     if status == "RUNNING" and seen != status:
         store.client.update_run(sent.run_id, status=status)
     elif status != seen:
@@ -106,8 +109,8 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     write_sent(folder, sent)
 
 
-def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], str]:
-    """Names of the parameters the run has, and its status; made if the store does not know it."""
+def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], str, str]:
+    """Its parameters' names, status and name; the run is made if the store does not know it."""
     from mlflow.exceptions import MlflowException
 
     if sent.run_id:
@@ -119,7 +122,7 @@ def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], st
         else:
             # A run deleted in the pages takes nothing more; a folder that goes on gets a new one.
             if run.info.lifecycle_stage == "active":
-                return set(run.data.params), str(run.info.status)
+                return set(run.data.params), str(run.info.status), str(run.info.run_name)
     description = folder.description()
     assert description is not None, f"{folder.path}: describe() comes before fill()"
     run = store.client.create_run(
@@ -129,7 +132,7 @@ def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], st
     sent.steps, sent.files, sent.profile = {}, {}, False
     # Written at once: a crash after this line must not leave a second run behind.
     write_sent(folder, sent)
-    return set(), str(run.info.status)
+    return set(), str(run.info.status), description.name
 
 
 def _send(store: Store, sent: Sent, entities: tuple[list[Any], list[Any], list[Any]]) -> None:

@@ -331,3 +331,11 @@ def test_configuration_builds(name: str, kind: type) -> None:
     if isinstance(tracker, MlflowTracking):
         assert tracker.uri == f"sqlite:///{Path('runs').resolve() / 'mlflow.db'}"
         assert tracker.artifact_uri == (Path("runs").resolve() / "mlartifacts").as_uri()
+
+
+def test_a_run_described_anew_is_renamed(runs_dir: Path) -> None:
+    folder = RunFolder(runs_dir / "renamed")
+    begin(folder, tracking(runs_dir))
+    tracker = tracking(runs_dir)
+    tracker.start(folder, "grbm sigma_div=4 seed=0", TAGS, PARAMS)
+    assert client(runs_dir).get_run(run_id(folder)).info.run_name == "grbm sigma_div=4 seed=0"
