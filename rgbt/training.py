@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config import build, flatten, run_key
+from rgbt.config import build, run_key
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.engine.checkpoint import State, load_checkpoint, load_weights
@@ -26,6 +26,7 @@ from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.maskers.masker import Masker
 from rgbt.metrics import names, scores
+from rgbt.naming import describe
 from rgbt.session import Session, evaluate, open_session, result_tables
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
@@ -81,32 +82,6 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     shown = asked if len(asked.name) > len(known.name) else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish()
-
-
-def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
-    """How the run is shown: "grbm sigma_div=2 seed=1", grouped with the same run of other seeds.
-
-    Only what differs from the experiment is named; keys are cut to their last part where that
-    says enough.
-    """
-    silent = ("experiment", "runs_dir", "tracking", "dataset.root", "name", "seed")
-    pairs = [item.lstrip("+").partition("=")[::2] for item in overrides]
-    changed = [(k, v) for k, v in pairs if k not in silent and not k.startswith("tracking.")]
-    ends = [key.rpartition(".")[2] for key, _ in changed]
-    clear = [end != "seed" and ends.count(end) == 1 for end in ends]
-    shown = [
-        f"{end if ok else key}={value}"
-        for (key, value), end, ok in zip(changed, ends, clear, strict=True)
-    ]
-    group = " ".join([config.name, *shown])
-    tags = {"rgbt.experiment": config.name, "rgbt.group": group, "rgbt.seed": str(config.seed)}
-    params = {
-        key: str(value)
-        for key, value in flatten(config).items()
-        # Paths and passwords of the tracker are no property of the run.
-        if not key.endswith("_target_") and not key.startswith("tracking.")
-    }
-    return Description(f"{group} seed={config.seed}", tags, params)
 
 
 def _say(text: str) -> None:

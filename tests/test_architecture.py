@@ -35,6 +35,7 @@ MEETING_PLACES = {
     "session.py",
     "stored.py",
     "training.py",
+    "naming.py",
     "__init__.py",
 }
 

@@ -429,7 +429,7 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
 def test_names_say_what_differs_and_groups_leave_the_seed_out() -> None:
     from omegaconf import OmegaConf
 
-    from rgbt.training import describe
+    from rgbt.naming import describe
 
     config = OmegaConf.create({"name": "grbm", "seed": 1})
     typed = ["+experiment=grbm", "seed=1", "runs_dir=x", "tracking=none", "masker.sigma_div=2"]

@@ -268,6 +268,9 @@ def test_weights_survive_evaluation_in_inference_mode() -> None:
     with torch.inference_mode():
         net.eval()(*images(1, 96, 64))
     net.train()(*images(2, 96, 64)).aux["mask_logits"].sum().backward()
+    trained = net.sem_seg_head.pixel_decoder.mask_features.weight.grad
+    assert trained is not None
+    assert trained.abs().sum() > 0
 
 
 def test_semantic_logits_by_hand() -> None:
