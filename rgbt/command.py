@@ -71,8 +71,7 @@ def _compose(config_name: str, job: Callable[[DictConfig], None]) -> None:
     # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Hydra's root logger shows the INFO lines of every library.
-    for library in ("matplotlib", "lightning_fabric", "lightning.fabric"):
-        logging.getLogger(library).setLevel(logging.WARNING)
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
     register_resolvers()
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
 

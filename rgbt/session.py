@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -86,6 +87,8 @@ def open_session(config: DictConfig) -> Session:
 
 
 def _fabric(trainer: TrainerSettings) -> Fabric:
+    # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     try:
         return Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
     except (RuntimeError, ValueError) as error:
