@@ -128,11 +128,21 @@ def _hydra_sentence(error: Exception) -> str:
     return f"{first}; see `python -m rgbt.run --help`."
 
 
-def _unknown_key(full_key: str) -> str:
+def _composed_without(full_key: str) -> DictConfig:
+    """The configuration that was asked for, but for the key that it does not know."""
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    others = [word for word in words if word.lstrip("+~").partition("=")[0] != full_key]
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose("config")
+        try:
+            return hydra.compose("config", others)
+        except HydraException:  # a second mistake, or the comma lists of a grid
+            return hydra.compose("config")
+
+
+def _unknown_key(full_key: str) -> str:
+    config = _composed_without(full_key)
     *parents, last = full_key.split(".")
-    node = config
+    node: object = config
     for parent in parents:
         node = node.get(parent) if isinstance(node, DictConfig) else None
     known = [str(key) for key in node if key != "_target_"] if isinstance(node, DictConfig) else []

@@ -24,9 +24,9 @@ from rgbt.engine.checkpoint import State, load_checkpoint, load_weights
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
-from rgbt.maskers.masker import Masker
 from rgbt.metrics import names, scores
 from rgbt.naming import describe
+from rgbt.randomness import torch_generator
 from rgbt.session import Session, evaluate, open_session, result_tables
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
@@ -35,7 +35,7 @@ from rgbt.tracking.pictures import Example, Legend, RegionHeat, draw_panel, draw
 from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.tables import ResultTables
 from rgbt.tracking.terminal import result_view, show
-from rgbt.types import Batch
+from rgbt.types import Batch, Masker
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
@@ -115,7 +115,9 @@ def prepare(config: DictConfig) -> Prepared:
     steps_per_epoch(session.dataset, session.loading)
     masker: Masker = build(config.masker)
     if session.transform.crop_hw is not None and not masker.hides_nothing:
-        masker.grid_hw(session.transform.crop_hw)
+        # One draw for nothing: cells that do not fit the crop are told before the run is begun.
+        centre = torch.zeros(1, 2, dtype=torch.int64)
+        masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
     if session.trainer.init_from is not None:
         source = Path(session.trainer.init_from)
         source = source / "best.pt" if source.is_dir() else source
