@@ -11,7 +11,7 @@ import hashlib
 import inspect
 import json
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -84,19 +84,7 @@ def check_node(node: DictConfig, path: str) -> None:
     Raises:
         InputError: missing or unknown target, unknown key, missing value, wrong type.
     """
-    target = _target(node, path)
-    parameters = inspect.signature(target).parameters
-    hints = _annotations(target)
-    for key, value in _items(node, path):
-        if key not in parameters:
-            raise InputError(
-                f"'{path}.{key}' is not a setting of {node['_target_']}; "
-                f"{nearest(key, [name for name in parameters if name in hints])}."
-            )
-        if isinstance(value, DictConfig) and "_target_" in value:
-            check_node(value, f"{path}.{key}")
-        else:
-            _check_value(f"{path}.{key}", value, hints.get(key, Any))
+    _typed(node, path, check_node)
 
 
 def build(node: DictConfig, **offered: Any) -> Any:
@@ -115,13 +103,7 @@ def build(node: DictConfig, **offered: Any) -> Any:
     """
     path = node._get_full_key(None) or "config"
     target = _target(node, path)
-    hints = _annotations(target)
-    values = {}
-    for key, value in _items(node, path):
-        nested = isinstance(value, DictConfig) and "_target_" in value
-        values[key] = (
-            build(value) if nested else _check_value(f"{path}.{key}", value, hints.get(key, Any))
-        )
+    values = _typed(node, path, lambda child, _: build(child))
     parameters = inspect.signature(target).parameters
     values |= {key: value for key, value in offered.items() if key in parameters}
     needed = [key for key, parameter in parameters.items() if parameter.default is parameter.empty]
@@ -153,14 +135,26 @@ def _canonical(node: DictConfig, path: str) -> dict[str, Any]:
     """Values as their constructors take them: 4 and 4.0 are one value where both mean 4.0."""
     from pydantic_core import to_jsonable_python
 
-    hints = _annotations(_target(node, path))
-    values: dict[str, Any] = {"_target_": node["_target_"]}
+    values = to_jsonable_python(_typed(node, path, _canonical))
+    return {"_target_": node["_target_"], **values}
+
+
+def _typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any]) -> dict[str, Any]:
+    """Values of a node as its constructor takes them; `nested` turns a node inside it into one."""
+    target = _target(node, path)
+    parameters = inspect.signature(target).parameters
+    hints = _annotations(target)
+    values = {}
     for key, value in _items(node, path):
+        if key not in parameters:
+            raise InputError(
+                f"'{path}.{key}' is not a setting of {node['_target_']}; "
+                f"{nearest(key, [name for name in parameters if name in hints])}."
+            )
         if isinstance(value, DictConfig) and "_target_" in value:
-            values[key] = _canonical(value, f"{path}.{key}")
+            values[key] = nested(value, f"{path}.{key}")
         else:
-            typed = _check_value(f"{path}.{key}", value, hints.get(key, Any))
-            values[key] = to_jsonable_python(typed)
+            values[key] = _check_value(f"{path}.{key}", value, hints.get(key, Any))
     return values
 
 
