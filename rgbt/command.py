@@ -9,7 +9,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
 
@@ -150,7 +150,7 @@ def _unknown_key(full_key: str) -> str:
 
 
 def plain_command(
-    own: dict[str, str | None], main: Callable[[dict[str, str], list[str]], int | None]
+    own: Mapping[str, str | None], main: Callable[[dict[str, str], list[str]], int | None]
 ) -> Callable[[], None]:
     """Make `main` a command on something stored: ``key=value`` arguments, no configuration file.
 
@@ -173,7 +173,7 @@ def plain_command(
     return entry
 
 
-def _split(own: dict[str, str | None], arguments: list[str]) -> tuple[dict[str, str], list[str]]:
+def _split(own: Mapping[str, str | None], arguments: list[str]) -> tuple[dict[str, str], list[str]]:
     values = {key: value for key, value in own.items() if value is not None}
     overrides = []
     for item in arguments:

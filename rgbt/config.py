@@ -29,6 +29,11 @@ NODES = (
     *("optimizer", "schedule", "trainer", "metric", "tracking"),
 )
 
+OF_THE_RUN: dict[str, dict[str, Any]] = {
+    "model": {"weights": str | None, "fresh": tuple[str, ...]},
+}
+"""Keys of a node that the run reads itself and the constructor does not take, by node."""
+
 NOT_IN_KEY = (
     *("name", "runs_dir", "out", "scale", "recipe", "tracking"),
     *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
@@ -117,9 +122,18 @@ def run_key(config: DictConfig) -> str:
     """12 hexadecimal digits that name the run: hash of the resolved configuration.
 
     Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method with
-    the same seed is the same run wherever it is started from.
+    the same seed is the same run wherever it is started from. A file of weights counts by what is
+    in it, not by where it lies.
+
+    Raises:
+        InputError: the file of weights is not there.
     """
     plain: dict[str, Any] = {"seed": config.seed}
+    source = weights_file(config)
+    if source is not None:
+        with source.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        plain["weights"] = [digest, *config.model.get("fresh", [])]
     plain |= {key: _canonical(config[key], key) for key in NODES}
     for dotted in NOT_IN_KEY:
         *parents, last = dotted.split(".")
@@ -129,6 +143,25 @@ def run_key(config: DictConfig) -> str:
         node.pop(last, None)
     text = json.dumps(plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def weights_file(config: DictConfig) -> Path | None:
+    """The file that `model.weights` names; of a run folder its best checkpoint. None: no weights.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    named = config.model.get("weights")
+    if named is None:
+        return None
+    path = Path(named).expanduser()
+    path = path / "best.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(
+            f"model.weights={named}: there is no file {path}; give a file of weights, or the "
+            "folder of a run."
+        )
+    return path
 
 
 def _canonical(node: DictConfig, path: str) -> dict[str, Any]:
@@ -146,6 +179,9 @@ def _typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any]
     hints = _annotations(target)
     values = {}
     for key, value in _items(node, path):
+        if key in OF_THE_RUN.get(path, {}):
+            _check_value(f"{path}.{key}", value, OF_THE_RUN[path][key])
+            continue
         if key not in parameters:
             raise InputError(
                 f"'{path}.{key}' is not a setting of {node['_target_']}; "

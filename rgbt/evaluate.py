@@ -1,4 +1,4 @@
-"""Evaluate a stored run: ``python -m rgbt.evaluate run=runs/<key> [modality=rgb]``.
+"""Evaluate a run, or weights from a file: ``python -m rgbt.evaluate run=runs/<key>``.
 
 Counts are written, and the tables that follow from them are shown.
 """
@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rgbt.checks import check_choice
 from rgbt.command import plain_command
 
 OWN = {
-    "run": None,
+    "run": "",
     "runs_dir": "runs",
     "split": "test",
-    "modality": "rgbt",
+    "modality": "default",
     "regions": "as trained",
     "checkpoint": "best",
     "out": "",
@@ -22,40 +21,39 @@ OWN = {
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Evaluate a run, on its own data set or another one.
+    """Evaluate a run, on its own data set or another one, or a network with weights from a file.
 
-    run       run folder, config key or MLflow run id
+    run       run folder, config key or MLflow run id; without one, name a network and its weights:
+              model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)
     split     split of the data set
-    modality  rgbt, or rgb / thermal to decode one branch alone
+    modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
     checkpoint  best (by validation mIoU) or last
     out       file of the counts; default: evaluations/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1
     """
-    from rgbt.engine.evaluate import MODALITIES
-    from rgbt.session import evaluate, result_tables
-    from rgbt.stored import find_run, open_run
+    from rgbt.session import evaluate, result_tables, view_of
+    from rgbt.stored import open_trained
     from rgbt.tracking.terminal import result_view, show
 
-    modality = arguments["modality"]
-    check_choice("modality", modality, MODALITIES)
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
-    folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
-    stored = open_run(folder, overrides, arguments["checkpoint"])
+    runs_dir = Path(arguments["runs_dir"])
+    stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
     session = stored.session
-    found = evaluate(session, session.model, arguments["split"], modality=modality)
+    view = view_of(session.model, arguments["modality"])
+    found = evaluate(session, session.model, arguments["split"], view=view)
     counts = found.counts
     stem = "_".join(
-        [session.dataset.name, counts.split, modality, counts.partition]
+        [session.dataset.name, counts.split, view, counts.partition]
         + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
     )
-    path = Path(arguments["out"] or folder / "evaluations" / f"{stem}.npz")
+    path = Path(arguments["out"] or stored.folder / f"{stem}.npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)
-    label = f"{session.config.name} {session.dataset.name} {modality}"
+    label = f"{stored.label} {session.dataset.name} {view}"
     tables = result_tables(counts, session.regions, label, stored.step)
-    show(result_view(tables, folder, [("counts", str(path))]))
+    show(result_view(tables, path.parent, [("counts", str(path))]))
     return 0
 
 

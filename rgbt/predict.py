@@ -1,4 +1,4 @@
-"""Predict images with a stored run: ``python -m rgbt.predict run=... input=... out=folder``.
+"""Predict images with a trained network: ``python -m rgbt.predict run=... input=... out=folder``.
 
 For every image a colour overlay and a PNG of class indices are written.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
@@ -17,30 +17,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rgbt.session import Session
-    from rgbt.types import Sample
+    from rgbt.types import Sample, View
 
-OWN = {"run": None, "input": None, "out": None, "runs_dir": "runs", "modality": "rgbt"}
+OWN = {"run": "", "input": None, "out": None, "runs_dir": "runs", "modality": "default"}
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """Write NAME_overlay.png and NAME.png (class indices, 0..K-1) for every input image.
 
-    run       run folder, config key or MLflow run id
+    run       run folder, config key or MLflow run id; without one, name a network and its weights:
+              model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)
     input     a 4-channel PNG (R, G, B, thermal), a folder of such, or a split of the data set
     out       folder, made where it is missing
-    modality  rgbt, or rgb / thermal to decode one branch alone
+    modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
     import numpy as np
 
-    from rgbt.engine.evaluate import MODALITIES
     from rgbt.engine.progress import progress
-    from rgbt.stored import find_run, open_run
+    from rgbt.session import view_of
+    from rgbt.stored import open_trained
     from rgbt.tracking.pictures import overlay
 
-    check_choice("modality", arguments["modality"], MODALITIES)
-    folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
-    session = open_run(folder, overrides).session
+    session = open_trained(arguments["run"], Path(arguments["runs_dir"]), overrides).session
+    view = view_of(session.model, arguments["modality"])
     samples, total = _samples(session, arguments["input"])
     out = Path(arguments["out"])
     if out.resolve() in (
@@ -54,7 +54,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     palette = np.array(session.dataset.palette, np.uint8)
     with progress() as display:
         task = display.add_task("predicting", total=total, note="images")
-        for sample, classes in _classes(session, samples, arguments["modality"]):
+        for sample, classes in _classes(session, samples, view):
             painted = overlay(sample.rgb, classes, palette)
             _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
             _write(out / f"{sample.name}.png", classes)
@@ -71,7 +71,7 @@ def _write(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _classes(
-    session: Session, samples: Iterable[Sample], modality: str
+    session: Session, samples: Iterable[Sample], view: View
 ) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
     from rgbt.data.batches import collate
     from rgbt.engine.evaluate import predictions
@@ -79,7 +79,7 @@ def _classes(
     for sample in samples:
         # One image at a time: a folder may hold images of any size.
         batch = collate([session.transform.test(sample)], "")
-        for found in predictions(session.model, [batch], session.fabric, modality):
+        for found in predictions(session.model, [batch], session.fabric, view):
             yield sample, found.classes[0].numpy()
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,8 +14,8 @@ from lightning_fabric import Fabric
 from omegaconf import DictConfig
 from torch import nn
 
-from rgbt.checks import InputError
-from rgbt.config import build
+from rgbt.checks import InputError, check_choice
+from rgbt.config import build, weights_file
 from rgbt.data.loaders import LoaderSettings, eval_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.engine.allocator import keep_memory
@@ -28,6 +29,7 @@ from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
 from rgbt.tracking.pictures import Example
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+from rgbt.types import VIEWS, View
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,11 @@ class Session:
 def open_session(config: DictConfig) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
-    Weights are drawn from (seed, "weights") without touching the global generator.
+    Weights are drawn from (seed, "weights") without touching the global generator; those that
+    `model.weights` names replace them.
+
+    Raises:
+        InputError: settings that do not fit each other, the machine or the file of weights.
     """
     keep_memory()
     trainer: TrainerSettings = build(config.trainer)
@@ -74,6 +80,12 @@ def open_session(config: DictConfig) -> Session:
             f"model.num_classes is {config.model.num_classes} but {dataset.name} has "
             f"{dataset.num_classes} classes; leave it to the data set."
         )
+    source = weights_file(config)
+    if source is not None:
+        from rgbt.weights.load import load_weights
+
+        report = load_weights(model, source, tuple(config.model.fresh))
+        sys.stderr.write(f"rgbt: {report.sentence()}\n")
     return Session(
         config=config,
         dataset=dataset,
@@ -98,6 +110,19 @@ def _fabric(trainer: TrainerSettings) -> Fabric:
         ) from error
 
 
+def view_of(model: nn.Module, modality: str) -> View:
+    """What `modality` asks of a network: one of its views; the first for "default".
+
+    Raises:
+        InputError: the network does not predict from it.
+    """
+    known: tuple[View, ...] = getattr(model, "views", VIEWS)
+    if modality == "default":
+        return known[0]
+    check_choice("modality", modality, known)
+    return cast(View, modality)
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Counts of one split, and the images that were asked to be kept.
@@ -118,7 +143,7 @@ def evaluate(
     model: nn.Module,
     split: str,
     *,
-    modality: str = "rgbt",
+    view: View | None = None,
     keep: Collection[str] = (),
 ) -> Evaluation:
     """Predict a split and count, with a progress bar.
@@ -127,7 +152,7 @@ def evaluate(
         session: see `open_session`.
         model: the network to evaluate; left in evaluation mode.
         split: name of the split.
-        modality: "rgbt", or one branch alone.
+        view: what is predicted from; None takes the network's first.
         keep: names of the images to return for pictures.
 
     Raises:
@@ -140,7 +165,7 @@ def evaluate(
     kept: list[Example] = []
     with progress() as display:
         task = display.add_task(split, total=len(dataset.names(split)), note="images")
-        for found in predictions(model, batches, session.fabric, modality):
+        for found in predictions(model, batches, session.fabric, view):
             triples = zip(found.batch.name, found.batch.label, found.classes, strict=True)
             for name, label, classes in triples:
                 counted[name] = counter(label, classes)

@@ -1,4 +1,4 @@
-"""A run that lies in its folder, opened again: its configuration and its weights."""
+"""A run opened again from its folder, or a network opened with weights from a file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config import check, conf_dir, flatten, register_resolvers
+from rgbt.config import check, conf_dir, flatten, register_resolvers, run_key, weights_file
 from rgbt.engine.checkpoint import load_checkpoint, load_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
@@ -27,15 +27,54 @@ CHANGEABLE = (
 
 @dataclass(frozen=True)
 class Stored:
-    """A stored run, opened.
+    """A trained network, opened.
 
     Attributes:
-        session: its objects; the network holds the weights of the checkpoint.
-        step: the optimiser step at which these were reached.
+        session: its objects; the network holds the trained weights.
+        step: the optimiser step at which these were reached; 0 where the file does not say.
+        folder: where what is made from it is put unless another place is named.
+        label: what it is called in tables.
     """
 
     session: Session
     step: int
+    folder: Path
+    label: str
+
+
+def open_trained(
+    run: str, runs_dir: Path, overrides: list[str], checkpoint: str = "best"
+) -> Stored:
+    """What ``run=`` names; without, the network of `overrides` with `model.weights`.
+
+    Args:
+        run: folder, config key or MLflow run id; "" for none.
+        runs_dir: where runs lie.
+        overrides: of the stored configuration, or (without a run) of the configuration at
+            scale=paper, such as model=mfnet model.weights=final.pth dataset.root=/data/MFNet.
+        checkpoint: "best" or "last" of a run.
+
+    Raises:
+        InputError: no such run; no weights; settings that do not fit.
+    """
+    if run:
+        return open_run(find_run(run, runs_dir), overrides, checkpoint)
+    config = _composed(["scale=paper", f"runs_dir={runs_dir}", *overrides])
+    check(config)
+    source = weights_file(config)
+    if source is None:
+        raise InputError(
+            "run has no value; give one with run=..., or a network with weights from a file: "
+            "model=mfnet model.weights=final.pth dataset.root=/data/MFNet."
+        )
+    folder = runs_dir / "evaluations" / run_key(config)
+    return Stored(open_session(config), 0, folder, source.name)
+
+
+def _composed(overrides: list[str]) -> DictConfig:
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", overrides)
 
 
 def find_run(run: str, runs_dir: Path) -> Path:
@@ -72,7 +111,7 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"
     _override(config, [_pair(item) for item in overrides])
-    config.trainer.init_from = None
+    config.model.weights = None  # the checkpoint holds them all
     check(config)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     weights = folder / f"{checkpoint}.pt"
@@ -86,7 +125,8 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
                 f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
             )
     load_weights(session.model, payload["model"], weights)
-    return Stored(session, payload["step"] if checkpoint == "best" else payload["state"]["step"])
+    step = payload["step"] if checkpoint == "best" else payload["state"]["step"]
+    return Stored(session, step, folder / "evaluations", config.name)
 
 
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
@@ -99,8 +139,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     groups = [key for key, _ in pairs if key in GROUPS]
     for group in groups:
         own = [f"{key}={value}" for key, value in pairs if key.split(".")[0] == group]
-        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            composed = hydra.compose("config", own)[group]
+        composed = _composed(own)[group]
         for name in OmegaConf.missing_keys(composed):
             raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)

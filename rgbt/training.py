@@ -118,14 +118,11 @@ def prepare(config: DictConfig) -> Prepared:
         # One draw for nothing: cells that do not fit the crop are told before the run is begun.
         centre = torch.zeros(1, 2, dtype=torch.int64)
         masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
-    if session.trainer.init_from is not None:
-        source = Path(session.trainer.init_from)
-        source = source / "best.pt" if source.is_dir() else source
-        load_weights(session.model, load_checkpoint(source)["model"], source)
-    elif config.optimizer.get("backbone_multiplier", 1.0) < 1.0:
+    no_weights = config.model.weights is None
+    if no_weights and config.optimizer.get("backbone_multiplier", 1.0) < 1.0:
         _say(
             "the backbone starts from random weights with a learning rate meant for pretrained "
-            "ones; name a checkpoint with trainer.init_from=..., or expect less than published."
+            "ones; name a file with model.weights=..., or expect less than published."
         )
     builder = build(config.optimizer)
     model, optimizer = session.fabric.setup(session.model, builder(session.model))

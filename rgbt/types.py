@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -19,6 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 IGNORE = 255
+
+View = Literal["rgbt", "rgb", "thermal"]
+"""What a prediction is made from: both images, or one alone."""
+
+VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
 GeneratorOf = Callable[[str], torch.Generator]
 """purpose -> generator; the same purpose in the same step always gives the same draws."""
@@ -111,6 +116,31 @@ class Phase(NamedTuple):
 
     optimizer: str
     parts: dict[str, Tensor]
+
+
+class Network(Protocol):
+    """A segmentation network, an `nn.Module` (see `rgbt.models`).
+
+    Attributes:
+        num_classes: K.
+        views: what it can predict from; the first is what it is evaluated with unless told
+            otherwise.
+    """
+
+    num_classes: int
+    views: tuple[View, ...]
+
+    def __call__(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores for images (N, 3, H, W) and (N, 1, H, W) in [0, 1]; () = the first view."""
+        ...
 
 
 class Masker(Protocol):

@@ -409,7 +409,7 @@ def test_a_checkpoint_of_another_model_is_refused(call: Call, data: Path, tmp_pa
     folder = only_run(tmp_path / "runs")
     code, _, err = train(
         *(call, data, tmp_path / "other", "+experiment=crm", "model.num_queries=7"),
-        *(f"trainer.init_from={folder}", *short(1)),
+        *(f"model.weights={folder}", *short(1)),
     )
     assert code == 2
     assert_one_sentence(err, "is a checkpoint of another model")

@@ -2,7 +2,7 @@
 
 Which checkpoint is taken when a run starts, first match wins:
 1. ``last.pt`` of the run folder (the run continues);
-2. `trainer.init_from` (weights only);
+2. `model.weights` (read by `rgbt.weights`);
 3. fresh weights.
 """
 

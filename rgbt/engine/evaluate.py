@@ -10,9 +10,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.types import Batch
-
-MODALITIES = ("rgbt", "rgb", "thermal")
+from rgbt.types import Batch, View
 
 
 class Prediction(NamedTuple):
@@ -26,7 +24,7 @@ def predictions(
     model: nn.Module,
     batches: Iterable[Batch],
     fabric: Fabric,
-    modality: str = "rgbt",
+    view: View | None = None,
 ) -> Iterator[Prediction]:
     """Class maps at the resolution of the labels, batch by batch.
 
@@ -37,13 +35,14 @@ def predictions(
         model: a network; put into evaluation mode here and left in it.
         batches: from `rgbt.data.loaders.eval_batches`.
         fabric: device and precision.
-        modality: "rgbt", or "rgb" / "thermal" to decode one branch alone.
+        view: what is predicted from; None leaves it to the network.
     """
     model.eval()
+    asked = {} if view is None else {"views": (view,)}
     for batch in batches:
         moved = batch.to(fabric.device)
         with torch.inference_mode(), fabric.autocast():
-            output = model(moved.rgb, moved.thermal, views=(modality,))
+            output = model(moved.rgb, moved.thermal, **asked)
             scores = output.logits.float()
             label_hw = batch.label.shape[-2:]
             if scores.shape[-2:] != label_hw:

@@ -22,7 +22,8 @@ class AdamW:
 
     Attributes:
         lr: learning rate of everything outside the backbone, > 0.
-        backbone_multiplier: factor of `lr` for parameters whose name starts with "backbone.".
+        backbone_multiplier: factor of `lr` for the parameters that the network counts as
+            pretrained (the prefixes of names in its attribute `pretrained_parts`).
         weight_decay: for every parameter except affine parameters of normalisations, embeddings
             and relative position tables, which get 0.
         betas: exponential decay rates of the two moments.
@@ -68,12 +69,13 @@ def parameter_groups(
     """
     groups: dict[tuple[float, bool], list[nn.Parameter]] = {}
     seen: set[int] = set()
+    pretrained: tuple[str, ...] = getattr(model, "pretrained_parts", ())
     for module_name, module in model.named_modules():
         for name, parameter in module.named_parameters(recurse=False):
             if id(parameter) in seen or not parameter.requires_grad:
                 continue
             seen.add(id(parameter))
             decayed = not isinstance(module, (*NORMS, nn.Embedding)) and name not in UNDECAYED_NAMES
-            in_backbone = module_name == "backbone" or module_name.startswith("backbone.")
+            in_backbone = f"{module_name}.{name}".lstrip(".").startswith(pretrained)
             groups.setdefault((backbone_lr if in_backbone else lr, decayed), []).append(parameter)
     return groups

@@ -24,7 +24,6 @@ class TrainerSettings:
         accelerator: "auto" takes a GPU where there is one.
         threads: CPU threads; null leaves torch's choice.
         selection_split: split whose mIoU picks the best checkpoint. Released: "test".
-        init_from: checkpoint file, or run folder (its best checkpoint), to start the weights from.
     """
 
     max_steps: int
@@ -37,7 +36,6 @@ class TrainerSettings:
     accelerator: Literal["auto", "cpu", "cuda", "mps"]
     threads: int | None
     selection_split: str
-    init_from: str | None
 
     def __post_init__(self) -> None:
         for name in ("max_steps", "eval_every", "checkpoint_every", "log_every", "accumulate"):

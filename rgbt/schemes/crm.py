@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.types import Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
+from rgbt.types import VIEWS, Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
 
-VIEWS = ("rgbt", "rgb", "thermal")
 Distillation = Callable[..., Tensor]
 
 
@@ -39,7 +38,8 @@ class CRM:
         nonlocal_weight: w_n. 1 in the release.
 
     Raises:
-        InputError: distillation asked for without a masked pass.
+        InputError: distillation asked for without a masked pass; a network that does not predict
+            from each image alone.
     """
 
     def __init__(  # noqa: PLR0913 - three collaborators, three published weights
@@ -59,6 +59,11 @@ class CRM:
                 "scheme=crm distils from a masked pass, but the masker hides nothing; choose "
                 "a masker (masker=crm) or set scheme.complementary_weight and "
                 "scheme.nonlocal_weight to 0."
+            )
+        if not set(VIEWS) <= set(getattr(model, "views", ())):
+            raise InputError(
+                "scheme=crm trains a network that predicts from RGB-T, RGB and thermal features "
+                "in one pass, as model=mask2former_* does; for others choose scheme=supervised."
             )
         self.model = model
         self.loss = loss

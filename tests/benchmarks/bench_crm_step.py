@@ -26,10 +26,12 @@ from torch import Tensor
 
 from rgbt.config import build, conf_dir, register_resolvers
 from rgbt.engine.allocator import keep_memory
-from rgbt.geometry import pad_to, padded_hw
+from rgbt.geometry import STRIDE, padded_hw
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.set_criterion import SetCriterion
-from rgbt.models.mask2former.model import Mask2Former, expand_to_tokens
+from rgbt.models.inputs import expand_cells
+from rgbt.models.mask2former.model import Mask2Former
+from rgbt.models.mask2former.swin import PATCH
 from rgbt.types import Batch, MaskPair, Output
 from tests.benchmarks.reference_criterion import Replayed, reference_criterion
 
@@ -98,13 +100,9 @@ def reference_loss(
     network: Mask2Former, criterion: SetCriterion, batch: Batch, masks: MaskPair, draws: Replayed
 ) -> Tensor:
     full_hw = padded_hw((batch.rgb.shape[-2], batch.rgb.shape[-1]))
-    mean, std = network.pixel_mean, network.pixel_std
-    images = (
-        pad_to((batch.rgb - mean[:3]) / std[:3], full_hw),
-        pad_to((batch.thermal - mean[3:]) / std[3:], full_hw),
-    )
+    images = network.inputs(batch.rgb, batch.thermal, multiple=STRIDE)
     outputs = []
-    for hidden in (None, expand_to_tokens(masks, len(batch.rgb), full_hw)):
+    for hidden in (None, expand_cells(masks, len(batch.rgb), full_hw, PATCH)):
         features = network.backbone(images, hidden, views=VIEWS)
         for view in range(3):
             outputs.append(network.sem_seg_head([level.chunk(3)[view] for level in features]))

@@ -30,7 +30,6 @@ SETTINGS = {
     "accelerator": "cpu",
     "threads": None,
     "selection_split": "val",
-    "init_from": None,
 }
 
 
@@ -183,6 +182,7 @@ def test_schedule_values() -> None:
 def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings() -> None:
     model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
     model["query"] = nn.Embedding(3, 2)
+    model.pretrained_parts = ("backbone.",)
     builder = AdamW(lr=1.0, backbone_multiplier=0.1, weight_decay=0.5, betas=(0.9, 0.999), eps=1e-8)
     groups = builder(model).param_groups
     found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}

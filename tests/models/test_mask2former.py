@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import inspect
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
+from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.model import Mask2Former, semantic_logits
 from rgbt.types import MaskPair
+from tests.models.golden import network
 
-CONF = Path(__file__).resolve().parents[2] / "conf" / "model"
 ALL_VIEWS = ("rgbt", "rgb", "thermal")
 NANO = {
     "num_classes": 4,
@@ -35,24 +33,23 @@ NANO = {
     "decoder_ffn_dim": 16,
     "attention_heads": 2,
     "pixel_decoder_fp32": True,
-    "pixel_mean": (123.675, 116.28, 103.53, 127.0),
-    "pixel_std": (58.395, 57.12, 57.375, 60.0),
 }
+MEAN = (123.675, 116.28, 103.53, 127.0)
+STD = (58.395, 57.12, 57.375, 60.0)
 
 
 def nano(**changes: Any) -> Mask2Former:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return Mask2Former(**{**NANO, **changes})
-
-
-def from_yaml(name: str) -> dict[str, Any]:
-    node = OmegaConf.load(CONF / f"{name}.yaml")
-    node.num_classes = 9
-    values = OmegaConf.to_container(node)
-    assert isinstance(values, dict)
-    assert values.pop("_target_") == "rgbt.models.mask2former.model.Mask2Former"
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        inputs = Inputs(
+            rgb_order="rgb",
+            rgb_mean=MEAN[:3],
+            rgb_std=STD[:3],
+            thermal_mean=MEAN[3:],
+            thermal_std=STD[3:],
+            thermal_scale="fixed",
+        )
+        return Mask2Former(**{**NANO, "inputs": inputs, **changes})
 
 
 def images(count: int, height: int = 64, width: int = 96, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -88,7 +85,7 @@ def test_padding_is_the_mean_colour() -> None:
     """60 x 84 equals 64 x 96 with the missing pixels set to the mean."""
     net = nano().eval()
     rgb, thermal = images(1, 60, 84)
-    mean = torch.tensor(NANO["pixel_mean"]).view(4, 1, 1) / 255
+    mean = torch.tensor(MEAN).view(4, 1, 1) / 255
     full_rgb, full_thermal = mean[:3].repeat(1, 1, 64, 96), mean[3:].repeat(1, 1, 64, 96)
     full_rgb[..., :60, :84], full_thermal[..., :60, :84] = rgb, thermal
     small, full = net(rgb, thermal), net(full_rgb, full_thermal)
@@ -206,11 +203,15 @@ def test_training_without_generator_raises() -> None:
     assert nano(drop_path_rate=0.1).eval()(*images(1)).logits is not None
 
 
+def test_without_a_view_the_fused_features_are_decoded() -> None:
+    net = nano().eval()
+    torch.testing.assert_close(net(*images(1)).logits, net(*images(1), views=("rgbt",)).logits)
+
+
 @pytest.mark.parametrize(
     "call",
     [
         {"passes": 2},
-        {"views": ()},
         {"views": ("rgb", "rgb")},
         {"views": ("infrared",)},
         {"masks": cells(2)},
@@ -283,19 +284,13 @@ def test_semantic_logits_by_hand() -> None:
     torch.testing.assert_close(scores[0, 1], torch.full((5, 6), 3 / 8))
 
 
-@pytest.mark.parametrize("name", ["tiny", "swin_t", "swin_s", "swin_b"])
-def test_yaml_names_every_argument(name: str) -> None:
-    wanted = set(inspect.signature(Mask2Former).parameters)
-    assert set(from_yaml(f"mask2former_{name}")) == wanted
-
-
 @pytest.mark.parametrize(
     ("name", "millions", "backbone"),
     [("swin_t", 74.92, 55.04), ("swin_s", 117.56, 97.68), ("swin_b", 193.50, 173.49)],
 )
 def test_published_parameter_counts(name: str, millions: float, backbone: float) -> None:
     with torch.device("meta"):
-        net = Mask2Former(**from_yaml(f"mask2former_{name}"))
+        net = network(f"mask2former_{name}")
     assert round(count(net) / 1e6, 2) == millions
     assert round(count(net.backbone) / 1e6, 2) == backbone
 
@@ -303,7 +298,7 @@ def test_published_parameter_counts(name: str, millions: float, backbone: float)
 @pytest.mark.parametrize(("start", "millions"), [(0, 27.53), (2, 29.02), (4, 55.04)])
 def test_shared_stages(start: int, millions: float) -> None:
     with torch.device("meta"):
-        net = Mask2Former(**{**from_yaml("mask2former_swin_t"), "share_start": start})
+        net = network("mask2former_swin_t", share_start=start)
     assert round(count(net.backbone) / 1e6, 2) == millions
     # Released: 693 entries at any value; 24 index tables and the class weights are not kept here.
     assert len(net.state_dict()) == 693 - 24 - 1
@@ -312,7 +307,7 @@ def test_shared_stages(start: int, millions: float) -> None:
 def test_optimiser_groups_follow_from_types_and_names() -> None:
     """Sizes of the released groups for Swin-T: (learning rate, weight decay) -> numbers."""
     with torch.device("meta"):
-        net = Mask2Former(**from_yaml("mask2former_swin_t"))
+        net = network("mask2former_swin_t")
     undecayed = (nn.LayerNorm, nn.BatchNorm2d, nn.GroupNorm, nn.Embedding)
     groups: dict[tuple[float, float], list[int]] = {}
     for module_name, module in net.named_modules():

@@ -6,59 +6,19 @@ filled by a stated rule); skipped where it is missing.
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import os
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from rgbt.models.mask2former.backbone import LEVELS
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.types import MaskPair
+from tests.models.golden import check_all, fill_network, load, network, requires_golden
 
-ROOT = Path(__file__).resolve().parents[2]
-GOLDEN = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "golden"
-NOT_OURS = ("relative_position_index", "criterion.empty_weight")
 HEADS = {"rgbt": "", "rgb": "rgb_head.", "thermal": "thermal_head."}
-
-pytestmark = pytest.mark.skipif(
-    not (GOLDEN / "fill.py").exists(), reason="reference material is not here"
-)
-
-
-def load_fill() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("golden_fill", GOLDEN / "fill.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def filled(name: str, fill: ModuleType) -> Mask2Former:
-    """The network of a YAML with every tensor filled under its released name."""
-    values = OmegaConf.load(ROOT / "conf" / "model" / f"mask2former_{name}.yaml")
-    values.num_classes = 9
-    arguments = OmegaConf.to_container(values)
-    assert isinstance(arguments, dict)
-    del arguments["_target_"]
-    net = Mask2Former(
-        **{k: tuple(v) if isinstance(v, list) else v for k, v in arguments.items()}
-    ).eval()
-    state = {
-        key: torch.from_numpy(fill.fill(f"network.{key}", value.shape))
-        for key, value in net.state_dict().items()
-        if value.is_floating_point()
-    }
-    net.load_state_dict(state, strict=False)
-    return net
 
 
 def record(net: Mask2Former) -> dict[str, Tensor]:
@@ -113,14 +73,16 @@ def pyramid(net: Mask2Former, out: Any) -> dict[str, Tensor]:
     return named
 
 
-def all_outputs(net: Mask2Former, image: Tensor, hidden: MaskPair) -> dict[str, Tensor]:
+def all_outputs(
+    net: Mask2Former, image: tuple[Tensor, Tensor], hidden: MaskPair
+) -> dict[str, Tensor]:
     """Every tensor of one clean and one masked forward of each view."""
     seen = record(net)
     found: dict[str, Tensor] = {}
     logits = {}
     for prefix, masks in (("", None), ("masked.", hidden)):
         for view, head in HEADS.items():
-            out = net(image[:, :3], image[:, 3:], masks, views=(view,))
+            out = net(*image, masks, views=(view,))
             classes, mask_logits = out.aux["class_logits"][:, 0], out.aux["mask_logits"][:, 0]
             for layer in range(10):
                 name = f"aux.{layer}." if layer < 9 else ""
@@ -144,29 +106,14 @@ def all_outputs(net: Mask2Former, image: Tensor, hidden: MaskPair) -> dict[str, 
     return found
 
 
+@requires_golden
 @pytest.mark.parametrize("name", ["swin_t", pytest.param("swin_s", marks=pytest.mark.slow)])
 def test_every_recorded_tensor(name: str) -> None:
-    fill = load_fill()
-    facts = json.loads((GOLDEN / f"crm_{name}.json").read_text())
-    with np.load(GOLDEN / f"crm_{name}.npz") as archive:
-        expected = dict(archive)
-    net = filled(name, fill)
-    names = {key for key in facts["keys"] if not key.endswith(NOT_OURS)}
-    assert {f"network.{key}" for key in net.state_dict()} == names
-    image = torch.from_numpy(expected["image_uint8"]).float()[None] / 255
-    hidden = torch.from_numpy(expected["mask_pair"]).bool()[:, :, 0]
+    golden = load(f"crm_{name}")
+    net = network(f"mask2former_{name}").eval()
+    fill_network(net, golden, prefix="network.")
+    hidden = torch.from_numpy(golden.arrays["mask_pair"]).bool()[:, :, 0]
     with torch.no_grad():
-        found = all_outputs(net, image, MaskPair(hidden[:, 0], hidden[:, 1]))
-
-    wrong, compared = {}, set(facts["outputs"]) - {"mask_pair", "argmax"}
-    assert compared <= set(found), compared - set(found)
-    for key in sorted(compared):
-        about, value = facts["outputs"][key], found[key].contiguous().numpy()
-        assert list(value.shape) == about["shape"], key
-        if about["stored"] == "sampled":
-            value = value.ravel()[fill.sample_positions(key, value.size, about["count"])]
-        difference = float(np.abs(value - expected[key]).max())
-        if not difference <= about["tol_abs"]:
-            wrong[key] = (difference, about["tol_abs"])
-    assert wrong == {}
-    assert np.array_equal(found["sem_seg"].argmax(0).numpy(), expected["argmax"])
+        found = all_outputs(net, golden.image, MaskPair(hidden[:, 0], hidden[:, 1]))
+    check_all(golden, found)
+    assert np.array_equal(found["sem_seg"].argmax(0).numpy(), golden.arrays["argmax"])

@@ -33,6 +33,8 @@ def generator_of(purpose: str) -> torch.Generator:
 class Numbered:
     """Pass p predicts class logits that are all p; remembers how it was called."""
 
+    views = ("rgbt", "rgb", "thermal")
+
     def __call__(self, rgb, thermal, masks=None, *, passes=1, views=("rgbt",), generator=None):
         self.call = {"n": len(rgb), "masks": masks, "passes": passes, "views": views}
         count = passes * len(views)
@@ -130,3 +132,19 @@ def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:
     supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves())
     list(supervised.phases(batch(), generator_of))
     assert supervised.model.call["masks"].rgb.shape == (B, 2, 2)
+
+
+def test_crm_is_refused_for_a_network_of_one_view() -> None:
+    single = Numbered()
+    single.views = ("rgbt",)
+    with pytest.raises(InputError, match="scheme=supervised"):
+        CRM(
+            model=single,
+            loss=OneEach(),
+            masker=Halves(),
+            sdc=sdc,
+            sdn=sdn,
+            modality_weight=1.0,
+            complementary_weight=1.0,
+            nonlocal_weight=1.0,
+        )

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.models.mask2former.swin import Stage, Swin, SwinShape
-from rgbt.types import MaskPair
+from rgbt.types import MaskPair, View
 
-View = Literal["rgbt", "rgb", "thermal"]
-VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 LEVELS = ("res2", "res3", "res4", "res5")
 
 
@@ -26,17 +24,23 @@ class RgbtBackbone(nn.Module):
         share_start: stages from this index on (0..4) are the RGB branch's own in both branches;
             embedding, output normalisations and mask token never are. 4 shares nothing.
         fusion: "max" or "add".
+        thermal_channels: of the thermal image.
     """
 
     def __init__(
-        self, shape: SwinShape, *, share_start: int, fusion: Literal["max", "add"]
+        self,
+        shape: SwinShape,
+        *,
+        share_start: int,
+        fusion: Literal["max", "add"],
+        thermal_channels: int,
     ) -> None:
         super().__init__()
         self.fuse = torch.maximum if fusion == "max" else torch.add
         self.RGB_branch = Swin(3, shape=shape, shared={})
         stages = {i: s for i, s in enumerate(self.RGB_branch.layers) if isinstance(s, Stage)}
         shared = {index: stage for index, stage in stages.items() if index >= share_start}
-        self.THR_branch = Swin(1, shape=shape, shared=shared)
+        self.THR_branch = Swin(thermal_channels, shape=shape, shared=shared)
         self.norm_layers = nn.ModuleDict(
             {
                 level: nn.BatchNorm2d(width)
@@ -56,7 +60,7 @@ class RgbtBackbone(nn.Module):
         """Features of all views as one batch; a branch that no view needs is not run.
 
         Args:
-            images: (N, 3, H, W) and (N, 1, H, W) normalised, sides multiples of 32.
+            images: (N, 3, H, W) and (N, c, H, W) normalised, sides multiples of 32.
             hidden: per token, (N, H/4, W/4) bool each; None: nothing is hidden.
             passes: N holds this many stacked copies of a batch; the fusion's batch normalisation
                 takes them one after the other, so that each is normalised on its own.

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice, check_range, check_shape
-from rgbt.geometry import pad_to, padded_hw
-from rgbt.models.mask2former.backbone import VIEWS, RgbtBackbone, View
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.geometry import STRIDE, padded_hw
+from rgbt.models.inputs import Inputs, expand_cells
+from rgbt.models.mask2former.backbone import RgbtBackbone
 from rgbt.models.mask2former.decoder import Predictions, Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
-from rgbt.types import MaskPair, Output
+from rgbt.types import VIEWS, MaskPair, Output, View
 
 
 class Head(nn.Module):
@@ -55,12 +56,11 @@ class Mask2Former(nn.Module):
         decoder_ffn_dim: width of their feed-forward networks.
         attention_heads: heads of both decoders.
         pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
-        pixel_mean: of R, G, B, thermal, in 0..255.
-        pixel_std: of R, G, B, thermal, in 0..255.
+        inputs: normalisation of the images.
     """
 
-    pixel_mean: Tensor
-    pixel_std: Tensor
+    views: tuple[View, ...] = VIEWS
+    pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -82,15 +82,19 @@ class Mask2Former(nn.Module):
         decoder_ffn_dim: int,
         attention_heads: int,
         pixel_decoder_fp32: bool,
-        pixel_mean: tuple[float, float, float, float],
-        pixel_std: tuple[float, float, float, float],
+        inputs: Inputs,
     ) -> None:
         super().__init__()
         shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
         _check(shape, share_start, fusion, hidden_dim, attention_heads)
         self.num_classes = num_classes
         self.drop_path_rate = drop_path_rate
-        self.backbone = RgbtBackbone(shape, share_start=share_start, fusion=fusion)
+        self.backbone = RgbtBackbone(
+            shape,
+            share_start=share_start,
+            fusion=fusion,
+            thermal_channels=inputs.thermal_channels,
+        )
         pixel_decoder = PixelDecoder(
             shape.widths,
             hidden_dim=hidden_dim,
@@ -108,9 +112,7 @@ class Mask2Former(nn.Module):
             ffn_dim=decoder_ffn_dim,
         )
         self.sem_seg_head = Head(pixel_decoder, predictor)
-        for name, values in (("pixel_mean", pixel_mean), ("pixel_std", pixel_std)):
-            scaled = torch.tensor(values).view(4, 1, 1) / 255
-            self.register_buffer(name, scaled, persistent=False)
+        self.inputs = inputs
 
     def forward(
         self,
@@ -119,7 +121,7 @@ class Mask2Former(nn.Module):
         masks: MaskPair | None = None,
         *,
         passes: int = 1,
-        views: tuple[View, ...] = ("rgbt",),
+        views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,
     ) -> Output:
         """Predictions of every view and pass, as one batch through the head.
@@ -132,7 +134,7 @@ class Mask2Former(nn.Module):
             passes: stacked copies of one batch. The fusion's batch normalisation sees them one
                 after the other, as successive calls would show them.
             views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
-                "thermal". A branch that no view needs is not computed.
+                "thermal". None named: "rgbt". A branch that no view needs is not computed.
             generator: draws stochastic depth, per sample and branch; needed in training mode
                 unless `drop_path_rate` is 0.
 
@@ -149,44 +151,26 @@ class Mask2Former(nn.Module):
             ValueError: shapes, passes or views that do not fit; no generator where one is needed.
             InputError: mask cells that do not divide the padded image.
         """
-        sizes = self._check_inputs(rgb, thermal, passes, views)
+        views = views or self.views[:1]
+        _check_passes(len(rgb), passes, views)
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 needs `generator`, got None.")
-        image_hw = sizes["H"], sizes["W"]
+        image_hw = rgb.shape[2], rgb.shape[3]
         full_hw = padded_hw(image_hw)
-        mean, std = self.pixel_mean, self.pixel_std
-        images = (
-            pad_to((rgb - mean[:3]) / std[:3], full_hw),
-            pad_to((thermal - mean[3:]) / std[3:], full_hw),
-        )
-        hidden = None if masks is None else expand_to_tokens(masks, sizes["N"], full_hw)
+        images = self.inputs(rgb, thermal, multiple=STRIDE)
+        hidden = None if masks is None else expand_cells(masks, len(rgb), full_hw, PATCH)
         features = self.backbone(images, hidden, passes=passes, views=views, generator=generator)
 
         classes, mask_logits = self.sem_seg_head(features)
         logits = None
         if not self.training and len(views) * passes == 1:
             logits = semantic_logits(classes[-1], mask_logits[-1], image_hw, full_hw)
-        stacked = (len(views) * passes, sizes["N"] // passes)
+        stacked = (len(views) * passes, len(rgb) // passes)
         aux = {
             "class_logits": classes.unflatten(1, stacked),
             "mask_logits": mask_logits.unflatten(1, stacked),
         }
         return Output(logits, aux)
-
-    def _check_inputs(
-        self, rgb: Tensor, thermal: Tensor, passes: int, views: tuple[View, ...]
-    ) -> dict[str, int]:
-        sizes = check_shape("rgb", rgb, "N C H W", C=3)
-        check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
-        if passes < 1 or sizes["N"] % passes:
-            raise ValueError(f"{sizes['N']} images are not {passes} stacked passes of one batch.")
-        if not views or len(set(views)) < len(views):
-            raise ValueError(
-                f"views must name each view at most once and at least one, got {views}."
-            )
-        for view in views:
-            check_choice("view", view, VIEWS)
-        return sizes
 
 
 def semantic_logits(
@@ -217,28 +201,13 @@ def semantic_logits(
         return scores.view(*scores.shape[:2], *image_hw)
 
 
-def expand_to_tokens(masks: MaskPair, count: int, image_hw: tuple[int, int]) -> MaskPair:
-    """Cells to tokens of 4 x 4 pixels, (N, H/4, W/4) bool each."""
-    rgb, thermal = (
-        _expand(name, mask, count, image_hw)
-        for name, mask in zip(MaskPair._fields, masks, strict=True)
-    )
-    return MaskPair(rgb, thermal)
-
-
-def _expand(name: str, mask: Tensor, count: int, image_hw: tuple[int, int]) -> Tensor:
-    sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
-    grid = sizes["h"], sizes["w"]
-    cell = image_hw[0] // grid[0]
-    if cell % PATCH or (grid[0] * cell, grid[1] * cell) != image_hw:
-        raise InputError(
-            f"masker: a grid of {grid[0]} x {grid[1]} cells does not divide the padded image of "
-            f"{image_hw[0]} x {image_hw[1]} pixels into squares of a multiple of {PATCH} pixels "
-            f"(patch size {image_hw[0] / grid[0]:g} x {image_hw[1] / grid[1]:g}); choose a "
-            "masker.patch_size that divides both sides."
-        )
-    repeat = cell // PATCH
-    return mask.repeat_interleave(repeat, 1).repeat_interleave(repeat, 2)
+def _check_passes(count: int, passes: int, views: tuple[View, ...]) -> None:
+    if passes < 1 or count % passes:
+        raise ValueError(f"{count} images are not {passes} stacked passes of one batch.")
+    if len(set(views)) < len(views):
+        raise ValueError(f"views must name each view at most once, got {views}.")
+    for view in views:
+        check_choice("view", view, VIEWS)
 
 
 def _check(shape: SwinShape, share_start: int, fusion: str, hidden: int, heads: int) -> None:

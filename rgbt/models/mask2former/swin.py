@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.windows import relative_index, shift_mask
+from rgbt.models.stochastic import keep_factors
 
 PATCH = 4
 
@@ -258,18 +259,6 @@ class Swin(nn.Module):
         return maps
 
     def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Factors 0 or 1/p of every residual of every sample, p falling from 1 to 1 - rate.
-
-        Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
-
-        Returns:
-            (blocks, 2, N, 1, 1, 1) float32 on the device of `x`.
-        """
-        if generator is None:
-            raise ValueError("stochastic depth needs a generator in training mode, got None.")
-        blocks = sum(self.shape.depths)
-        probability = 1 - torch.linspace(0, self.shape.drop_path_rate, blocks).view(-1, 1, 1)
-        draw = torch.rand(blocks, 2, len(x), generator=generator, device=generator.device)
-        probability = probability.to(draw.device)
-        factor = (draw < probability) / probability
-        return factor.view(blocks, 2, -1, 1, 1, 1).to(x.device, non_blocking=True)
+        """Factors of every residual of every sample, (blocks, 2, N, 1, 1, 1); rates rise from 0."""
+        rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
+        return keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)

@@ -1,0 +1,175 @@
+"""What a network is fed: channel order, normalisation, padding and hidden pixels, per release.
+
+Weights are tied to the convention they were trained with: fed another way, a released network
+gives other numbers. `conf/model/inputs/` has one file per release.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.checks import InputError, check_shape
+from rgbt.geometry import pad_to, padded_hw
+from rgbt.types import MaskPair, View
+
+
+class Images(NamedTuple):
+    """Normalised images: rgb (N, 3, H', W') and thermal (N, c, H', W'), padded with 0."""
+
+    rgb: Tensor
+    thermal: Tensor
+
+
+class Inputs(nn.Module):
+    """Images in [0, 1] to what a network was trained on: ``(255 x - mean) / std`` per channel.
+
+    Args:
+        rgb_order: "rgb", or "bgr" as OpenCV reads files.
+        rgb_mean: in grey levels 0..255, in the order of `rgb_order`.
+        rgb_std: likewise, > 0.
+        thermal_mean: in grey levels 0..255, one value per channel that the network's thermal
+            branch takes: the single thermal channel is repeated for three.
+        thermal_std: likewise, > 0, as many values.
+        thermal_scale: "fixed": 255 is white; "image_max": every image is divided by its own
+            maximum first (an image of zeros stays one).
+
+    Raises:
+        InputError: deviations that are not positive; not 1 or 3 thermal channels; lists of
+            different length.
+    """
+
+    rgb_mean: Tensor
+    rgb_std: Tensor
+    thermal_mean: Tensor
+    thermal_std: Tensor
+
+    def __init__(
+        self,
+        *,
+        rgb_order: Literal["rgb", "bgr"],
+        rgb_mean: tuple[float, float, float],
+        rgb_std: tuple[float, float, float],
+        thermal_mean: tuple[float, ...],
+        thermal_std: tuple[float, ...],
+        thermal_scale: Literal["fixed", "image_max"],
+    ) -> None:
+        super().__init__()
+        if len(thermal_mean) not in (1, 3) or len(thermal_std) != len(thermal_mean):
+            raise InputError(
+                "model.inputs: thermal_mean and thermal_std need one value, or three where thermal "
+                f"is repeated for three channels, got {len(thermal_mean)} and {len(thermal_std)}."
+            )
+        if min(*rgb_std, *thermal_std) <= 0:
+            raise InputError("model.inputs: rgb_std and thermal_std must be positive.")
+        self.rgb_order = rgb_order
+        self.thermal_scale = thermal_scale
+        named: dict[str, tuple[float, ...]] = {"rgb_mean": rgb_mean, "rgb_std": rgb_std}
+        named |= {"thermal_mean": thermal_mean, "thermal_std": thermal_std}
+        for name, values in named.items():
+            scaled = torch.tensor(values).view(-1, 1, 1) / 255
+            self.register_buffer(name, scaled, persistent=False)
+
+    @property
+    def thermal_channels(self) -> int:
+        """Channels of the thermal image that the network sees, 1 or 3."""
+        return len(self.thermal_mean)
+
+    def forward(
+        self, rgb: Tensor, thermal: Tensor, masks: MaskPair | None = None, *, multiple: int = 1
+    ) -> Images:
+        """Normalised images; hidden pixels and padding are 0, which is the mean colour.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1].
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: cells of the image padded to multiples of 32, (N, h, w) bool each,
+                True = the pixels are hidden; None: nothing is.
+            multiple: sides are padded at the bottom and right to multiples of this.
+
+        Raises:
+            ValueError: shapes that do not fit each other.
+            InputError: mask cells that do not divide the padded image.
+        """
+        sizes = check_shape("rgb", rgb, "N C H W", C=3)
+        check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
+        if self.rgb_order == "bgr":
+            rgb = rgb.flip(1)
+        if self.thermal_scale == "image_max":
+            # The smallest float only matters where the whole image is 0.
+            brightest = thermal.amax((1, 2, 3), keepdim=True)
+            thermal = thermal / brightest.clamp(min=torch.finfo(thermal.dtype).tiny)
+        images = Images(
+            (rgb - self.rgb_mean) / self.rgb_std,
+            (thermal - self.thermal_mean) / self.thermal_std,
+        )
+        hw = sizes["H"], sizes["W"]
+        if masks is not None:
+            cells = expand_cells(masks, sizes["N"], padded_hw(hw))
+            images = Images(
+                *(
+                    image.masked_fill(hidden[:, None, : hw[0], : hw[1]], 0.0)
+                    for image, hidden in zip(images, cells, strict=True)
+                )
+            )
+        full = padded_hw(hw, multiple)
+        return Images(*(pad_to(image, full) for image in images))
+
+
+def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:
+    """Cells to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
+
+    Args:
+        masks: (N, h, w) bool each.
+        count: N that is expected.
+        image_hw: the padded size that the cells divide.
+        unit: side of a square, pixels: 1 for pixels, 4 for the tokens of a Swin.
+
+    Raises:
+        InputError: cells that are not squares of a multiple of `unit` pixels.
+        ValueError: another N.
+    """
+    rgb, thermal = (
+        _expand(name, mask, (count, *image_hw), unit)
+        for name, mask in zip(MaskPair._fields, masks, strict=True)
+    )
+    return MaskPair(rgb, thermal)
+
+
+def _expand(name: str, mask: Tensor, size: tuple[int, int, int], unit: int) -> Tensor:
+    count, height, width = size
+    sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
+    grid = sizes["h"], sizes["w"]
+    cell = height // grid[0]
+    if cell % unit or (grid[0] * cell, grid[1] * cell) != (height, width):
+        raise InputError(
+            f"masker: a grid of {grid[0]} x {grid[1]} cells does not divide the padded image of "
+            f"{height} x {width} pixels into squares of a multiple of {unit} pixels "
+            f"(patch size {height / grid[0]:g} x {width / grid[1]:g}); choose a "
+            "masker.patch_size that divides both sides."
+        )
+    repeat = cell // unit
+    return mask.repeat_interleave(repeat, 1).repeat_interleave(repeat, 2)
+
+
+def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
+    """The one view that a network without stacked views is asked for.
+
+    Args:
+        views: as a network's `forward` got them; empty takes the first of `known`.
+        known: what the network predicts from.
+        network: its name for the message.
+
+    Raises:
+        InputError: more than one view, or one that the network does not have.
+    """
+    asked = views or known[:1]
+    if len(asked) > 1 or asked[0] not in known:
+        raise InputError(
+            f"{network} predicts from {' or '.join(known)}, one at a time, but was asked for "
+            f"{', '.join(asked)}; choose modality={known[0]}, or a network with several views "
+            "(model=mask2former_tiny)."
+        )
+    return asked[0]

@@ -1,0 +1,133 @@
+"""Tensors recorded from released networks, for weights and images that are filled by a stated rule.
+
+The reference material lies beside the checkout; tests that need it are skipped where it is missing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from omegaconf import DictConfig
+from torch import Tensor, nn
+
+from rgbt.config import build, conf_dir, register_resolvers
+
+SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
+FOLDER = SHARED / "golden"
+
+requires_golden = pytest.mark.skipif(
+    not (FOLDER / "fill.py").exists(), reason="reference material is not here"
+)
+
+
+@dataclass(frozen=True)
+class Golden:
+    """One recorded network: what is said about it, the arrays, and the rule of the weights."""
+
+    facts: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    fill: ModuleType
+
+    @property
+    def image(self) -> tuple[Tensor, Tensor]:
+        """The input as the lab feeds it: rgb (1, 3, H, W) and thermal (1, 1, H, W) in [0, 1]."""
+        image = torch.from_numpy(self.arrays["image_uint8"]).float()[None] / 255
+        return image[:, :3], image[:, 3:]
+
+
+def load(name: str) -> Golden:
+    """The golden file `name`, such as "rtfnet_50"."""
+    spec = importlib.util.spec_from_file_location("golden_fill", FOLDER / "fill.py")
+    assert spec is not None
+    assert spec.loader is not None
+    fill = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(fill)
+    with np.load(FOLDER / f"{name}.npz") as archive:
+        arrays = dict(archive)
+    return Golden(json.loads((FOLDER / f"{name}.json").read_text()), arrays, fill)
+
+
+def compose(*overrides: str) -> DictConfig:
+    """The configuration for these overrides."""
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", list(overrides))
+
+
+def network(yaml: str, num_classes: int = 9, **changed: Any) -> Any:
+    """The network of conf/model/<yaml>.yaml, composed as a user would get it."""
+    changes = [f"model.{key}={value}" for key, value in changed.items()]
+    changes.append(f"model.num_classes={num_classes}")
+    return build(compose(f"model={yaml}", *changes).model)
+
+
+def fill_network(
+    net: nn.Module, golden: Golden, prefix: str = "", unused: Collection[str] = ()
+) -> None:
+    """Fill every floating tensor of `net` under its released name, `prefix` + own key.
+
+    Fails unless the names are those of the release's filled tensors, less `unused` (by prefix).
+    """
+    state = {
+        key: torch.from_numpy(golden.fill.fill(prefix + key, value.shape))
+        for key, value in net.state_dict().items()
+        if golden.fill.is_filled(key, str(value.dtype).removeprefix("torch."))
+    }
+    released = {
+        key: shape
+        for key, (shape, _, filled, _) in golden.facts["keys"].items()
+        if filled and not key.startswith(tuple(unused))
+    }
+    assert {prefix + key: list(value.shape) for key, value in state.items()} == released
+    net.load_state_dict(state, strict=False)
+
+
+def deviations(golden: Golden, found: dict[str, Tensor]) -> dict[str, float]:
+    """Largest difference of every recorded tensor, in units of its tolerance; all must be found."""
+    skipped = {"argmax", "network_input", "mask_pair"}
+    wanted = {key for key in golden.facts["outputs"] if key not in skipped}
+    assert wanted <= found.keys(), f"not computed: {sorted(wanted - found.keys())}"
+    result = {}
+    for key in sorted(wanted):
+        about, value = golden.facts["outputs"][key], found[key].detach().contiguous().numpy()
+        assert list(value.shape) == about["shape"], key
+        if about["stored"] == "sampled":
+            positions = golden.fill.sample_positions(key, value.size, about["count"])
+            value = value.ravel()[positions]
+        difference = float(np.abs(value - golden.arrays[key]).max())
+        result[key] = difference / about["tol_abs"]
+    return result
+
+
+def check_all(golden: Golden, found: dict[str, Tensor]) -> None:
+    """Fail with the tensors that differ by more than their tolerance; print the worst."""
+    found_deviations = deviations(golden, found)
+    worst = max(found_deviations, key=lambda key: found_deviations[key])
+    print(f"{golden.facts['network']}: worst {worst} at {found_deviations[worst]:.2g} of tolerance")
+    assert {key: value for key, value in found_deviations.items() if not value <= 1} == {}
+
+
+def hook(net: nn.Module, named: dict[str, str]) -> dict[str, Tensor]:
+    """Outputs of submodules, filled by the next forward: name in the record -> module path."""
+    seen: dict[str, Tensor] = {}
+
+    def note(name: str) -> Callable[..., None]:
+        def called(_module: nn.Module, _inputs: Any, output: Tensor) -> None:
+            seen[name] = output
+
+        return called
+
+    for name, path in named.items():
+        net.get_submodule(path).register_forward_hook(note(name))
+    return seen

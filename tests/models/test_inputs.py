@@ -1,0 +1,141 @@
+"""Normalisation per release, hidden pixels, padding, views."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.config import build
+from rgbt.models.inputs import Inputs, expand_cells, only_view
+from rgbt.types import MaskPair
+from tests.models.golden import compose
+
+
+def inputs(**changes: Any) -> Inputs:
+    values: dict[str, Any] = {
+        "rgb_order": "rgb",
+        "rgb_mean": (0.0, 51.0, 102.0),
+        "rgb_std": (255.0, 51.0, 25.5),
+        "thermal_mean": (0.0,),
+        "thermal_std": (255.0,),
+        "thermal_scale": "fixed",
+    }
+    return Inputs(**{**values, **changes})
+
+
+def ones(height: int = 32, width: int = 32, count: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones(count, 3, height, width), torch.full((count, 1, height, width), 0.5)
+
+
+def test_channels_are_shifted_and_scaled_in_grey_levels() -> None:
+    rgb, thermal = inputs()(*ones())
+    # By hand: 255 grey levels over 255; 204 over 51; 153 over 25.5.
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx([1.0, 4.0, 6.0])
+    assert thermal.shape == (1, 1, 32, 32)
+    assert thermal.unique().item() == pytest.approx(0.5)
+
+
+def test_bgr_swaps_the_images_channels_and_not_the_means() -> None:
+    red = torch.tensor([1.0, 0.0, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
+    rgb, _ = inputs(rgb_order="bgr")(red, ones()[1])
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx([0.0, -1.0, 6.0])
+
+
+def test_thermal_is_repeated_for_three_channels() -> None:
+    three = inputs(thermal_mean=(0.0, 127.5, 0.0), thermal_std=(255.0, 255.0, 127.5))
+    assert three.thermal_channels == 3
+    _, thermal = three(*ones())
+    assert thermal[0, :, 0, 0].tolist() == pytest.approx([0.5, 0.0, 1.0])
+
+
+def test_every_thermal_image_is_divided_by_its_own_maximum() -> None:
+    rgb, thermal = ones(count=3)
+    thermal[0, 0, 0, 0], thermal[2] = 0.25, 0.0
+    _, scaled = inputs(thermal_scale="image_max")(rgb, thermal)
+    assert scaled[0, 0, 0, 0] == 0.5
+    assert scaled[1].unique().tolist() == [1.0]
+    assert scaled[2].unique().tolist() == [0.0]
+
+
+def test_padding_and_hidden_pixels_are_the_mean() -> None:
+    rgb, thermal = ones(40, 60)
+    hidden = torch.zeros(1, 2, 2, dtype=torch.bool)
+    hidden[0, 1, 1] = True
+    images = inputs()(rgb, thermal, MaskPair(hidden, ~hidden), multiple=32)
+    assert images.rgb.shape[-2:] == images.thermal.shape[-2:] == (64, 64)
+    assert images.rgb[..., 40:, :].abs().sum() == images.rgb[..., 60:].abs().sum() == 0
+    # Cells are 32 x 32 of the padded image: rows 32..39 and columns 32..59 are hidden in RGB.
+    assert (images.rgb[0, 0, :40, :60] == 0).sum() == 8 * 28
+    assert (images.thermal[0, 0, :40, :60] != 0).sum() == 8 * 28
+
+
+def test_any_size_without_a_multiple() -> None:
+    hidden = torch.ones(1, 2, 2, dtype=torch.bool)
+    images = inputs()(*ones(37, 41), MaskPair(hidden, ~hidden))
+    assert images.rgb.shape[-2:] == (37, 41)
+    assert images.rgb.abs().sum() == 0
+
+
+def test_cells_become_squares_of_units() -> None:
+    hidden = torch.tensor([[[True, False]]])
+    pixels = expand_cells(MaskPair(hidden, hidden), 1, (32, 64))
+    assert pixels.rgb.shape == (1, 32, 64)
+    assert pixels.rgb[0, :, :32].all()
+    assert not pixels.rgb[0, :, 32:].any()
+    assert expand_cells(MaskPair(hidden, hidden), 1, (32, 64), 4).thermal.shape == (1, 8, 16)
+
+
+@pytest.mark.parametrize(("grid", "unit"), [((3, 2), 1), ((1, 1), 1), ((16, 32), 4)])
+def test_cells_that_do_not_fit_are_refused(grid: tuple[int, int], unit: int) -> None:
+    hidden = torch.zeros(1, *grid, dtype=torch.bool)
+    with pytest.raises(InputError, match=r"masker.patch_size that divides both sides"):
+        expand_cells(MaskPair(hidden, hidden), 1, (32, 64), unit)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"thermal_mean": (0.0, 0.0)}, "one value, or three"),
+        ({"thermal_std": (1.0, 1.0, 1.0)}, "one value, or three"),
+        ({"rgb_std": (1.0, 0.0, 1.0)}, "must be positive"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        inputs(**change)
+
+
+def test_shapes_that_do_not_fit_raise() -> None:
+    rgb, thermal = ones()
+    with pytest.raises(ValueError, match="thermal"):
+        inputs()(rgb, thermal[..., 1:])
+
+
+def test_one_view_at_a_time() -> None:
+    assert only_view((), ("rgb", "thermal"), "X") == "rgb"
+    assert only_view(("thermal",), ("rgb", "thermal"), "X") == "thermal"
+    for asked in (("rgbt",), ("rgb", "thermal")):
+        with pytest.raises(InputError, match="X predicts from rgb or thermal"):
+            only_view(asked, ("rgb", "thermal"), "X")
+
+
+@pytest.mark.parametrize(
+    ("option", "white"),
+    [
+        # White and mid-grey thermal in each release's convention, by hand.
+        ("crm", ([2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60])),
+        ("unit", ([1.0] * 3, [0.5])),
+        ("half", ([1.0] * 3, [0.0])),
+        ("temporal", ([1.0] * 3, [1.0] * 3)),
+        ("cmx", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),
+        ("cmx_released", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),
+    ],
+)
+def test_conventions_of_the_releases(option: str, white: tuple[list[float], list[float]]) -> None:
+    node = compose(f"model/inputs={option}").model.inputs
+    rgb, thermal = build(node)(*ones())
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx(white[0], abs=1e-5)
+    assert thermal[0, :, 0, 0].tolist() == pytest.approx(white[1], abs=1e-5)
