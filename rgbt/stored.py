@@ -60,13 +60,13 @@ def open_trained(
     if run:
         return open_run(find_run(run, runs_dir), overrides, checkpoint)
     config = _composed(["scale=paper", f"runs_dir={runs_dir}", *overrides])
-    check(config)
     source = weights_file(config)
     if source is None:
         raise InputError(
-            "run has no value; give one with run=..., or a network with weights from a file: "
+            "'run' has no value; give one with run=..., or a network with weights from a file: "
             "model=mfnet model.weights=final.pth dataset.root=/data/MFNet."
         )
+    check(config)
     folder = runs_dir / "evaluations" / run_key(config)
     return Stored(open_session(config), 0, folder, source.name)
 

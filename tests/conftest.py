@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 # One thread a process: two tests that share two cores otherwise wait for each other's threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from rgbt.randomness import numpy_generator
+from tests.commands import SPLITS, Call
 
 WriteMFNet = Callable[..., Path]
 
@@ -70,3 +72,22 @@ def expected_pair() -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
 @pytest.fixture
 def png() -> Callable[[Path, np.ndarray], None]:
     return write_png
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Call:
+    """Call a command's entry in this process: (exit code, stdout, stderr)."""
+
+    def run(entry: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["rgbt", *arguments])
+        with pytest.raises(SystemExit) as left:
+            entry()
+        out, err = capfd.readouterr()
+        return int(left.value.code or 0), out, err
+
+    return run
+
+
+@pytest.fixture
+def data(write_mfnet: Callable[..., Path]) -> Path:
+    return write_mfnet(SPLITS, hw=(48, 64))

@@ -44,3 +44,23 @@ class Poly:
         decay = max(0.0, 1.0 - done / max_steps) ** self.power
         warmup = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
         return float(decay * warmup)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exponential:
+    """``factor ** epoch``, epochs counted from 0.
+
+    Source: MFNet and RTFNet releases.
+
+    Attributes:
+        factor: 0.95 in both releases' code; MFNet's released weights were trained with 0.94.
+    """
+
+    factor: float
+
+    def __post_init__(self) -> None:
+        check_range("schedule.factor", self.factor, 0.0, 1.0)
+
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
+        """See `Schedule`."""
+        return float(self.factor ** (step // steps_per_epoch))

@@ -55,11 +55,23 @@ class Recipe:
         batch_size: samples per process and step.
         max_steps: optimiser steps.
         eval_every: steps between evaluations: five epochs of MFNet's 1568 training images.
+        train_sizes: shortest edges that the training resize draws from, pixels.
+        crop_hw: training crop, pixels.
+        lr: base learning rate.
+        backbone_multiplier: factor of `lr` for what is pretrained.
+        clip_norm: largest gradient norm; null for none.
+        warmup_steps: linear warm-up.
     """
 
     batch_size: int
     max_steps: int
     eval_every: int
+    train_sizes: tuple[int, ...]
+    crop_hw: tuple[int, int]
+    lr: float
+    backbone_multiplier: float
+    clip_norm: float | None
+    warmup_steps: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +92,7 @@ class Scale:
         eval_every: steps between evaluations.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for the backbone.
-        clip_norm: largest gradient norm.
+        clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
     """
@@ -97,6 +109,6 @@ class Scale:
     eval_every: int
     lr: float
     backbone_multiplier: float
-    clip_norm: float
+    clip_norm: float | None
     warmup_steps: int
     precision: str

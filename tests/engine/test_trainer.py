@@ -12,8 +12,8 @@ from torch import nn
 
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, load_weights, save_checkpoint
-from rgbt.engine.optimizers import AdamW
-from rgbt.engine.schedules import Poly
+from rgbt.engine.optimizers import SGD, AdamW
+from rgbt.engine.schedules import Exponential, Poly
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
@@ -72,7 +72,12 @@ def make(folder: Path, poison: int | None = None, **changes: object) -> tuple[Tr
     torch.manual_seed(1)
     model = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 1))
     builder = AdamW(
-        lr=0.1, backbone_multiplier=1.0, weight_decay=0.05, betas=(0.9, 0.999), eps=1e-8
+        lr=0.1,
+        backbone_multiplier=1.0,
+        weight_decay=0.05,
+        decay_biases=True,
+        betas=(0.9, 0.999),
+        eps=1e-8,
     )
     wrapped, optimizer = fabric.setup(model, builder(model))
     log: list = []
@@ -183,10 +188,61 @@ def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings(
     model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
     model["query"] = nn.Embedding(3, 2)
     model.pretrained_parts = ("backbone.",)
-    builder = AdamW(lr=1.0, backbone_multiplier=0.1, weight_decay=0.5, betas=(0.9, 0.999), eps=1e-8)
+    builder = AdamW(
+        lr=1.0,
+        backbone_multiplier=0.1,
+        weight_decay=0.5,
+        decay_biases=True,
+        betas=(0.9, 0.999),
+        eps=1e-8,
+    )
     groups = builder(model).param_groups
     found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}
     assert found == {(0.1, 0.5): 6, (1.0, 0.0): 4 + 6}
+
+
+def test_biases_are_left_undecayed_where_asked() -> None:
+    builder = AdamW(
+        lr=1.0,
+        backbone_multiplier=1.0,
+        weight_decay=0.5,
+        decay_biases=False,
+        betas=(0.9, 0.999),
+        eps=1e-8,
+    )
+    groups = builder(nn.Linear(3, 2)).param_groups
+    assert {g["weight_decay"]: [p.shape for p in g["params"]] for g in groups} == {
+        0.5: [(2, 3)],
+        0.0: [(2,)],
+    }
+
+
+def test_sgd_steps_as_written_and_decays_everything() -> None:
+    model = nn.ModuleDict({"backbone": nn.Linear(1, 1), "norm": nn.BatchNorm1d(1)})
+    model.pretrained_parts = ("backbone.",)
+    for parameter in model.parameters():
+        nn.init.constant_(parameter, 2.0)
+        parameter.grad = torch.ones_like(parameter)
+    optimizer = SGD(lr=0.1, backbone_multiplier=0.5, momentum=0.9, weight_decay=0.25)(model)
+    optimizer.step()
+    # 2 - lr (1 + 0.25 * 2): 0.05 for the backbone, 0.1 for the rest.
+    assert model["backbone"].weight.item() == pytest.approx(2 - 0.05 * 1.5)
+    assert model["backbone"].bias.item() == pytest.approx(2 - 0.05 * 1.5)
+    assert model["norm"].weight.item() == pytest.approx(2 - 0.1 * 1.5)
+    assert sorted(g["base_lr"] for g in optimizer.param_groups) == [0.05, 0.1]
+
+
+@pytest.mark.parametrize("change", [{"lr": 0.0}, {"momentum": 1.0}, {"weight_decay": -1.0}])
+def test_sgd_refuses_values_out_of_range(change: dict[str, float]) -> None:
+    values = {"lr": 0.1, "backbone_multiplier": 1.0, "momentum": 0.9, "weight_decay": 0.0}
+    with pytest.raises(InputError, match=f"optimizer.{next(iter(change))}"):
+        SGD(**{**values, **change})
+
+
+def test_exponential_falls_by_the_epoch() -> None:
+    schedule = Exponential(factor=0.5)
+    factors = [schedule(step, 100, 3) for step in range(7)]
+    assert factors == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
 
 
 def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:

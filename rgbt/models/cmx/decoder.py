@@ -1,0 +1,121 @@
+"""MLP decoder: four maps of different size to class scores at a quarter of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.models.stochastic import drop_channels
+
+
+class Projection(nn.Module):
+    """A linear map and the one after it, as the single map that they are together.
+
+        following (proj x + b) + bias
+
+    The linear map has the released name `proj`.
+    """
+
+    def __init__(self, in_dim: int, out_dim: int) -> None:
+        super().__init__()
+        self.proj = nn.Linear(in_dim, out_dim)
+
+    def forward(self, x: Tensor, following: Tensor, bias: Tensor | None = None) -> Tensor:
+        """(N, H, W, in), (E, out) and (E,) -> (N, E, H, W)."""
+        offset = following @ self.proj.bias
+        if bias is not None:
+            offset = offset + bias
+        return F.linear(x, following @ self.proj.weight, offset).permute(0, 3, 1, 2)
+
+
+class TwoEpsNorm(nn.BatchNorm2d):
+    """Batch normalisation with one eps while training and another one while evaluating."""
+
+    def __init__(self, channels: int, *, eps: float, eps_eval: float) -> None:
+        super().__init__(channels, eps=eps)
+        self.eps_train, self.eps_eval = eps, eps_eval
+
+    def train(self, mode: bool = True) -> TwoEpsNorm:
+        """Also chooses the eps."""
+        self.eps = self.eps_train if mode else self.eps_eval
+        return super().train(mode)
+
+
+class MlpDecoder(nn.Module):
+    """Every map to E channels, enlarged to the first one's size, joined, mixed and classified.
+
+        ReLU(BatchNorm(conv1x1([c4, c3, c2, c1]))),  c_i = enlarge(linear_i(x_i))
+
+    Enlarging is linear and its weights sum to 1, so that it may follow the convolution instead:
+    each map meets its own part of the convolution at its own size, and the two linear maps are
+    one whose matrix is their product. The same numbers to rounding, at a fraction of the
+    operations and without the map of 4 E channels.
+
+    Source: SegFormer, Sec. 3.2, Eq. (4); CMX, Sec. III-A.
+
+    Args:
+        dims: channels of the four maps, the largest map first.
+        num_classes: K.
+        dim: E.
+        dropout: share of channels dropped in front of the classifier while training.
+        norm_eps: of the batch normalisation while training.
+        norm_eps_eval: of the same while evaluating.
+    """
+
+    def __init__(
+        self,
+        dims: Sequence[int],
+        num_classes: int,
+        *,
+        dim: int,
+        dropout: float,
+        norm_eps: float,
+        norm_eps_eval: float,
+    ) -> None:
+        super().__init__()
+        self.dropout = dropout
+        self.linear_c1, self.linear_c2, self.linear_c3, self.linear_c4 = (
+            Projection(width, dim) for width in dims
+        )
+        fuse = nn.Conv2d(4 * dim, dim, 1)
+        norm = TwoEpsNorm(dim, eps=norm_eps, eps_eval=norm_eps_eval)
+        self.linear_fuse = nn.Sequential(fuse, norm, nn.ReLU())
+        self.linear_pred = nn.Conv2d(dim, num_classes, 1)
+        for convolution in (fuse, self.linear_pred):
+            nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+
+    def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
+        """Class scores.
+
+        Args:
+            maps: four (N, H_i, W_i, C_i), the largest first.
+            generator: draws the dropped channels; only read in training mode with a rate above 0.
+
+        Returns:
+            (N, K, H_1, W_1).
+        """
+        mixed = self.linear_fuse[1:](self._mix(maps))
+        if self.training and self.dropout > 0:
+            mixed = drop_channels(mixed, self.dropout, generator)
+        logits: Tensor = self.linear_pred(mixed)
+        return logits
+
+    def _mix(self, maps: list[Tensor]) -> Tensor:
+        """The convolution over the four projected and enlarged maps, (N, E, H_1, W_1)."""
+        weight, bias = (self.linear_fuse.get_parameter(f"0.{name}") for name in ("weight", "bias"))
+        # The release joins the maps in the order c4, c3, c2, c1.
+        part4, part3, part2, part1 = weight.flatten(1).chunk(4, 1)
+        mixed: Tensor = self.linear_c1(maps[0], part1, bias)
+        smaller = (
+            self.linear_c2(maps[1], part2),
+            self.linear_c3(maps[2], part3),
+            self.linear_c4(maps[3], part4),
+        )
+        for small in smaller:
+            mixed = mixed + F.interpolate(
+                small, size=mixed.shape[2:], mode="bilinear", align_corners=False
+            )
+        return mixed

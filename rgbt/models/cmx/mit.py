@@ -1,0 +1,197 @@
+"""Mix Transformer (MiT): patch embedding, attention with fewer keys, feed-forward, stages.
+
+Maps are (N, H, W, C) throughout, which is a sequence of tokens and an image that convolutions
+take as it is (channels last), so that nothing is copied between the two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+BLOCK_NORM_EPS = 1e-6
+"""Of the normalisations in front of attention and feed-forward and after a stage; those of patch
+embeddings and keys have torch's 1e-5."""
+
+Stage2 = Literal["ramp", "released"]
+
+
+@dataclass(frozen=True)
+class MitShape:
+    """Sizes of one stream; see `CMX` for their meaning."""
+
+    embed_dims: tuple[int, int, int, int]
+    depths: tuple[int, int, int, int]
+    num_heads: tuple[int, int, int, int]
+    sr_ratios: tuple[int, int, int, int]
+    mlp_ratio: float
+
+
+def convolve(convolution: nn.Module, x: Tensor) -> Tensor:
+    """A module that expects (N, C, H, W), on (N, H, W, C) without a copy."""
+    out: Tensor = convolution(x.permute(0, 3, 1, 2))
+    return out.permute(0, 2, 3, 1)
+
+
+class PatchEmbed(nn.Module):
+    """One token per patch; neighbouring patches overlap."""
+
+    def __init__(self, in_channels: int, dim: int, *, kernel: int, stride: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(in_channels, dim, kernel, stride=stride, padding=kernel // 2)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, c) -> (N, ceil(H / stride), ceil(W / stride), C)."""
+        tokens: Tensor = self.norm(convolve(self.proj, x))
+        return tokens
+
+
+class Attention(nn.Module):
+    """Multi-head attention to a map whose sides are `reduction` times smaller.
+
+        softmax(q k' / sqrt(d)) v,   k and v from LayerNorm(conv(x)), kernel = stride = reduction
+
+    Source: SegFormer, Sec. 3.1, Eqs. (1)-(2); PVT.
+    """
+
+    def __init__(self, dim: int, heads: int, reduction: int) -> None:
+        super().__init__()
+        self.heads, self.reduction = heads, reduction
+        self.q = nn.Linear(dim, dim)
+        self.kv = nn.Linear(dim, 2 * dim)
+        self.proj = nn.Linear(dim, dim)
+        if reduction > 1:
+            self.sr = nn.Conv2d(dim, dim, reduction, stride=reduction)
+            self.norm = nn.LayerNorm(dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C), sides at least `reduction`."""
+        n, _, _, dim = x.shape
+        seen = self.norm(convolve(self.sr, x)) if self.reduction > 1 else x
+        q = self.q(x).view(n, -1, self.heads, dim // self.heads).transpose(1, 2)
+        kv = self.kv(seen).view(n, -1, 2, self.heads, dim // self.heads)
+        k, v = kv.permute(2, 0, 3, 1, 4)
+        out = F.scaled_dot_product_attention(q, k, v)
+        mixed: Tensor = self.proj(out.transpose(1, 2).reshape(x.shape))
+        return mixed
+
+
+class Depthwise(nn.Module):
+    """A 3x3 convolution of every channel alone, under the released name `dwconv.dwconv`."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.dwconv = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C)."""
+        return convolve(self.dwconv, x)
+
+
+class MixFfn(nn.Module):
+    """Linear, depthwise 3x3 convolution, exact GELU, linear.
+
+    Source: SegFormer, Sec. 3.1, Eq. (3).
+    """
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.dwconv = Depthwise(hidden)
+        self.fc2 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C)."""
+        out: Tensor = self.fc2(F.gelu(self.dwconv(self.fc1(x))))
+        return out
+
+
+class Block(nn.Module):
+    """Attention and feed-forward, each normalised before and added to its input."""
+
+    def __init__(self, dim: int, heads: int, reduction: int, hidden: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
+        self.attn = Attention(dim, heads, reduction)
+        self.norm2 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
+        self.mlp = MixFfn(dim, hidden)
+
+    def forward(self, x: Tensor, keep: Tensor | None = None) -> Tensor:
+        """One block.
+
+        Args:
+            x: (N, H, W, C).
+            keep: (2, N, 1, 1, 1) factors of the two residuals (stochastic depth); None for ones.
+
+        Returns:
+            (N, H, W, C).
+        """
+        first, second = (None, None) if keep is None else keep.unbind()
+        x = _add(x, self.attn(self.norm1(x)), first)
+        return _add(x, self.mlp(self.norm2(x)), second)
+
+
+def _add(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
+    return x + residual if factor is None else torch.addcmul(x, residual, factor)
+
+
+def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn.Module]:
+    """Patch embedding, blocks and normalisation of a stage, by their released names.
+
+    The release keeps them side by side (`block1`, `extra_block1`), not in one module per stage.
+
+    Args:
+        shape: sizes.
+        stage: 0..3.
+        in_channels: of the image, for stage 0.
+    """
+    dim = shape.embed_dims[stage]
+    before = shape.embed_dims[stage - 1] if stage else in_channels
+    kernel, stride = (3, 2) if stage else (7, 4)
+    hidden = int(dim * shape.mlp_ratio)
+    heads, reduction = shape.num_heads[stage], shape.sr_ratios[stage]
+    return {
+        "patch_embed": PatchEmbed(before, dim, kernel=kernel, stride=stride),
+        "block": nn.ModuleList(
+            Block(dim, heads, reduction, hidden) for _ in range(shape.depths[stage])
+        ),
+        "norm": nn.LayerNorm(dim, eps=BLOCK_NORM_EPS),
+    }
+
+
+def drop_rates(depths: tuple[int, int, int, int], last: float, stage2: Stage2) -> Tensor:
+    """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
+
+    Args:
+        depths: blocks per stage.
+        last: rate of the last block; rates rise evenly from 0.
+        stage2: "released": stage 2 has one rate per stream, that of its first block for RGB and
+            the next one on the ramp for thermal; "ramp": no exception.
+    """
+    rates = torch.linspace(0, last, sum(depths)).repeat(2, 1)
+    if stage2 == "released":
+        start = depths[0]
+        rates[:, start : start + depths[1]] = rates[0, start : start + 2, None].clone()
+    return rates
+
+
+def initialise(module: nn.Module) -> None:
+    """Starting weights of the streams and of what lies between them, before ImageNet's.
+
+    Linear: normal with deviation 0.02; convolution: normal with variance 2 / (outputs that one
+    input value reaches); biases 0.   Source: SegFormer and CMX releases.
+    """
+    if isinstance(module, nn.Linear):
+        nn.init.trunc_normal_(module.weight, std=0.02)
+    elif isinstance(module, nn.Conv2d):
+        reached = module.weight[:, 0].numel() // module.groups
+        nn.init.normal_(module.weight, std=(2 / reached) ** 0.5)
+    else:
+        return
+    if module.bias is not None:
+        nn.init.zeros_(module.bias)

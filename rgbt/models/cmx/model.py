@@ -1,0 +1,229 @@
+"""CMX: the two streams, what happens between them, and the decoder put together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.models.cmx.decoder import MlpDecoder
+from rgbt.models.cmx.fusion import Fusion, Rectification
+from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
+from rgbt.models.inputs import Images, Inputs, only_view
+from rgbt.models.stochastic import keep_factors
+from rgbt.types import MaskPair, Output, View
+
+STREAMS = ("", "extra_")
+"""Beginnings of the released names: RGB, and the other modality."""
+
+
+class Encoder(nn.Module):
+    """Two Mix Transformers with weights of their own that meet after every stage.
+
+    What the rectification returns goes on to the next stage; what the fusion returns, only to the
+    decoder.   Source: CMX, Sec. III-A.
+
+    Args:
+        shape: sizes of a stream.
+        thermal_channels: of the thermal image.
+        drop_rates: (2, blocks) probabilities of stochastic depth, RGB's and thermal's; None: none.
+    """
+
+    def __init__(
+        self, shape: MitShape, *, thermal_channels: int, drop_rates: Tensor | None
+    ) -> None:
+        super().__init__()
+        self.depths = shape.depths
+        self.drop_rates = drop_rates
+        for prefix, channels in zip(STREAMS, (3, thermal_channels), strict=True):
+            for stage in range(4):
+                for name, module in stage_modules(shape, stage, channels).items():
+                    self.add_module(f"{prefix}{name}{stage + 1}", module)
+        self.FRMs = nn.ModuleList(Rectification(dim) for dim in shape.embed_dims)
+        self.FFMs = nn.ModuleList(
+            Fusion(dim, heads) for dim, heads in zip(shape.embed_dims, shape.num_heads, strict=True)
+        )
+        self.apply(initialise)
+
+    def forward(self, images: Images, generator: torch.Generator | None) -> list[Tensor]:
+        """Fused maps of the four stages.
+
+        Args:
+            images: (N, 3, H, W) and (N, c, H, W) normalised.
+            generator: draws stochastic depth; only read in training mode with rates.
+
+        Returns:
+            four (N, h, w, C_s), h and w being H and W over 4, 8, 16, 32, rounded up.
+        """
+        rgb, thermal = (image.permute(0, 2, 3, 1).contiguous() for image in images)
+        keep_rgb, keep_thermal = self._draw_keep(rgb, generator)
+        fused = []
+        for stage, (rectify, fuse) in enumerate(zip(self.FRMs, self.FFMs, strict=True)):
+            rgb = self._stage(STREAMS[0], stage, rgb, keep_rgb[stage])
+            thermal = self._stage(STREAMS[1], stage, thermal, keep_thermal[stage])
+            rgb, thermal = rectify(rgb, thermal)
+            fused.append(fuse(rgb, thermal))
+        return fused
+
+    def _stage(self, prefix: str, stage: int, x: Tensor, keep: Tensor | None) -> Tensor:
+        """One stage of one stream; `keep` is (blocks, 2, N, 1, 1, 1)."""
+        embed, blocks, norm = (
+            self.get_submodule(f"{prefix}{name}{stage + 1}")
+            for name in ("patch_embed", "block", "norm")
+        )
+        x = embed(x)
+        for number, block in enumerate(blocks.children()):
+            x = block(x, None if keep is None else keep[number])
+        normed: Tensor = norm(x)
+        return normed
+
+    def _draw_keep(
+        self, x: Tensor, generator: torch.Generator | None
+    ) -> Sequence[Sequence[Tensor | None]]:
+        """Factors of every residual by stream and stage, (blocks, 2, N, 1, 1, 1) each."""
+        if not self.training or self.drop_rates is None:
+            return [[None] * 4] * 2
+        drawn = keep_factors(self.drop_rates.flatten(), (2, len(x), 1, 1, 1), generator, x.device)
+        return [torch.split(half, list(self.depths)) for half in drawn.chunk(2)]
+
+
+class CMX(nn.Module):
+    """CMX with MiT streams for RGB and thermal.
+
+    Source: J. Zhang et al., CMX: Cross-Modal Fusion for RGB-X Semantic Segmentation With
+    Transformers, T-ITS 2023; the network of the temporal paper, too.   Released:
+    huaaaliu/RGBX_Semantic_Segmentation; lab-sun/Temporal-Consistent-RGBT-Segmentation (the same
+    network, other inputs).
+
+    Args:
+        num_classes: K.
+        embed_dims: channels per stage.
+        depths: blocks per stage.
+        num_heads: heads per stage, of attention and of fusion.
+        sr_ratios: how many times smaller per side the map is that a stage attends to.
+        mlp_ratio: width of a block's feed-forward network over the block's.
+        decoder_dim: E, channels of the decoder.
+        drop_path_rate: stochastic depth of the last block, 0 at the first, in [0, 1).
+        drop_path_stage2: "ramp": rates rise from block to block, as in MiT.   Released:
+            "released": all RGB blocks of stage 2 have the rate of its first block, all thermal
+            ones that of its second.
+        decoder_dropout: share of channels dropped in front of the classifier, in [0, 1).
+        decoder_norm_eps: of the decoder's batch normalisation, > 0.
+        decoder_norm_eps_eval: of the same in evaluation; None: the same.   Released: CMX trains
+            with 1e-3 and, as its evaluation skips the set-up of weights, evaluates with 1e-5.
+        inputs: normalisation of the images.
+    """
+
+    views: tuple[View, ...] = ("rgbt",)
+    pretrained_parts: tuple[str, ...] = ("backbone.",)
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: int,
+        embed_dims: tuple[int, int, int, int],
+        depths: tuple[int, int, int, int],
+        num_heads: tuple[int, int, int, int],
+        sr_ratios: tuple[int, int, int, int],
+        mlp_ratio: float,
+        decoder_dim: int,
+        drop_path_rate: float,
+        drop_path_stage2: Stage2,
+        decoder_dropout: float,
+        decoder_norm_eps: float,
+        decoder_norm_eps_eval: float | None,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
+        _check(shape, drop_path_rate, decoder_dropout)
+        check_choice("model.drop_path_stage2", drop_path_stage2, ("ramp", "released"))
+        self.num_classes = num_classes
+        # The smallest image whose every map is at least as large as the kernel that shrinks it.
+        self.shortest_side = max(
+            stride * (ratio - 1) + 1
+            for stride, ratio in zip((4, 8, 16, 32), sr_ratios, strict=True)
+        )
+        rates = drop_rates(depths, drop_path_rate, drop_path_stage2)
+        self.backbone = Encoder(
+            shape,
+            thermal_channels=inputs.thermal_channels,
+            drop_rates=rates if drop_path_rate > 0 else None,
+        )
+        if decoder_norm_eps_eval is None:
+            decoder_norm_eps_eval = decoder_norm_eps
+        check_range("model.decoder_norm_eps", decoder_norm_eps, 1e-12, 1)
+        check_range("model.decoder_norm_eps_eval", decoder_norm_eps_eval, 1e-12, 1)
+        self.decode_head = MlpDecoder(
+            embed_dims,
+            num_classes,
+            dim=decoder_dim,
+            dropout=decoder_dropout,
+            norm_eps=decoder_norm_eps,
+            norm_eps_eval=decoder_norm_eps_eval,
+        )
+        self.inputs = inputs
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores of every pixel.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1], sides of any length from 29 (with the released
+                `sr_ratios`).
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: cells of the image padded to multiples of 32, (N, h, w) bool each, True = the
+                pixels are hidden. None: nothing is hidden.
+            views: only ("rgbt",), or nothing for the same.
+            generator: draws stochastic depth per sample, block and stream, then the decoder's
+                dropped channels; needed in training mode unless both rates are 0.
+
+        Returns:
+            logits: (N, K, H, W) float32, in training and evaluation.
+            aux: empty.
+
+        Raises:
+            ValueError: shapes that do not fit; no generator where one is needed.
+            InputError: another view; mask cells that do not divide the padded image; images
+                smaller than the deepest reduction of attention takes.
+        """
+        images = self.inputs(rgb, thermal, masks, multiple=1)
+        only_view(views, self.views, "CMX")
+        image_hw = rgb.shape[2], rgb.shape[3]
+        if min(image_hw) < self.shortest_side:
+            raise InputError(
+                f"CMX with model.sr_ratios as they are needs images of at least "
+                f"{self.shortest_side} pixels per side, got {image_hw[0]} x {image_hw[1]}; "
+                "use larger images or crops, or smaller sr_ratios."
+            )
+        fused = self.backbone(images, generator)
+        quarter = self.decode_head(fused, generator)
+        logits = F.interpolate(quarter.float(), size=image_hw, mode="bilinear", align_corners=False)
+        return Output(logits, {})
+
+
+def _check(shape: MitShape, drop_path_rate: float, decoder_dropout: float) -> None:
+    """Refuse sizes that do not fit each other, naming the key."""
+    check_range("model.drop_path_rate", drop_path_rate, 0, 0.999)
+    check_range("model.decoder_dropout", decoder_dropout, 0, 0.999)
+    if min(*shape.depths, *shape.sr_ratios) < 1:
+        raise InputError(
+            "model.depths and model.sr_ratios must be at least 1 in every stage, got "
+            f"{shape.depths} and {shape.sr_ratios}."
+        )
+    for stage, (dim, heads) in enumerate(zip(shape.embed_dims, shape.num_heads, strict=True)):
+        if heads < 1 or dim % heads:
+            raise InputError(
+                f"model.num_heads[{stage}] = {heads} must divide the {dim} channels of "
+                f"model.embed_dims[{stage}]."
+            )

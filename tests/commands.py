@@ -1,0 +1,46 @@
+"""Calling the commands on a small data set, as a user would."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+SPLITS = {
+    "train": [f"{n:05d}{'DN'[n % 2]}" for n in range(1, 9)],
+    "val": ["00101D", "00102N"],
+    "test": ["00201D", "00202N", "00203D"],
+}
+SMALL = (
+    *("scale.batch_size=2", "scale.eval_batch_size=2", "scale.num_points=64"),
+    *("scale.crop_hw=[48,64]", "scale.train_sizes=[48,56]", "scale.test_short_edge=48"),
+    *(
+        "masker.patch_size=32",
+        "trainer.log_every=1",
+        "trainer.accelerator=cpu",
+        "trainer.threads=1",
+    ),
+)
+Call = Callable[..., tuple[int, str, str]]
+
+
+def short(steps: int) -> tuple[str, ...]:
+    return f"trainer.max_steps={steps}", f"trainer.eval_every={steps}", "trainer.checkpoint_every=2"
+
+
+def train(call: Call, data: Path, runs: Path, *overrides: str) -> tuple[int, str, str]:
+    from rgbt.run import main
+
+    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
+    return call(main, *place, *SMALL, *overrides)
+
+
+def only_run(runs: Path) -> Path:
+    (result,) = runs.glob("*/result.json")
+    return result.parent
+
+
+def assert_one_sentence(err: str, sentence: str) -> None:
+    told = [line for line in err.splitlines() if line.startswith("rgbt: ")]
+    assert len(told) == 1, err
+    assert sentence in told[0]
+    assert "Traceback" not in err

@@ -1,0 +1,102 @@
+"""Weights from a file, where a user names them: training, evaluating, predicting, the run's key."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbt import evaluate, predict
+from rgbt.command import plain_command
+from rgbt.config import run_key
+from rgbt.metrics.counts import Counts
+from tests.commands import Call, assert_one_sentence, only_run, short, train
+from tests.models.golden import SHARED, compose
+
+EVALUATE = plain_command(evaluate.OWN, evaluate.main)
+REAL = SHARED / "realdata"
+
+
+def test_a_run_starts_from_another_runs_weights(call: Call, data: Path, tmp_path: Path) -> None:
+    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
+    code, _, err = train(call, data, tmp_path / "first", *one)
+    assert code == 0, err
+    first = only_run(tmp_path / "first")
+    still = ("optimizer.lr=1.0e-30", f"model.weights={first}")
+    code, _, err = train(call, data, tmp_path / "second", *one, *still)
+    assert code == 0, err
+    second = only_run(tmp_path / "second")
+    before, after = (
+        torch.load(folder / "best.pt", weights_only=True)["model"] for folder in (first, second)
+    )
+    moved = [key for key in before if not torch.equal(before[key], after[key])]
+    # The step of a training moves running statistics, and at this rate nothing else.
+    assert all("running" in key or "num_batches" in key for key in moved)
+
+
+def test_weights_are_scored_without_a_run(call: Call, data: Path, tmp_path: Path) -> None:
+    code, _, err = train(
+        call, data, tmp_path, "+experiment=mfnet", "masker.patch_size=null", *short(2)
+    )
+    assert code == 0, err
+    folder = only_run(tmp_path)
+    named = (
+        *("model=mfnet_tiny", f"model.weights={folder}", f"dataset.root={data}"),
+        *(f"runs_dir={tmp_path}", "data.num_workers=0", "trainer.threads=1"),
+    )
+    code, out, err = call(EVALUATE, *named)
+    assert code == 0, err
+    assert "mIoU" in out
+    (written,) = tmp_path.glob("evaluations/*/mfnet_test_rgbt_ring5.npz")
+    stored = Counts.load(folder / "counts_test.npz")
+    assert np.array_equal(Counts.load(written).counts, stored.counts)
+
+    code, out, err = call(
+        plain_command(predict.OWN, predict.main), *named, "input=test", f"out={tmp_path / 'out'}"
+    )
+    assert code == 0, err
+    assert len(list((tmp_path / "out").glob("*_overlay.png"))) == len(stored.names)
+
+
+def test_weights_that_are_not_there_are_named(call: Call, data: Path, tmp_path: Path) -> None:
+    code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.weights=nowhere.pth")
+    assert code == 2
+    assert_one_sentence(err, "there is no file nowhere.pth")
+    code, _, err = call(EVALUATE, "model=mfnet_tiny", f"dataset.root={data}")
+    assert code == 2
+    assert_one_sentence(err, "'run' has no value")
+    code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.fresh=decode1")
+    assert code == 2
+    assert_one_sentence(err, "model.fresh")
+
+
+def test_the_key_follows_what_is_in_the_file(tmp_path: Path) -> None:
+    first, copy, other = (tmp_path / name for name in ("a.pth", "b.pth", "c.pth"))
+    first.write_bytes(b"weights")
+    shutil.copy(first, copy)
+    other.write_bytes(b"other weights")
+    keys = [run_key(compose(f"model.weights={path}")) for path in (first, copy, other)]
+    assert keys[0] == keys[1] != keys[2]
+    assert run_key(compose()) not in keys
+    assert run_key(compose(f"model.weights={first}", "model.fresh=[head]")) not in keys
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (REAL / "mfnet_weights").is_dir(), reason="real data is not here")
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_released_weights_give_the_known_counts(call: Call, tmp_path: Path, split: str) -> None:
+    code, _, err = call(
+        EVALUATE,
+        *("model=mfnet", f"model.weights={REAL / 'mfnet_weights' / 'final.pth'}"),
+        *(f"dataset.root={REAL / 'mfnet200'}", "dataset.splits.test=val.txt", f"split={split}"),
+        *(f"out={tmp_path / 'counts.npz'}", "data.num_workers=0"),
+    )
+    assert code == 0, err
+    known = json.loads((REAL / "mfnet_weights" / "expected_confusions.json").read_text())
+    expected = np.array(known[f"MFNet_final_pth/{split}"]["confusion"])
+    found = Counts.load(tmp_path / "counts.npz").whole()
+    assert np.abs(found - expected).sum() // 2 == 0, "pixels that differ"
