@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,11 +40,29 @@ class Golden:
     arrays: dict[str, np.ndarray]
     fill: ModuleType
 
+    def classes(self, bias: str) -> int:
+        """Length of the released tensor called `bias`."""
+        (length,) = self.facts["keys"][bias][0]
+        return int(length)
+
     @property
     def image(self) -> tuple[Tensor, Tensor]:
         """The input as the lab feeds it: rgb (1, 3, H, W) and thermal (1, 1, H, W) in [0, 1]."""
         image = torch.from_numpy(self.arrays["image_uint8"]).float()[None] / 255
         return image[:, :3], image[:, 3:]
+
+
+def recorded(pattern: str, *, fast: Collection[str]) -> list[Any]:
+    """Every record whose name matches: parameters (name, what the group of the pattern matched).
+
+    Records that are not named as `fast` are marked slow. None where the material is missing.
+    """
+    found = [(path.stem, re.fullmatch(pattern, path.stem)) for path in FOLDER.glob("*.json")]
+    return [
+        pytest.param(name, match[1], id=name, marks=() if name in fast else pytest.mark.slow)
+        for name, match in sorted(found)
+        if match
+    ]
 
 
 def load(name: str) -> Golden:

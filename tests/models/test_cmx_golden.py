@@ -23,10 +23,14 @@ AS_TEMPORAL = ("model/inputs=temporal",)
 STREAMS = {"rgb": "", "x": "extra_"}
 
 
-def network(*overrides: str) -> CMX:
+def network(model: str, classes: int, *overrides: str) -> CMX:
     """The network as a user asks for it on the command line, for evaluation."""
-    net: CMX = build(golden.compose(*overrides, "model.num_classes=9").model)
+    net: CMX = build(golden.compose(model, f"model.num_classes={classes}", *overrides).model)
     return net.eval()
+
+
+def classes_of(recorded: golden.Golden) -> int:
+    return recorded.classes("decode_head.linear_pred.bias")
 
 
 def places(net: CMX) -> dict[str, str]:
@@ -84,16 +88,16 @@ def check(recorded: golden.Golden, found: dict[str, Tensor]) -> None:
     assert np.array_equal(found["logits"][0].argmax(0).numpy(), recorded.arrays["argmax"])
 
 
-@golden.requires_golden
-@pytest.mark.parametrize("size", ["b0", pytest.param("b2", marks=pytest.mark.slow)])
-def test_cmx_release(size: str) -> None:
-    recorded = golden.load(f"cmx_mit_{size}")
-    net = network(f"model=cmx_{size}", *AS_CMX_EVALUATES)
+@pytest.mark.parametrize(("name", "size"), golden.recorded(r"cmx_mit_(b\d).*", fast=["cmx_mit_b0"]))
+def test_cmx_release(name: str, size: str) -> None:
+    recorded = golden.load(name)
+    classes = classes_of(recorded)
+    net = network(f"model=cmx_{size}", classes, *AS_CMX_EVALUATES)
     golden.fill_network(net, recorded)
     assert set(net.state_dict()) == set(recorded.facts["keys"])
     found = record(net, *recorded.image)
 
-    as_trained = network(f"model=cmx_{size}", *AS_CMX_TRAINS)
+    as_trained = network(f"model=cmx_{size}", classes, *AS_CMX_TRAINS)
     as_trained.load_state_dict(net.state_dict())
     with torch.inference_mode():
         logits = as_trained(*recorded.image).logits
@@ -101,10 +105,12 @@ def test_cmx_release(size: str) -> None:
     check(recorded, found | {"logits_decoder_eps_1e-3": logits})
 
 
-@golden.requires_golden
-def test_temporal_release() -> None:
-    recorded = golden.load("temporal_cmx_b2")
-    net = network("model=cmx_b2", *AS_TEMPORAL)
+@pytest.mark.parametrize(
+    ("name", "size"), golden.recorded(r"temporal_cmx_(b\d).*", fast=["temporal_cmx_b2"])
+)
+def test_temporal_release(name: str, size: str) -> None:
+    recorded = golden.load(name)
+    net = network(f"model=cmx_{size}", classes_of(recorded), *AS_TEMPORAL)
     golden.fill_network(net, recorded, unused=("voting.",))
     found = record(net, *recorded.image)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from rgbt.models.mask2former.backbone import LEVELS
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.types import MaskPair
-from tests.models.golden import check_all, fill_network, load, network, requires_golden
+from tests.models.golden import check_all, fill_network, load, network, recorded
 
 HEADS = {"rgbt": "", "rgb": "rgb_head.", "thermal": "thermal_head."}
 
@@ -106,11 +106,13 @@ def all_outputs(
     return found
 
 
-@requires_golden
-@pytest.mark.parametrize("name", ["swin_t", pytest.param("swin_s", marks=pytest.mark.slow)])
-def test_every_recorded_tensor(name: str) -> None:
-    golden = load(f"crm_{name}")
-    net = network(f"mask2former_{name}").eval()
+@pytest.mark.parametrize(
+    ("name", "size"), recorded(r"crm_swin_([tsb]).*", fast=["crm_swin_t", "crm_swin_s"])
+)
+def test_every_recorded_tensor(name: str, size: str) -> None:
+    golden = load(name)
+    classes = golden.classes("network.sem_seg_head.predictor.class_embed.bias") - 1
+    net = network(f"mask2former_swin_{size}", classes).eval()
     fill_network(net, golden, prefix="network.")
     hidden = torch.from_numpy(golden.arrays["mask_pair"]).bool()[:, :, 0]
     with torch.no_grad():
