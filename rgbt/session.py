@@ -30,6 +30,7 @@ from rgbt.randomness import derive
 from rgbt.tracking.pictures import Example
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.types import VIEWS, View
+from rgbt.weights.load import load_weights
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,6 @@ def open_session(config: DictConfig) -> Session:
         )
     source = weights_file(config)
     if source is not None:
-        from rgbt.weights.load import load_weights
-
         report = load_weights(model, source, tuple(config.model.fresh))
         sys.stderr.write(f"rgbt: {report.sentence()}\n")
     return Session(

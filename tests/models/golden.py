@@ -117,16 +117,17 @@ def deviations(golden: Golden, found: dict[str, Tensor]) -> dict[str, float]:
     skipped = {"argmax", "network_input", "mask_pair"}
     wanted = {key for key in golden.facts["outputs"] if key not in skipped}
     assert wanted <= found.keys(), f"not computed: {sorted(wanted - found.keys())}"
-    result = {}
-    for key in sorted(wanted):
-        about, value = golden.facts["outputs"][key], found[key].detach().contiguous().numpy()
-        assert list(value.shape) == about["shape"], key
-        if about["stored"] == "sampled":
-            positions = golden.fill.sample_positions(key, value.size, about["count"])
-            value = value.ravel()[positions]
-        difference = float(np.abs(value - golden.arrays[key]).max())
-        result[key] = difference / about["tol_abs"]
-    return result
+    return {key: deviation(golden, key, found[key]) for key in sorted(wanted)}
+
+
+def deviation(golden: Golden, key: str, found: Tensor) -> float:
+    """Largest difference of one recorded tensor, in units of its tolerance."""
+    about, value = golden.facts["outputs"][key], found.detach().contiguous().numpy()
+    assert list(value.shape) == about["shape"], key
+    if about["stored"] == "sampled":
+        positions = golden.fill.sample_positions(key, value.size, about["count"])
+        value = value.ravel()[positions]
+    return float(np.abs(value - golden.arrays[key]).max() / about["tol_abs"])
 
 
 def check_all(golden: Golden, found: dict[str, Tensor]) -> None:

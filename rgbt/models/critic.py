@@ -1,0 +1,76 @@
+"""The critic of adversarial adaptation: which domain does this map come from?"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_shape
+
+STRIDE = 32
+
+
+class Critic(nn.Module):
+    """Five strided 4x4 convolutions, no normalisation, no sigmoid.
+
+    Source: AdaptSegNet, Sec. 3.2 (its discriminator); HeatNet and the thesis use the same.
+    Weights keep torch's initialisation, as released.
+
+    Args:
+        in_channels: of the map that is judged: K for scores or probabilities.
+        base_width: channels of the first convolution; doubled by each of the next three.
+        upsample: enlarge the verdicts 32 times, back to the size of the map (HeatNet); false:
+            one verdict per 32 pixels (AdaptSegNet, thesis with two heads).
+        align_corners: of that enlargement; false in HeatNet's release, true in the thesis' port
+            of it. Must be false where nothing is enlarged.
+
+    Raises:
+        InputError: align_corners without upsample.
+    """
+
+    def __init__(
+        self, *, in_channels: int, base_width: int, upsample: bool, align_corners: bool
+    ) -> None:
+        super().__init__()
+        if align_corners and not upsample:
+            raise InputError(
+                "critic.align_corners=true has no effect with critic.upsample=false; "
+                "set it to false."
+            )
+        self.upsample = upsample
+        self.align_corners = align_corners
+        widths = [base_width * factor for factor in (1, 2, 4, 8)]
+        self.conv1 = nn.Conv2d(in_channels, widths[0], 4, stride=2, padding=1)
+        self.conv2 = nn.Conv2d(widths[0], widths[1], 4, stride=2, padding=1)
+        self.conv3 = nn.Conv2d(widths[1], widths[2], 4, stride=2, padding=1)
+        self.conv4 = nn.Conv2d(widths[2], widths[3], 4, stride=2, padding=1)
+        self.classifier = nn.Conv2d(widths[3], 1, 4, stride=2, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Verdicts, not squashed; which number stands for which domain is the loss's choice.
+
+        Args:
+            x: (N, in_channels, H, W), sides of at least 32.
+
+        Returns:
+            (N, 1, h, w) with h = H // 32 and w = W // 32, or 32 times that with `upsample`:
+            H and W where they are multiples of 32, a little less otherwise.
+
+        Raises:
+            InputError: a map that is too small.
+            ValueError: another number of channels.
+        """
+        sizes = check_shape("map", x, "N C H W", C=self.conv1.in_channels)
+        if min(sizes["H"], sizes["W"]) < STRIDE:
+            raise InputError(
+                f"a critic judges maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} x "
+                f"{sizes['W']}; use larger crops, or a critic on the class scores."
+            )
+        for conv in (self.conv1, self.conv2, self.conv3, self.conv4):
+            x = F.leaky_relu(conv(x), 0.2)
+        verdicts: Tensor = self.classifier(x)
+        if not self.upsample:
+            return verdicts
+        return F.interpolate(
+            verdicts, scale_factor=STRIDE, mode="bilinear", align_corners=self.align_corners
+        )

@@ -1,0 +1,136 @@
+"""From features to class scores: the atrous spatial pyramid, alone or before three up blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.checks import InputError, check_choice
+from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
+
+Decoder = Literal["basic", "modified_released", "modified_thesis"]
+DECODERS = ("basic", "modified_released", "modified_thesis")
+
+
+@dataclass(frozen=True)
+class HeadShape:
+    """What every head of a network has in common.
+
+    Attributes:
+        in_channels: of the features.
+        num_classes: K.
+        decoder: "basic": the pyramid's K maps; "modified_released": 1024, 256, 64, 64 and K maps
+            at base width 64; "modified_thesis": K maps throughout.
+        rates: dilations of the pyramid.
+        summed_rates: those that count.
+        dropout: of channels in the modified decoders.
+        align_corners: of the up blocks.
+    """
+
+    in_channels: int
+    num_classes: int
+    decoder: Decoder
+    rates: tuple[int, ...]
+    summed_rates: tuple[int, ...]
+    dropout: DropRates
+    align_corners: bool
+
+    def __post_init__(self) -> None:
+        check_choice("model.decoder", self.decoder, DECODERS)
+        check_rates(self.dropout)
+        summed = set(self.summed_rates)
+        if min(self.rates, default=0) < 1 or len(set(self.rates)) < len(self.rates):
+            raise InputError(f"model.rates needs different dilations >= 1, got {self.rates}.")
+        if not summed or not summed <= set(self.rates) or len(summed) < len(self.summed_rates):
+            raise InputError(
+                f"model.summed_rates must name some of model.rates {self.rates}, each once, "
+                f"got {self.summed_rates}."
+            )
+        if self.decoder == "basic" and any(self.dropout):
+            raise InputError(
+                "model.dropout drops channels of a modified decoder; with model.decoder=basic it "
+                f"must be [0.0, 0.0], got {self.dropout}."
+            )
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels after the pyramid and after each up block."""
+        k, c = self.num_classes, self.in_channels
+        widths: dict[str, tuple[int, ...]] = {
+            "basic": (k,),
+            "modified_released": (c // 2, c // 8, c // 32, c // 32),
+            "modified_thesis": (k, k, k, k),
+        }
+        return widths[self.decoder]
+
+
+class Pyramid(nn.Module):
+    """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
+
+    Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
+    MaxSquareLoss and the thesis leave their loop early, so that only the first two count, while
+    the others still belong to the parameters; ADVENT sums all.
+
+    Args:
+        in_channels: of the features.
+        out_channels: of the sum.
+        rates: dilations, one convolution each.
+        summed_rates: those that count.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        rates: tuple[int, ...],
+        summed_rates: tuple[int, ...],
+    ) -> None:
+        super().__init__()
+        self.conv2d_list = nn.ModuleList(
+            nn.Conv2d(in_channels, out_channels, 3, padding=rate, dilation=rate) for rate in rates
+        )
+        self.summed = [rates.index(rate) for rate in summed_rates]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, h, w) -> (N, out, h, w)."""
+        first, *others = self.summed
+        result: Tensor = self.conv2d_list[first](x)
+        for index in others:
+            result = result + self.conv2d_list[index](x)
+        return result
+
+
+class Head(nn.Module):
+    """Pyramid, and in the modified decoders three up blocks.
+
+    Source: thesis, Sec. III-B and Fig. 5.   Released: the modified decoder ends with a 1x1
+    convolution; see `HeadShape.decoder`.
+    """
+
+    def __init__(self, shape: HeadShape) -> None:
+        super().__init__()
+        self.dropout = shape.dropout
+        widths = shape.widths
+        self.aspp = Pyramid(shape.in_channels, widths[0], shape.rates, shape.summed_rates)
+        self.ups = nn.ModuleList(
+            UpBlock(before, after, align_corners=shape.align_corners)
+            for before, after in zip(widths, widths[1:], strict=False)
+        )
+        self.final = (
+            nn.Conv2d(widths[-1], shape.num_classes, 1)
+            if shape.decoder == "modified_released"
+            else nn.Identity()
+        )
+
+    def forward(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(N, in, h, w) -> (N, K, h, w), or (N, K, 8 h, 8 w) from a modified decoder.
+
+        Raises:
+            ValueError: no generator in training with dropout.
+        """
+        rates = self.dropout if self.training else (0.0, 0.0)
+        result: Tensor = self.final(enlarge(self.aspp(x), self.ups, rates, generator))
+        return result

@@ -1,0 +1,164 @@
+"""DeepLab v2: one image in, class scores of one of its heads out."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice
+from rgbt.geometry import padded_hw
+from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
+from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid
+from rgbt.models.inputs import Inputs, only_view
+from rgbt.models.upsampling import DropRates
+from rgbt.types import MaskPair, Output, View
+
+STRIDE = 8
+"""Of the backbone; the modified decoders double the size three times."""
+
+
+class DeepLabV2(nn.Module):
+    """DeepLab v2 with a backbone that all domains share and one head, or one per domain.
+
+    Sees the RGB image or the thermal image, never both. Weights of convolutions are drawn from
+    N(0, 0.01), as released; biases and slopes keep torch's initialisation.
+
+    Source: DeepLab v2; thesis (J. Sun, Multi-head), Sec. III.   Released: AdaptSegNet, ADVENT and
+    MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
+
+    Args:
+        num_classes: K; 14 in the thesis.
+        depths: bottlenecks per stage: (3, 4, 23, 3) for ResNet-101.
+        base_width: channels of the stem; the other widths are multiples of it.
+        ceil_mode: the pooling rounds up (released); false: down, which the modified decoders need
+            to come back to the size of the image.
+        train_norm: "all": the backbone's normalisations are trained (thesis' code);
+            "statistics": scale and shift are not, statistics are (AdaptSegNet, ADVENT).
+        heads: their names, the first is the default; ("main",), or one per domain.
+        auxiliary: a further pyramid on the third stage (AdaptSegNet and MaxSquareLoss).
+        decoder: see `HeadShape`. "modified_thesis" is what the text says, "modified_released"
+            what the code has.
+        rates: dilations of the pyramid.
+        summed_rates: those that count: all (DeepLab v2, ADVENT), or the first two (AdaptSegNet,
+            MaxSquareLoss, thesis' code). The parameters are the same.
+        dropout: of channels, before the first up block and after each; (0, 0) without up blocks.
+        align_corners: of all enlargements: true where the releases enlarge the scores themselves,
+            false in the thesis' up blocks.
+        inputs: normalisation of the images, with three thermal channels.
+
+    Raises:
+        InputError: values that do not fit each other.
+    """
+
+    views: tuple[View, ...] = ("rgb", "thermal")
+    pretrained_parts: tuple[str, ...] = ("backbone.",)
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: int,
+        depths: tuple[int, int, int, int],
+        base_width: int,
+        ceil_mode: bool,
+        train_norm: TrainNorm,
+        heads: tuple[str, ...],
+        auxiliary: bool,
+        decoder: Decoder,
+        rates: tuple[int, ...],
+        summed_rates: tuple[int, ...],
+        dropout: DropRates,
+        align_corners: bool,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        shape = HeadShape(
+            32 * base_width, num_classes, decoder, rates, summed_rates, dropout, align_corners
+        )
+        _check(depths, heads, inputs)
+        check_choice("model.train_norm", train_norm, ("all", "statistics"))
+        if ceil_mode and decoder != "basic":
+            raise InputError(
+                f"model.decoder={decoder} enlarges 8 times, which comes back to the size of the "
+                "image only with model.ceil_mode=false."
+            )
+        self.num_classes = num_classes
+        self.align_corners = align_corners
+        # Scores that are interpolated fit images of any size.
+        self.multiple = 1 if decoder == "basic" else STRIDE
+        self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
+        self.heads = nn.ModuleDict({name: Head(shape) for name in heads})
+        self.auxiliary = (
+            Pyramid(16 * base_width, num_classes, rates, summed_rates) if auxiliary else None
+        )
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.normal_(module.weight, 0.0, 0.01)
+        self.inputs = inputs
+
+    def forward(  # noqa: PLR0913 - what every network takes, and the head
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        head: str | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores at the size of the image, from one image by one head.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1].
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: cells of the image padded to multiples of 32, True = the pixels are hidden.
+            views: the image that is seen, ("rgb",) or ("thermal",); () is RGB.
+            head: its name; None: the first.
+            generator: draws the dropped channels; needed in training unless `dropout` is 0.
+
+        Returns:
+            logits: (N, K, H, W).
+            aux: "aux_logits" (N, K, H, W) of the auxiliary head, where there is one.
+
+        Raises:
+            ValueError: shapes that do not fit; no generator where one is needed.
+            InputError: another view or head; mask cells that do not divide the padded image.
+        """
+        view = only_view(views, self.views, "DeepLabV2")
+        name = next(iter(self.heads)) if head is None else head
+        check_choice("head", name, self.heads)
+        images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
+        features = self.backbone(images.rgb if view == "rgb" else images.thermal)
+
+        image_hw = rgb.shape[2], rgb.shape[3]
+        aux = {}
+        if self.auxiliary is not None:
+            aux["aux_logits"] = self._at_image(self.auxiliary(features.layer3), image_hw)
+        scores = self.heads[name](features.layer4, generator)
+        return Output(self._at_image(scores, image_hw), aux)
+
+    def _at_image(self, scores: Tensor, image_hw: tuple[int, int]) -> Tensor:
+        """Scores enlarged to the padded image where they are smaller, less the padding."""
+        full = padded_hw(image_hw, self.multiple)
+        if scores.shape[2:] != full:
+            scores = F.interpolate(
+                scores, size=full, mode="bilinear", align_corners=self.align_corners
+            )
+        return scores[..., : image_hw[0], : image_hw[1]]
+
+
+def _check(depths: tuple[int, ...], heads: tuple[str, ...], inputs: Inputs) -> None:
+    """Refuse what the parts cannot be built from, naming the key."""
+    if min(depths) < 1:
+        raise InputError(f"model.depths needs at least one block per stage, got {depths}.")
+    usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
+    if not heads or len(set(heads)) < len(heads) or not usable:
+        raise InputError(
+            "model.heads needs different names made of letters, such as [main] or "
+            f"[source, target], got {list(heads)}."
+        )
+    if inputs.thermal_channels != 3:
+        raise InputError(
+            "model.inputs must repeat thermal for three channels, because RGB and thermal images "
+            "pass the same backbone; choose model/inputs=half_three."
+        )

@@ -1,0 +1,202 @@
+"""MFNet: two small convolutional encoders, one per image, and a decoder that adds their features.
+
+Parameter names are those of the authors' PyTorch release; "inf" (infrared) is the thermal encoder.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.models.inputs import Inputs, only_view
+from rgbt.types import MaskPair, Output, View
+
+STRIDE = 16
+"""Four halvings, which the decoder undoes exactly."""
+
+LEAKY_SLOPE = 0.2
+"""Of every leaky ReLU, as released."""
+
+
+class Features(NamedTuple):
+    """Features of an encoder at strides 2, 4, 8 (before they are pooled) and 16."""
+
+    half: Tensor
+    quarter: Tensor
+    eighth: Tensor
+    last: Tensor
+
+
+class ConvUnit(nn.Module):
+    """3x3 convolution, batch normalisation, leaky ReLU.
+
+    Args:
+        in_channels: of the input.
+        out_channels: of the output.
+        dilation: of the convolution; its padding too.
+        activation: whether there is a leaky ReLU.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, dilation: int = 1, activation: bool = True
+    ) -> None:
+        super().__init__()
+        self.activation = activation
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=dilation, dilation=dilation)
+        self.bn = nn.BatchNorm2d(out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, out, H, W)."""
+        y: Tensor = self.bn(self.conv(x))
+        return F.leaky_relu(y, LEAKY_SLOPE) if self.activation else y
+
+
+class MiniInception(nn.Module):
+    """Three levels of a plain and a dilated unit side by side, each half of the channels.
+
+    Source: MFNet, mini-inception block.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        half = out_channels // 2
+        self.conv1_left = ConvUnit(in_channels, half)
+        self.conv1_right = ConvUnit(in_channels, half, dilation=2)
+        self.conv2_left = ConvUnit(out_channels, half)
+        self.conv2_right = ConvUnit(out_channels, half, dilation=2)
+        self.conv3_left = ConvUnit(out_channels, half)
+        self.conv3_right = ConvUnit(out_channels, half, dilation=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, out, H, W)."""
+        x = torch.cat((self.conv1_left(x), self.conv1_right(x)), 1)
+        x = torch.cat((self.conv2_left(x), self.conv2_right(x)), 1)
+        return torch.cat((self.conv3_left(x), self.conv3_right(x)), 1)
+
+
+class MFNet(nn.Module):
+    """Multi-spectral fusion network of Ha et al.
+
+    Source: MFNet (Ha et al., IROS 2017).   Released: haqishen/MFNet-pytorch.
+
+    Args:
+        num_classes: K.
+        rgb_widths: channels of the RGB encoder at strides 1, 2, 4 and 8, the last even; stride 16
+            has those of stride 8, since the decoder adds the two.
+        thermal_widths: of the thermal encoder, likewise.
+        decoder_width: channels of the decoder's last features, at stride 2.
+        final_activation: whether the logits are the output of a leaky ReLU, as of every other
+            unit. Released: true. false: its input, with the same weights and the same class at
+            every pixel, for the leaky ReLU rises.
+        inputs: normalisation of the images.
+
+    Raises:
+        InputError: widths that are not positive, or odd where a mini-inception halves them.
+    """
+
+    views: tuple[View, ...] = ("rgbt",)
+    pretrained_parts: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        *,
+        num_classes: int,
+        rgb_widths: tuple[int, int, int, int],
+        thermal_widths: tuple[int, int, int, int],
+        decoder_width: int,
+        final_activation: bool,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        _check(rgb_widths, thermal_widths, decoder_width)
+        self.num_classes = num_classes
+        self._add_encoder("rgb", 3, rgb_widths)
+        self._add_encoder("inf", inputs.thermal_channels, thermal_widths)
+        pairs = zip(rgb_widths, thermal_widths, strict=True)
+        _, half, quarter, eighth = (sum(pair) for pair in pairs)
+        self.decode4 = ConvUnit(eighth, quarter)
+        self.decode3 = ConvUnit(quarter, half)
+        self.decode2 = ConvUnit(half, decoder_width)
+        self.decode1 = ConvUnit(decoder_width, num_classes, activation=final_activation)
+        self.inputs = inputs
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
+    ) -> Output:
+        """Class scores from both images.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1].
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: hidden cells of the image padded to multiples of 32, (N, h, w) bool each; None:
+                nothing is hidden.
+            views: () or ("rgbt",).
+            generator: not drawn from.
+
+        Returns:
+            logits: (N, K, H, W).
+            aux: empty.
+
+        Raises:
+            ValueError: shapes that do not fit each other.
+            InputError: another view, or mask cells that do not divide the padded image.
+        """
+        only_view(views, self.views, "MFNet")
+        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+        encoded = (self._encode("rgb", images.rgb), self._encode("inf", images.thermal))
+        half, quarter, eighth, last = (torch.cat(pair, 1) for pair in zip(*encoded, strict=True))
+
+        x = self.decode4(doubled(last) + eighth)
+        x = self.decode3(doubled(x) + quarter)
+        x = self.decode2(doubled(x) + half)
+        x = self.decode1(doubled(x))
+        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
+
+    def _add_encoder(self, suffix: str, channels: int, widths: tuple[int, int, int, int]) -> None:
+        full, half, quarter, eighth = widths
+        units: dict[str, nn.Module] = {
+            "conv1": ConvUnit(channels, full),
+            "conv2_1": ConvUnit(full, half),
+            "conv2_2": ConvUnit(half, half),
+            "conv3_1": ConvUnit(half, quarter),
+            "conv3_2": ConvUnit(quarter, quarter),
+            "conv4": MiniInception(quarter, eighth),
+            "conv5": MiniInception(eighth, eighth),
+        }
+        for name, unit in units.items():
+            self.add_module(f"{name}_{suffix}", unit)
+
+    def _encode(self, suffix: str, image: Tensor) -> Features:
+        def unit(name: str, x: Tensor) -> Tensor:
+            result: Tensor = self.get_submodule(f"{name}_{suffix}")(x)
+            return result
+
+        half = unit("conv2_2", unit("conv2_1", F.max_pool2d(unit("conv1", image), 2)))
+        quarter = unit("conv3_2", unit("conv3_1", F.max_pool2d(half, 2)))
+        eighth = unit("conv4", F.max_pool2d(quarter, 2))
+        return Features(half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2)))
+
+
+def doubled(x: Tensor) -> Tensor:
+    """Every pixel four times: (N, C, H, W) -> (N, C, 2 H, 2 W)."""
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def _check(rgb: tuple[int, ...], thermal: tuple[int, ...], decoder_width: int) -> None:
+    for name, widths in (("rgb_widths", rgb), ("thermal_widths", thermal)):
+        if min(widths) < 1 or widths[3] % 2:
+            raise InputError(
+                f"model.{name} must be positive, the last one even, got {list(widths)}."
+            )
+    if decoder_width < 1:
+        raise InputError(f"model.decoder_width must be positive, got {decoder_width}.")

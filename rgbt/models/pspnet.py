@@ -1,0 +1,240 @@
+"""HeatNet's PSPNet: a residual encoder per image, pyramid pooling, a decoder of three steps."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice
+from rgbt.models.inputs import Images, Inputs, only_view
+from rgbt.models.resnet import bottleneck_stage
+from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
+from rgbt.types import MaskPair, Output, View
+
+STRIDE = 8
+"""Of the encoder; the decoder doubles the size three times."""
+
+BINS = (1, 2, 3, 6)
+"""Cells per side of the pooled maps (PSPNet, Sec. 3.2)."""
+
+BRANCHES = ("", "_2")
+"""What the released names of the first and second branch end with."""
+
+Modalities = Literal["late_fusion", "early_fusion", "rgb", "thermal"]
+VIEWS_OF: dict[str, tuple[View, ...]] = {
+    "late_fusion": ("rgbt",),
+    "early_fusion": ("rgbt",),
+    "rgb": ("rgb",),
+    "thermal": ("thermal",),
+}
+
+
+class PSPNet(nn.Module):
+    """PSPNet with ResNet-50 and without auxiliary head.
+
+    Two branches are concatenated at 1/8 of the size, before the third stage. Weights are drawn as
+    released: convolutions N(0, 0.02), normalisations N(1, 0.02) and 0; biases of convolutions and
+    slopes keep torch's initialisation.
+
+    Source: HeatNet, Sec. III; PSPNet.   Released: JohanVer/heatnet, jzuern/heatnet-pub
+    (architecture "pspnet"; the names of the weights are theirs without "trgb_segnet.").
+
+    Args:
+        num_classes: K; 13 in the release, 14 in the thesis.
+        depths: bottlenecks per stage.
+        base_width: channels of the stem; the other widths are multiples of it.
+        modalities: "late_fusion", a stem and two stages for each image (HeatNet); "early_fusion",
+            one stem for all channels; "rgb" or "thermal", one image alone.
+        dropout: of channels, before the decoder and after each of its blocks.
+        align_corners: of all enlargements; false is the release on current PyTorch, true the
+            thesis' port of it.
+        inputs: normalisation of the images.
+    """
+
+    pretrained_parts: tuple[str, ...] = ("feats.",)
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: int,
+        depths: tuple[int, int, int, int],
+        base_width: int,
+        modalities: Modalities,
+        dropout: DropRates,
+        align_corners: bool,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        check_choice("model.modalities", modalities, VIEWS_OF)
+        check_rates(dropout)
+        if min(depths) < 1:
+            raise InputError(f"model.depths needs at least one block per stage, got {depths}.")
+        self.num_classes = num_classes
+        self.views = VIEWS_OF[modalities]
+        self.modalities = modalities
+        self.dropout = dropout
+        width, thermal = base_width, inputs.thermal_channels
+        channels = {
+            "late_fusion": (3, thermal),
+            "early_fusion": (3 + thermal,),
+            "rgb": (3,),
+            "thermal": (thermal,),
+        }
+        self.feats = Encoder(channels[modalities], depths, width)
+        self.psp = PyramidPooling(32 * width, 16 * width, align_corners=align_corners)
+        self.up_1 = UpBlock(16 * width, 4 * width, align_corners=align_corners)
+        self.up_2 = UpBlock(4 * width, width, align_corners=align_corners)
+        self.up_3 = UpBlock(width, width, align_corners=align_corners)
+        self.final = nn.Sequential(nn.Conv2d(width, num_classes, 1))
+        self.apply(_initialise)
+        self.inputs = inputs
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores at the size of the image.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1].
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: cells of the image padded to multiples of 32, True = the pixels are hidden.
+            views: () or the one of `self.views`.
+            generator: draws the dropped channels; needed in training unless `dropout` is 0.
+
+        Returns:
+            logits: (N, K, H, W).
+            aux: what critics may judge, besides the logits. With w = base_width, branches
+                concatenated, sides H and W rounded up to multiples of 8 and then divided by s:
+                "layer4" (32 w, s = 8), "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8),
+                "layer1" (4 w per branch, s = 4), "stem" (w per branch, s = 4).
+
+        Raises:
+            ValueError: shapes that do not fit; no generator where one is needed.
+            InputError: another view; mask cells that do not divide the padded image.
+        """
+        only_view(views, self.views, "PSPNet")
+        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+        features = self.feats(self._seen(images))
+        rates = self.dropout if self.training else (0.0, 0.0)
+        x = self.psp(features["layer4"])
+        x = enlarge(x, (self.up_1, self.up_2, self.up_3), rates, generator)
+        logits = self.final(x)[..., : rgb.shape[2], : rgb.shape[3]]
+        return Output(logits, features)
+
+    def _seen(self, images: Images) -> tuple[Tensor, ...]:
+        """One image per branch of the encoder."""
+        if self.modalities == "late_fusion":
+            return images
+        if self.modalities == "early_fusion":
+            return (torch.cat(images, 1),)
+        return (images.rgb if self.modalities == "rgb" else images.thermal,)
+
+
+class Encoder(nn.Module):
+    """ResNet whose last two stages are dilated instead of strided.
+
+    Stem and first two stages exist once per image. The first block of a dilated stage is not
+    dilated; after two branches the third stage keeps its width, so that it has no projection.
+
+    Args:
+        channels: of each image, one or two.
+        depths: bottlenecks per stage.
+        width: channels of the stem.
+    """
+
+    def __init__(
+        self, channels: tuple[int, ...], depths: tuple[int, int, int, int], width: int
+    ) -> None:
+        super().__init__()
+        self.branches = BRANCHES[: len(channels)]
+        for end, count in zip(self.branches, channels, strict=True):
+            stem = nn.Conv2d(count, width, 7, stride=2, padding=3, bias=False)
+            self.add_module(f"conv1{end}", stem)
+            self.add_module(f"bn1{end}", nn.BatchNorm2d(width))
+            self.add_module(f"layer1{end}", bottleneck_stage(width, width, depths[0]))
+            layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2)
+            self.add_module(f"layer2{end}", layer2)
+        fused = len(channels) * 8 * width
+        self.layer3 = bottleneck_stage(fused, 4 * width, depths[2], dilations=(1, 2))
+        self.layer4 = bottleneck_stage(16 * width, 8 * width, depths[3], dilations=(1, 4))
+
+    def forward(self, images: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Features by the name of their stage, see `PSPNet.forward`."""
+        found = [self._branch(*each) for each in zip(self.branches, images, strict=True)]
+        stem, layer1, layer2 = (_concatenated(maps) for maps in zip(*found, strict=True))
+        layer3 = self.layer3(layer2)
+        layer4 = self.layer4(layer3)
+        return {
+            "layer4": layer4,
+            "layer3": layer3,
+            "layer2": layer2,
+            "layer1": layer1,
+            "stem": stem,
+        }
+
+    def _branch(self, end: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        conv1, bn1, layer1, layer2 = (
+            self.get_submodule(f"{name}{end}") for name in ("conv1", "bn1", "layer1", "layer2")
+        )
+        stem = F.max_pool2d(F.relu(bn1(conv1(image))), 3, stride=2, padding=1)
+        first = layer1(stem)
+        return stem, first, layer2(first)
+
+
+class PyramidPooling(nn.Module):
+    """Means over 1, 4, 9 and 36 cells, projected, enlarged, and joined with the map.
+
+    There is neither normalisation nor activation inside the four branches.
+
+    Source: PSPNet, Fig. 3.   Released: HeatNet, whose branches keep all channels.
+
+    Args:
+        channels: of the map.
+        out_channels: of the result.
+        align_corners: of the enlargement.
+    """
+
+    def __init__(self, channels: int, out_channels: int, *, align_corners: bool) -> None:
+        super().__init__()
+        self.align_corners = align_corners
+        self.stages = nn.ModuleList(
+            nn.Sequential(nn.AdaptiveAvgPool2d(bins), nn.Conv2d(channels, channels, 1, bias=False))
+            for bins in BINS
+        )
+        joined = (len(BINS) + 1) * channels
+        self.bottleneck = nn.Conv2d(joined, out_channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, out, h, w), >= 0."""
+        # A 1x1 convolution of joined, enlarged maps is the sum of the enlarged 1x1 convolutions of
+        # the small ones; a fifth of the multiplications remains.
+        *shares, own = torch.split(self.bottleneck.weight, x.shape[1], dim=1)
+        result = F.conv2d(x, own, self.bottleneck.bias)
+        for stage, share in zip(self.stages, shares, strict=True):
+            small = F.conv2d(stage(x), share)
+            result = result + F.interpolate(
+                small, size=x.shape[2:], mode="bilinear", align_corners=self.align_corners
+            )
+        return F.relu(result)
+
+
+def _concatenated(maps: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat(maps, 1) if len(maps) > 1 else maps[0]
+
+
+def _initialise(module: nn.Module) -> None:
+    """As `PSPNet` says; biases of convolutions and slopes are left alone."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.normal_(module.weight, 0.0, 0.02)
+    elif isinstance(module, nn.BatchNorm2d):
+        nn.init.normal_(module.weight, 1.0, 0.02)
+        nn.init.zeros_(module.bias)

@@ -1,0 +1,249 @@
+"""RTFNet: two ResNet encoders whose features are added, and a decoder of Upception blocks.
+
+Parameter names are the release's, so that its weights load as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice
+from rgbt.models.inputs import Inputs, only_view
+from rgbt.models.resnet import basic_stage, bottleneck_stage
+from rgbt.types import MaskPair, Output, View
+
+STRIDE = 32
+"""Five halvings, which the decoder undoes exactly."""
+
+BLOCKS = {
+    18: (2, 2, 2, 2),
+    34: (3, 4, 6, 3),
+    50: (3, 4, 6, 3),
+    101: (3, 4, 23, 3),
+    152: (3, 8, 36, 3),
+}
+"""Depth of a ResNet -> blocks of its stages (He et al., Table 1)."""
+
+BASIC = (18, 34)
+"""Depths of basic blocks; the others have bottlenecks, which end in four times as many channels."""
+
+
+class UpceptionA(nn.Module):
+    """1x1, 3x3 and 3x3 convolution and the identity: neither size nor channels change.
+
+    Source: RTFNet, Upception block A.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.conv3 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn3 = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) -> the same shape, >= 0."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        y = F.relu(self.bn2(self.conv2(y)))
+        return F.relu(self.bn3(self.conv3(y)) + x)
+
+
+class UpceptionB(nn.Module):
+    """1x1, 3x3 and transposed convolution and a transposed shortcut: twice the size.
+
+    Source: RTFNet, Upception block B.
+
+    Args:
+        in_channels: of the input.
+        out_channels: of the output.
+        relu: whether the sum passes a ReLU.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, *, relu: bool) -> None:
+        super().__init__()
+        self.relu = relu
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(out_channels)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(out_channels)
+        self.conv3 = nn.ConvTranspose2d(out_channels, out_channels, 2, stride=2, bias=False)
+        self.bn3 = nn.BatchNorm2d(out_channels)
+        self.upsample = nn.Sequential(
+            nn.ConvTranspose2d(in_channels, out_channels, 2, stride=2, bias=False),
+            nn.BatchNorm2d(out_channels),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, out, 2 H, 2 W)."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        y = F.relu(self.bn2(self.conv2(y)))
+        y = self.bn3(self.conv3(y)) + self.upsample(x)
+        return F.relu(y) if self.relu else y
+
+
+class RTFNet(nn.Module):
+    """RGB-thermal fusion network of Sun et al.
+
+    The thermal features are added to the RGB features after the stem and after each of the four
+    stages; the thermal encoder never sees the RGB image.
+
+    Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
+
+    Args:
+        num_classes: K.
+        depth: of both ResNets; the release edits a constant, 152 where nothing is said.
+        base_width: channels of the stem, a positive even number; everything scales with it. 64 is
+            ResNet's own.
+        final_relu: whether the logits are the output of the last block's ReLU, hence never
+            negative. Released: true. false: the sum before it, with the same weights.
+        thermal_stem: start of the thermal encoder's first convolution. "rgb_mean": the mean of the
+            RGB encoder's over its input channels (released), or a copy where `inputs` repeats
+            thermal three times; "xavier": drawn anew (paper). Holds for weights from ImageNet too.
+        inputs: normalisation of the images.
+
+    Raises:
+        InputError: a width that is not positive and even; unknown depth or stem.
+    """
+
+    views: tuple[View, ...] = ("rgbt",)
+    pretrained_parts: tuple[str, ...] = ("encoder_",)
+
+    def __init__(
+        self,
+        *,
+        num_classes: int,
+        depth: Literal[18, 34, 50, 101, 152],
+        base_width: int,
+        final_relu: bool,
+        thermal_stem: Literal["rgb_mean", "xavier"],
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        _check(depth, base_width, thermal_stem)
+        self.num_classes = num_classes
+        self.thermal_stem = thermal_stem
+        self.encoder_rgb_conv1 = _stem(3, base_width)
+        self.encoder_rgb_bn1 = nn.BatchNorm2d(base_width)
+        self.encoder_rgb_maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        (
+            self.encoder_rgb_layer1,
+            self.encoder_rgb_layer2,
+            self.encoder_rgb_layer3,
+            self.encoder_rgb_layer4,
+        ) = _stages(depth, base_width)
+        self.encoder_thermal_conv1 = _stem(inputs.thermal_channels, base_width)
+        self.encoder_thermal_bn1 = nn.BatchNorm2d(base_width)
+        self.encoder_thermal_maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        (
+            self.encoder_thermal_layer1,
+            self.encoder_thermal_layer2,
+            self.encoder_thermal_layer3,
+            self.encoder_thermal_layer4,
+        ) = _stages(depth, base_width)
+        channels = 8 * base_width * (1 if depth in BASIC else 4)
+        self.deconv1 = _upception(channels, channels // 2)
+        self.deconv2 = _upception(channels // 2, channels // 4)
+        self.deconv3 = _upception(channels // 4, channels // 8)
+        self.deconv4 = _upception(channels // 8, channels // 16)
+        self.deconv5 = _upception(channels // 16, num_classes, relu=final_relu)
+        self.inputs = inputs
+        self._start()
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
+    ) -> Output:
+        """Class scores from both images.
+
+        Args:
+            rgb: (N, 3, H, W) float in [0, 1].
+            thermal: (N, 1, H, W) float in [0, 1].
+            masks: hidden cells of the padded image, (N, h, w) bool each; None: nothing is hidden.
+            views: () or ("rgbt",).
+            generator: not drawn from.
+
+        Returns:
+            logits: (N, K, H, W), >= 0 where `final_relu`.
+            aux: empty.
+
+        Raises:
+            ValueError: shapes that do not fit each other.
+            InputError: another view, or mask cells that do not divide the padded image.
+        """
+        only_view(views, self.views, "RTFNet")
+        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+
+        x = F.relu(self.encoder_rgb_bn1(self.encoder_rgb_conv1(images.rgb)))
+        y = F.relu(self.encoder_thermal_bn1(self.encoder_thermal_conv1(images.thermal)))
+        x, y = self.encoder_rgb_maxpool(x + y), self.encoder_thermal_maxpool(y)
+        for rgb_stage, thermal_stage in self._stage_pairs():
+            y = thermal_stage(y)
+            x = rgb_stage(x) + y
+
+        for block in (self.deconv1, self.deconv2, self.deconv3, self.deconv4, self.deconv5):
+            x = block(x)
+        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
+
+    def _stage_pairs(self) -> tuple[tuple[nn.Sequential, nn.Sequential], ...]:
+        return (
+            (self.encoder_rgb_layer1, self.encoder_thermal_layer1),
+            (self.encoder_rgb_layer2, self.encoder_thermal_layer2),
+            (self.encoder_rgb_layer3, self.encoder_thermal_layer3),
+            (self.encoder_rgb_layer4, self.encoder_thermal_layer4),
+        )
+
+    def _start(self) -> None:
+        """Initial weights: torchvision's in the encoders, Xavier's (uniform) in the decoder."""
+        for name, module in self.named_modules():
+            if not isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                continue
+            if name.startswith("encoder_"):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            else:
+                nn.init.xavier_uniform_(module.weight)
+        stem = self.encoder_thermal_conv1.weight
+        if self.thermal_stem == "xavier":
+            nn.init.xavier_uniform_(stem)
+            return
+        with torch.no_grad():
+            rgb = self.encoder_rgb_conv1.weight
+            stem.copy_(rgb if rgb.shape == stem.shape else rgb.mean(1, keepdim=True))
+
+
+def _stem(in_channels: int, base_width: int) -> nn.Conv2d:
+    return nn.Conv2d(in_channels, base_width, 7, stride=2, padding=3, bias=False)
+
+
+def _stages(depth: int, base_width: int) -> tuple[nn.Sequential, ...]:
+    """The four residual stages of one encoder."""
+    stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
+    stages, channels = [], base_width
+    for index, blocks in enumerate(BLOCKS[depth]):
+        width = base_width * 2**index
+        stages.append(stage(channels, width, blocks, stride=1 if index == 0 else 2))
+        channels = expansion * width
+    return tuple(stages)
+
+
+def _upception(in_channels: int, out_channels: int, *, relu: bool = True) -> nn.Sequential:
+    return nn.Sequential(UpceptionA(in_channels), UpceptionB(in_channels, out_channels, relu=relu))
+
+
+def _check(depth: int, base_width: int, thermal_stem: str) -> None:
+    check_choice("model.depth", str(depth), map(str, BLOCKS))
+    check_choice("model.thermal_stem", thermal_stem, ("rgb_mean", "xavier"))
+    if base_width < 2 or base_width % 2:
+        raise InputError(
+            f"model.base_width must be a positive even number, got {base_width}; ResNet's is 64."
+        )

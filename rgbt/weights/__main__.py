@@ -1,0 +1,175 @@
+"""Look at files of weights, and write those of a run.
+
+    python -m rgbt.weights inspect FILE [model=...]
+    python -m rgbt.weights export run=runs/KEY format=safetensors out=FILE
+
+Nothing in a file is executed. Exit code 0: done, 1: the file does not fit the network, 2: wrong
+input.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError, check_choice, nearest
+from rgbt.command import plain_command
+from rgbt.config import build, conf_dir, register_resolvers
+from rgbt.weights.layout import Facts
+from rgbt.weights.read import Contents
+
+INSPECT = {"file": None}
+EXPORT = {"run": None, "format": None, "out": None, "checkpoint": "best", "runs_dir": "runs"}
+CHECKPOINTS = ("best", "last")
+NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
+
+
+def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Say what a file is and what it would do to a network.
+
+    FILE      of weights, ours or a released one
+    overrides the network, such as model=mask2former_tiny model.fresh=[sem_seg_head]; without, the
+              one that fits, or the one of the run that the file belongs to
+    """
+    from rgbt.tracking.terminal import show
+    from rgbt.weights.load import plan_for
+    from rgbt.weights.read import read
+    from rgbt.weights.recognise import recognise
+    from rgbt.weights.view import facts_view, plan_view
+
+    contents = read(Path(arguments["file"]))
+    facts = recognise(contents)
+    show(facts_view(contents, facts))
+    found = _network(contents, facts, overrides)
+    if found is None:
+        return 0
+    node, name = found
+    _, plan, remarks = plan_for(_built(node), contents, tuple(node.get("fresh") or ()))
+    show(plan_view(plan, name, remarks))
+    return 0 if plan.fits else 1
+
+
+def _network(
+    contents: Contents, facts: Facts, overrides: list[str]
+) -> tuple[DictConfig, str] | None:
+    """The network that is asked about and its name; None where nothing says which."""
+    beside = contents.path.parent / "config.yaml"
+    if not overrides and contents.ours and beside.is_file():
+        node = _stored(beside).model
+        return (node, str(beside)) if _is_ours(node) else None
+    if not any(word.startswith("model=") for word in overrides):
+        usual = next((each for each in facts.fits if _is_there(each)), ())
+        if not usual:
+            return None
+        overrides = [*usual, *overrides]
+    if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
+        overrides = [*overrides, f"model.num_classes={facts.classes}"]
+    import hydra
+
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", overrides).model, " ".join(overrides)
+
+
+def _is_ours(node: object) -> bool:
+    """Whether every object that a node describes is one of rgbt.models.
+
+    A configuration beside a file of somebody else's might describe a call of anything.
+    """
+    if not isinstance(node, DictConfig):
+        return True
+    target = str(node.get("_target_", "rgbt.models."))
+    return target.startswith("rgbt.models.") and all(map(_is_ours, node.values()))
+
+
+def _is_there(overrides: tuple[str, ...]) -> bool:
+    model = overrides[0].removeprefix("model=")
+    return (conf_dir() / "model" / f"{model}.yaml").is_file()
+
+
+def _built(node: DictConfig) -> Any:
+    """The network without memory for its weights, where it can be built so."""
+    import torch
+
+    try:
+        with torch.device("meta"):
+            return build(node)
+    except (NotImplementedError, RuntimeError):
+        return build(node)
+
+
+def export(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Write the weights of a run.
+
+    run         run folder, config key or MLflow run id
+    format      safetensors (names of this project), released (as the authors' code loads them),
+                released_temporal (CMX as the temporal paper's code loads it)
+    out         the new file; one that exists is left alone
+    checkpoint  best (by the selection split) or last
+    """
+    from rgbt.stored import find_run
+    from rgbt.weights.layout import family_named
+    from rgbt.weights.read import read
+    from rgbt.weights.release import save
+
+    for word in overrides:
+        raise InputError(
+            f"'{word}': expected one of the keys of this command; "
+            f"{nearest(word.partition('=')[0], EXPORT)}."
+        )
+    check_choice("checkpoint", arguments["checkpoint"], CHECKPOINTS)
+    folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
+    model = _stored(folder / "config.yaml").model
+    contents = read(folder / f"{arguments['checkpoint']}.pt")
+    family = family_named(model._target_)
+    plain: Any = OmegaConf.to_container(model, resolve=True)
+    settings = {key: value for key, value in plain.items() if key not in NOT_SETTINGS}
+    note = {
+        "network": plain["_target_"],
+        "family": family,
+        "inputs": json.dumps(plain.get("inputs")),
+        "settings": json.dumps(settings),
+        "run": folder.name,
+        "checkpoint": arguments["checkpoint"],
+        "step": str(contents.settings.get("step", 0)),
+    }
+    out = Path(arguments["out"])
+    remark = save(out, arguments["format"], family, contents.tensors, note)
+    if remark:
+        sys.stderr.write(f"rgbt: {remark}.\n")
+    sys.stdout.write(f"{out}\n")
+    return 0
+
+
+def _stored(path: Path) -> DictConfig:
+    register_resolvers()
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig), "a stored configuration is a mapping"
+    return config
+
+
+def main() -> None:
+    """Run the command that the first word names."""
+    commands = {"inspect": plain_command(INSPECT, inspect), "export": plain_command(EXPORT, export)}
+    name, *words = sys.argv[1:] or [""]
+    if name in ("-h", "--help"):
+        sys.stdout.write(f"{(__doc__ or '').strip()}\n")
+        sys.exit(0)
+    if name not in commands:
+        sys.stderr.write(
+            f"rgbt: expected a command, got '{name}'; {nearest(name, commands)}, such as "
+            "python -m rgbt.weights inspect FILE.\n"
+        )
+        sys.exit(2)
+    if name == "inspect" and words and not words[0].startswith(("file=", "-")):
+        words[0] = f"file={words[0]}"
+    sys.argv[1:] = words
+    commands[name]()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""What a file of weights is and what it would do, as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+from torch import Tensor
+
+from rgbt.weights.layout import Facts
+from rgbt.weights.plan import Plan
+from rgbt.weights.read import Contents
+from rgbt.weights.records import printable
+
+NOT_TRAINED = (
+    *("running_mean", "running_var", "num_batches_tracked"),
+    *("relative_position_index", "attn_mask", "empty_weight"),
+)
+"""Last words of the names of buffers."""
+
+MILLION = 1e6
+
+
+def count_parameters(tensors: Mapping[str, Tensor]) -> int:
+    """Numbers that were trained; what lies under two names counts once."""
+    trained = {
+        (tensor.data_ptr() or name, tensor.shape): tensor.numel()
+        for name, tensor in tensors.items()
+        if tensor.is_floating_point() and not name.endswith(NOT_TRAINED)
+    }
+    return sum(trained.values())
+
+
+def facts_view(contents: Contents, facts: Facts) -> RenderableType:
+    """What the file is, line by line."""
+    tensors = contents.tensors.values()
+    kinds = sorted({str(tensor.dtype).removeprefix("torch.") for tensor in tensors})
+    size = contents.path.stat().st_size / MILLION
+    where = f", under '{contents.where}'" if contents.where else ""
+    taken = f", '{contents.prefix}' taken off every name" if contents.prefix else ""
+    parameters = count_parameters(contents.tensors)
+    notes = sorted(contents.note)
+    lines = [
+        ("file", f"{contents.path} ({size:.1f} MB)"),
+        ("what", facts.title),
+        ("container", f"{contents.container}{where}{taken}"),
+        *((("beside them", ", ".join(contents.others)),) if contents.others else ()),
+        ("tensors", f"{len(tensors)} ({', '.join(kinds)})"),
+        ("parameters", f"{parameters:,} ({parameters / MILLION:.2f} M)"),
+        *(("fits", " ".join(overrides)) for overrides in facts.fits or (("no published size",),)),
+        *((("windows", f"{facts.window} x {facts.window} tokens"),) if facts.window else ()),
+        *(("remark", remark) for remark in facts.remarks),
+        *((f"note {printable(key, 20)}", printable(contents.note[key], 600)) for key in notes),
+    ]
+    if not facts.family and not facts.fits:
+        lines.append(("names", _first(contents.tensors, 8)))
+    width = max(len(name) for name, _ in lines)
+    return Text("\n".join(f"{name:<{width}}  {value}" for name, value in lines), no_wrap=True)
+
+
+def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableType:
+    """What would happen to a network, one row per reason.
+
+    Args:
+        plan: see `rgbt.weights.plan`.
+        overrides: which network it is.
+        remarks: on the way it would be filled.
+    """
+    table = Table(title=f"into {overrides}", title_justify="left", box=box.SIMPLE_HEAD)
+    for name, justify in (("", "left"), ("tensors", "right"), ("why", "left"), ("such as", "left")):
+        table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
+    unfit = [f"{entry}: {how}" for entry, how in plan.unfit.items()]
+    torn = [f"{first} and {other}" for first, other in plan.torn]
+    rows: list[tuple[str, str, Iterable[str]]] = [
+        ("set", "", [entry for entry in plan.values if entry not in plan.unfit]),
+        ("begin at 0", "counters that the file lacks", plan.zeros),
+        *(("stay fresh", why, names) for why, names in _by_reason(plan.fresh)),
+        *(("left over", why, names) for why, names in _by_reason(plan.leftover)),
+        ("MISSING", "the network has them, the file does not", plan.missing),
+        ("UNEXPECTED", "the file has them, the network does not", plan.unexpected),
+        ("DIFFERENT", "of another shape or kind", unfit),
+        ("TORN", "one tensor in the network, two in the file", torn),
+    ]
+    for what, why, names in rows:
+        listed = list(names)
+        if listed:
+            shown = "" if what == "set" else _first(listed, 1)
+            table.add_row(*(Text(cell) for cell in (what, str(len(listed)), why, shown)))
+    lines = [Text(f"remark  {remark}") for remark in remarks]
+    return Group(table, *lines)
+
+
+def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, list[str]]]:
+    found: dict[str, list[str]] = {}
+    for name, why in reasons.items():
+        found.setdefault(why, []).append(name)
+    return list(found.items())
+
+
+def _first(names: Iterable[str], count: int) -> str:
+    listed = list(names)
+    more = ", ..." if len(listed) > count else ""
+    return ", ".join(printable(name) for name in listed[:count]) + more
