@@ -45,7 +45,8 @@ class PSPNet(nn.Module):
     Args:
         num_classes: K; 13 in the release, 14 in the thesis.
         depths: bottlenecks per stage.
-        base_width: channels of the stem; the other widths are multiples of it.
+        base_width: channels of the stem; the encoder's other widths are multiples of it.
+        decoder_width: channels of the last two up blocks; the first has four times as many.
         modalities: "late_fusion", a stem and two stages for each image (HeatNet); "early_fusion",
             one stem for all channels; "rgb" or "thermal", one image alone.
         dropout: of channels, before the decoder and after each of its blocks.
@@ -62,6 +63,7 @@ class PSPNet(nn.Module):
         num_classes: int,
         depths: tuple[int, int, int, int],
         base_width: int,
+        decoder_width: int,
         modalities: Modalities,
         dropout: DropRates,
         align_corners: bool,
@@ -76,19 +78,20 @@ class PSPNet(nn.Module):
         self.views = VIEWS_OF[modalities]
         self.modalities = modalities
         self.dropout = dropout
-        width, thermal = base_width, inputs.thermal_channels
+        thermal = inputs.thermal_channels
         channels = {
             "late_fusion": (3, thermal),
             "early_fusion": (3 + thermal,),
             "rgb": (3,),
             "thermal": (thermal,),
         }
-        self.feats = Encoder(channels[modalities], depths, width)
-        self.psp = PyramidPooling(32 * width, 16 * width, align_corners=align_corners)
-        self.up_1 = UpBlock(16 * width, 4 * width, align_corners=align_corners)
-        self.up_2 = UpBlock(4 * width, width, align_corners=align_corners)
-        self.up_3 = UpBlock(width, width, align_corners=align_corners)
-        self.final = nn.Sequential(nn.Conv2d(width, num_classes, 1))
+        self.feats = Encoder(channels[modalities], depths, base_width)
+        pooled, wide, narrow = 16 * base_width, 4 * decoder_width, decoder_width
+        self.psp = PyramidPooling(32 * base_width, pooled, align_corners=align_corners)
+        self.up_1 = UpBlock(pooled, wide, align_corners=align_corners)
+        self.up_2 = UpBlock(wide, narrow, align_corners=align_corners)
+        self.up_3 = UpBlock(narrow, narrow, align_corners=align_corners)
+        self.final = nn.Sequential(nn.Conv2d(narrow, num_classes, 1))
         self.apply(_initialise)
         self.inputs = inputs
 

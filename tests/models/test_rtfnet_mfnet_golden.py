@@ -1,12 +1,11 @@
-"""RTFNet-50 and MFNet against tensors recorded from their releases, and MFNet's trained weights.
+"""RTFNet and MFNet against tensors recorded from their releases, and MFNet's trained weights.
 
-The trained weights and the images come with a known answer: the confusion counts of the release.
+Confusion counts on real pairs are compared in tests/test_weights_run.py, by the command.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.data.files import read_packed
-from rgbt.data.mfnet import MFNet as MFNetFiles
 from tests.models import golden
 
 REAL = golden.SHARED / "realdata"
@@ -40,9 +38,9 @@ def hook_inputs(net: nn.Module, named: dict[str, str]) -> dict[str, Tensor]:
     return seen
 
 
-def compare(name: str, outputs: dict[str, str], inputs: dict[str, str]) -> None:
-    recorded = golden.load(name)
-    net = golden.network(name).eval()
+def compare(
+    recorded: golden.Golden, net: nn.Module, outputs: dict[str, str], inputs: dict[str, str]
+) -> None:
     golden.fill_network(net, recorded)
     assert set(net.state_dict()) == set(recorded.facts["keys"])
     after, before = golden.hook(net, outputs), hook_inputs(net, inputs)
@@ -58,9 +56,9 @@ def compare(name: str, outputs: dict[str, str], inputs: dict[str, str]) -> None:
     assert np.abs(fed - recorded.arrays["network_input"]).max() <= about["tol_abs"]
 
 
-@pytest.mark.slow  # fills 185 million parameters
-@golden.requires_golden
-def test_rtfnet_50_every_recorded_tensor() -> None:
+@pytest.mark.parametrize(("name", "depth"), golden.recorded(r"rtfnet_(\d+).*", fast=[]))
+def test_rtfnet_every_recorded_tensor(name: str, depth: str) -> None:
+    recorded = golden.load(name)
     outputs = {}
     for stream in ("rgb", "thermal"):
         outputs[f"{stream}.conv1"] = f"encoder_{stream}_conv1"
@@ -70,15 +68,18 @@ def test_rtfnet_50_every_recorded_tensor() -> None:
         outputs |= {f"deconv{block}.a": f"deconv{block}.0", f"deconv{block}": f"deconv{block}"}
     inputs = {"thermal.stem": "encoder_thermal_maxpool", "fusion0": "encoder_rgb_maxpool"}
     inputs |= {f"fusion{stage}": f"encoder_rgb_layer{stage + 1}" for stage in (1, 2, 3)}
-    compare("rtfnet_50", outputs, {**inputs, "fusion4": "deconv1"})
+    net = golden.network(f"rtfnet_{depth}", recorded.classes("deconv5.1.bn1.bias")).eval()
+    compare(recorded, net, outputs, {**inputs, "fusion4": "deconv1"})
 
 
-@golden.requires_golden
-def test_mfnet_every_recorded_tensor() -> None:
-    recorded = set(golden.load("mfnet").facts["outputs"]) - {"network_input", "logits", "argmax"}
-    inputs = {name: name.removeprefix("in.") for name in recorded if name.startswith("in.")}
-    outputs = {name: name for name in recorded if name not in inputs}
-    compare("mfnet", outputs, inputs)
+@pytest.mark.parametrize(("name", "_"), golden.recorded(r"(mfnet).*", fast=["mfnet"]))
+def test_mfnet_every_recorded_tensor(name: str, _: str) -> None:
+    recorded = golden.load(name)
+    inner = set(recorded.facts["outputs"]) - {"network_input", "logits", "argmax"}
+    inputs = {key: key.removeprefix("in.") for key in inner if key.startswith("in.")}
+    outputs = {key: key for key in inner if key not in inputs}
+    net = golden.network("mfnet", recorded.classes("decode1.bn.bias")).eval()
+    compare(recorded, net, outputs, inputs)
 
 
 def released_network() -> Any:
@@ -114,30 +115,3 @@ def test_trained_mfnet_on_two_frames() -> None:
         assert torch.bincount(logits[0].argmax(0).flatten(), minlength=9).tolist() == expected
         if name == "01477D":
             assert logits[0, :, 240, 320].tolist() == pytest.approx(pixel, abs=6e-5)
-
-
-def confusion(net: Any, names: Iterable[str], files: MFNetFiles) -> np.ndarray:
-    """(9, 9) counts, rows = label, columns = prediction."""
-
-    def numbers() -> Iterator[np.ndarray]:
-        for name in names:
-            sample = files.read(name)
-            with torch.inference_mode():
-                logits = net(*images(sample.rgb, sample.thermal)).logits
-            assert sample.label is not None
-            yield sample.label.ravel() * np.int64(9) + logits[0].argmax(0).numpy().ravel()
-
-    return sum(np.bincount(number, minlength=81) for number in numbers()).reshape(9, 9)
-
-
-@pytest.mark.slow  # 200 images of 480 x 640
-@requires_weights
-@pytest.mark.parametrize("split", ["train", "val"])
-def test_trained_mfnet_confusion_counts(split: str) -> None:
-    answers = json.loads((REAL / "mfnet_weights" / "expected_confusions.json").read_text())
-    files = MFNetFiles(str(REAL / "mfnet200"))
-    found = confusion(released_network(), files.names(split), files)
-    expected = np.array(answers[f"MFNet_final_pth/{split}"]["confusion"])
-    assert found.sum() == expected.sum() == 100 * 480 * 640
-    moved = int(np.abs(found - expected).sum()) // 2
-    assert moved == 0, f"{moved} of {found.sum()} pixels are counted elsewhere"
