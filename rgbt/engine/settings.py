@@ -61,6 +61,7 @@ class Recipe:
         backbone_multiplier: factor of `lr` for what is pretrained.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
+        demo_steps: optimiser steps at scale=demo, which takes nothing else from here.
     """
 
     batch_size: int
@@ -72,6 +73,7 @@ class Recipe:
     backbone_multiplier: float
     clip_norm: float | None
     warmup_steps: int
+    demo_steps: int
 
 
 @dataclass(frozen=True, kw_only=True)

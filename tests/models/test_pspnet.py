@@ -19,6 +19,7 @@ NANO = {
     "num_classes": 4,
     "depths": (1, 2, 3, 2),
     "base_width": 4,
+    "decoder_width": 5,
     "modalities": "late_fusion",
     "dropout": (0.3, 0.15),
     "align_corners": False,
