@@ -356,7 +356,7 @@ def test_a_checkpoint_of_another_model_is_refused(call: Call, data: Path, tmp_pa
         *(f"model.weights={folder}", *short(1)),
     )
     assert code == 2
-    assert_one_sentence(err, "is a checkpoint of another model")
+    assert_one_sentence(err, "does not fit this network")
 
 
 def test_multirun_finishes_the_other_points_when_one_is_wrong(

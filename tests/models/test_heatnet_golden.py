@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -19,12 +20,13 @@ RECORDED_AS = {
 }
 
 
-@golden.requires_golden
-def test_every_recorded_tensor() -> None:
-    record = golden.load("heatnet")
-    net = golden.network("heatnet", num_classes=13).eval()
+@pytest.mark.parametrize(("name", "_"), golden.recorded(r"(heatnet).*", fast=["heatnet"]))
+def test_every_recorded_tensor(name: str, _: str) -> None:
+    record = golden.load(name)
+    classes = record.classes(f"{NETWORK}final.0.bias")
+    net = golden.network("heatnet", num_classes=classes).eval()
     golden.fill_network(net, record, NETWORK, unused=(CRITIC,))
-    critic = Critic(in_channels=13, base_width=64, upsample=True, align_corners=False)
+    critic = Critic(in_channels=classes, base_width=64, upsample=True, align_corners=False)
     golden.fill_network(critic, record, CRITIC, unused=(NETWORK,))
 
     inner = {name: f"feats.{name}" for name in ENCODER}

@@ -38,7 +38,7 @@ def hook_inputs(net: nn.Module, named: dict[str, str]) -> dict[str, Tensor]:
     return seen
 
 
-def compare(
+def check_record(
     recorded: golden.Golden, net: nn.Module, outputs: dict[str, str], inputs: dict[str, str]
 ) -> None:
     golden.fill_network(net, recorded)
@@ -69,7 +69,7 @@ def test_rtfnet_every_recorded_tensor(name: str, depth: str) -> None:
     inputs = {"thermal.stem": "encoder_thermal_maxpool", "fusion0": "encoder_rgb_maxpool"}
     inputs |= {f"fusion{stage}": f"encoder_rgb_layer{stage + 1}" for stage in (1, 2, 3)}
     net = golden.network(f"rtfnet_{depth}", recorded.classes("deconv5.1.bn1.bias")).eval()
-    compare(recorded, net, outputs, {**inputs, "fusion4": "deconv1"})
+    check_record(recorded, net, outputs, {**inputs, "fusion4": "deconv1"})
 
 
 @pytest.mark.parametrize(("name", "_"), golden.recorded(r"(mfnet).*", fast=["mfnet"]))
@@ -79,7 +79,7 @@ def test_mfnet_every_recorded_tensor(name: str, _: str) -> None:
     inputs = {key: key.removeprefix("in.") for key in inner if key.startswith("in.")}
     outputs = {key: key for key in inner if key not in inputs}
     net = golden.network("mfnet", recorded.classes("decode1.bn.bias")).eval()
-    compare(recorded, net, outputs, inputs)
+    check_record(recorded, net, outputs, inputs)
 
 
 def released_network() -> Any:
