@@ -61,6 +61,39 @@ def test_paper_scale_is_the_released_recipe() -> None:
     assert compose("+experiment=grbm", "scale=demo").masker.patch_size == 32
 
 
+def test_recipes_of_the_reference_networks() -> None:
+    """Numbers of the temporal release (CMX), and of the RTFNet and MFNet releases."""
+    cmx, rtfnet, mfnet = (
+        compose(f"+experiment={name}", "scale=paper", "dataset.root=unused")
+        for name in ("cmx", "rtfnet", "mfnet")
+    )
+    adamw = cmx.optimizer
+    assert (adamw.lr, adamw.weight_decay, adamw.decay_biases) == (6e-5, 0.01, False)
+    assert (adamw.backbone_multiplier, cmx.trainer.clip_norm) == (1.0, None)
+    assert (cmx.trainer.max_steps, cmx.schedule.warmup_steps) == (200 * 1568, 10 * 1568)
+    assert (cmx.schedule.power, cmx.schedule.per) == (0.9, "iteration")
+    for config in (rtfnet, mfnet):
+        sgd = config.optimizer
+        assert (sgd.lr, sgd.momentum, sgd.weight_decay) == (0.01, 0.9, 5e-4)
+        assert (config.schedule.factor, config.trainer.clip_norm) == (0.95, None)
+    batch_sizes = [config.data.batch_size for config in (cmx, rtfnet, mfnet)]
+    assert batch_sizes == [1, 3, 8]
+    for config in (cmx, rtfnet, mfnet):
+        assert list(config.transform.crop_hw) == [480, 640]
+        assert (config.transform.flip_probability, config.transform.colour_probability) == (0.5, 0)
+    assert [config.model._target_.split(".")[2] for config in (cmx, rtfnet, mfnet)] == [
+        *("cmx", "rtfnet", "mfnet")
+    ]
+
+
+@pytest.mark.parametrize("name", ["deeplabv2", "deeplabv2_two_heads", "deeplabv2_tiny"])
+def test_deeplab_pools_as_released_and_counts_all_rates(name: str) -> None:
+    model = compose(f"model={name}").model
+    assert model.ceil_mode
+    assert model.align_corners
+    assert model.summed_rates == model.rates
+
+
 def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
     same = [
         *("dataset.root=/a", "runs_dir=/b", "tracking=none", "data.num_workers=3"),

@@ -38,6 +38,23 @@ def test_a_run_starts_from_another_runs_weights(call: Call, data: Path, tmp_path
     assert all("running" in key or "num_batches" in key for key in moved)
 
 
+def test_fresh_parts_keep_their_random_start(call: Call, data: Path, tmp_path: Path) -> None:
+    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
+    code, _, err = train(call, data, tmp_path / "first", *one)
+    assert code == 0, err
+    first = only_run(tmp_path / "first")
+    other = (f"model.weights={first}", "model.fresh=[decode1.]", "optimizer.lr=1.0e-30", "seed=7")
+    code, _, err = train(call, data, tmp_path / "second", *one, *other)
+    assert code == 0, err
+    assert "named in model.fresh" in err
+    before, after = (
+        torch.load(only_run(tmp_path / name) / "best.pt", weights_only=True)["model"]
+        for name in ("first", "second")
+    )
+    assert not torch.equal(before["decode1.conv.weight"], after["decode1.conv.weight"])
+    assert torch.equal(before["decode2.conv.weight"], after["decode2.conv.weight"])
+
+
 def test_weights_are_scored_without_a_run(call: Call, data: Path, tmp_path: Path) -> None:
     code, _, err = train(
         call, data, tmp_path, "+experiment=mfnet", "masker.patch_size=null", *short(2)

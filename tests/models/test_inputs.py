@@ -53,9 +53,9 @@ def test_thermal_is_repeated_for_three_channels() -> None:
 
 def test_every_thermal_image_is_divided_by_its_own_maximum() -> None:
     rgb, thermal = ones(count=3)
-    thermal[0, 0, 0, 0], thermal[2] = 0.25, 0.0
+    thermal[0, 0, 0, 0], thermal[1], thermal[2] = 0.25, 0.125, 0.0
     _, scaled = inputs(thermal_scale="image_max")(rgb, thermal)
-    assert scaled[0, 0, 0, 0] == 0.5
+    assert scaled[0].unique().tolist() == [0.5, 1.0]
     assert scaled[1].unique().tolist() == [1.0]
     assert scaled[2].unique().tolist() == [0.0]
 
@@ -129,6 +129,7 @@ def test_one_view_at_a_time() -> None:
         ("crm", ([2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60])),
         ("unit", ([1.0] * 3, [0.5])),
         ("half", ([1.0] * 3, [0.0])),
+        ("half_three", ([1.0] * 3, [0.0] * 3)),
         ("temporal", ([1.0] * 3, [1.0] * 3)),
         ("cmx", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),
         ("cmx_released", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),
