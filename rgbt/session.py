@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, cast
@@ -15,7 +14,7 @@ from omegaconf import DictConfig
 from torch import nn
 
 from rgbt.checks import InputError, check_choice
-from rgbt.config import build, weights_file
+from rgbt.config import build
 from rgbt.data.loaders import LoaderSettings, eval_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.engine.allocator import keep_memory
@@ -26,11 +25,12 @@ from rgbt.metrics import scores
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.pretrained import start
 from rgbt.randomness import derive
 from rgbt.tracking.pictures import Example
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.types import VIEWS, View
-from rgbt.weights.load import load_weights
+from rgbt.weights.report import Report
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Session:
         trainer: durations, precision, device.
         fabric: device and precision.
         model: the network, on the device, not wrapped.
+        weights: what it took from a file, None where it is random.
     """
 
     config: DictConfig
@@ -56,6 +57,7 @@ class Session:
     trainer: TrainerSettings
     fabric: Fabric
     model: nn.Module
+    weights: Report | None
 
 
 def open_session(config: DictConfig) -> Session:
@@ -81,10 +83,7 @@ def open_session(config: DictConfig) -> Session:
             f"model.num_classes is {config.model.num_classes} but {dataset.name} has "
             f"{dataset.num_classes} classes; leave it to the data set."
         )
-    source = weights_file(config)
-    if source is not None:
-        report = load_weights(model, source, tuple(config.model.fresh))
-        sys.stderr.write(f"rgbt: {report.sentence()}\n")
+    weights = start(model, config)
     return Session(
         config=config,
         dataset=dataset,
@@ -94,6 +93,7 @@ def open_session(config: DictConfig) -> Session:
         trainer=trainer,
         fabric=fabric,
         model=model.to(fabric.device),
+        weights=weights,
     )
 
 

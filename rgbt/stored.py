@@ -67,8 +67,17 @@ def open_trained(
             "model=mfnet model.weights=final.pth dataset.root=/data/MFNet."
         )
     check(config)
-    folder = runs_dir / "evaluations" / run_key(config)
-    return Stored(open_session(config), 0, folder, source.name)
+    if checkpoint != "best":
+        raise InputError(f"checkpoint={checkpoint} is one of a run; name that with run=...")
+    session = open_session(config)
+    if session.weights is not None and session.weights.fresh:
+        raise InputError(
+            f"{source} does not hold the whole network, the rest would be random: "
+            f"{session.weights.sentence()}; train it first with python -m rgbt.run."
+        )
+    # Copies of a data set in other places may hold other images.
+    place = f"{run_key(config)}-{session.dataset.fingerprint()[:8]}"
+    return Stored(session, 0, runs_dir / "evaluations" / place, source.name)
 
 
 def _composed(overrides: list[str]) -> DictConfig:

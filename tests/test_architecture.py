@@ -37,6 +37,7 @@ MEETING_PLACES = {
     "stored.py",
     "training.py",
     "naming.py",
+    "pretrained.py",
     "weights/__main__.py",
     "__init__.py",
 }

@@ -79,6 +79,60 @@ def test_weights_are_scored_without_a_run(call: Call, data: Path, tmp_path: Path
     assert len(list((tmp_path / "out").glob("*_overlay.png"))) == len(stored.names)
 
 
+def test_another_way_of_feeding_is_said(call: Call, data: Path, tmp_path: Path) -> None:
+    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
+    code, _, err = train(call, data, tmp_path / "first", *one)
+    assert code == 0, err
+    first = only_run(tmp_path / "first")
+    for runs, inputs in (("same", "unit"), ("other", "crm")):
+        words = (f"model.weights={first}", f"model/inputs={inputs}")
+        code, _, err = train(call, data, tmp_path / runs, *one, *words)
+        assert code == 0, err
+        assert ("this network with something else" in err) == (inputs == "crm")
+
+    state = torch.load(first / "best.pt", weights_only=True)["model"]
+    torch.save(state, tmp_path / "final.pth")
+    named = ("model=mfnet_tiny", f"model.weights={tmp_path / 'final.pth'}", f"dataset.root={data}")
+    small = (f"runs_dir={tmp_path}", "data.num_workers=0", "trainer.threads=1")
+    for change in ("model.final_activation=true", "model.final_activation=false"):
+        code, _, err = call(EVALUATE, *named, *small, change)
+        assert code == 0, err
+        said = "goes with model.final_activation=true" in err
+        assert said == change.endswith("false")
+
+
+def test_networks_with_random_parts_are_not_scored(call: Call, data: Path, tmp_path: Path) -> None:
+    code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "masker.patch_size=null",
+                         *short(1))  # fmt: skip
+    assert code == 0, err
+    named = (
+        *("model=mfnet_tiny", f"model.weights={only_run(tmp_path)}", f"dataset.root={data}"),
+        *("model.fresh=[decode1]", "data.num_workers=0", "trainer.threads=1"),
+    )
+    code, _, err = call(EVALUATE, *named)
+    assert code == 2
+    assert "does not hold the whole network, the rest would be random" in err
+    code, _, err = call(EVALUATE, *named, "checkpoint=last")
+    assert code == 2
+    assert_one_sentence(err, "checkpoint=last is one of a run")
+    code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.fresh=[decode1]")
+    assert code == 2
+    assert_one_sentence(err, "or leave model.fresh away")
+
+
+def test_a_network_of_one_image_is_scored_from_it(call: Call, data: Path, tmp_path: Path) -> None:
+    words = ("+experiment=mfnet", "model=heatnet_tiny", "model.modalities=rgb")
+    code, _, err = train(call, data, tmp_path, *words, "masker.patch_size=null", *short(1))
+    assert code == 0, err
+    folder = only_run(tmp_path)
+    code, _, err = call(EVALUATE, f"run={folder}")
+    assert code == 0, err
+    assert (folder / "evaluations" / "mfnet_test_rgb_ring5.npz").exists()
+    code, _, err = call(EVALUATE, f"run={folder}", "modality=thermal")
+    assert code == 2
+    assert_one_sentence(err, "'thermal' is not a choice")
+
+
 def test_weights_that_are_not_there_are_named(call: Call, data: Path, tmp_path: Path) -> None:
     code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.weights=nowhere.pth")
     assert code == 2

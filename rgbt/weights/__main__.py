@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.command import plain_command
@@ -59,8 +62,9 @@ def _network(
     """The network that is asked about and its name; None where nothing says which."""
     beside = contents.path.parent / "config.yaml"
     if not overrides and contents.ours and beside.is_file():
-        node = _stored(beside).model
-        return (node, str(beside)) if _is_ours(node) else None
+        node = _stored(beside).get("model")
+        is_network = isinstance(node, DictConfig) and "_target_" in node and _is_ours(node)
+        return (node, str(beside)) if is_network else None
     if not any(word.startswith("model=") for word in overrides):
         usual = next((each for each in facts.fits if _is_there(each)), ())
         if not usual:
@@ -76,14 +80,31 @@ def _network(
 
 
 def _is_ours(node: object) -> bool:
-    """Whether every object that a node describes is one of rgbt.models.
+    """Whether every object that a node describes is a network of rgbt.models or a part of one.
 
     A configuration beside a file of somebody else's might describe a call of anything.
     """
     if not isinstance(node, DictConfig):
         return True
-    target = str(node.get("_target_", "rgbt.models."))
-    return target.startswith("rgbt.models.") and all(map(_is_ours, node.values()))
+    target = node.get("_target_")
+    return (target is None or _is_part(str(target))) and all(map(_is_ours, node.values()))
+
+
+def _is_part(target: str) -> bool:
+    """Whether a dotted path names a class that a module of rgbt.models defines itself.
+
+    What such a module imports (rgbt.models.inputs.torch.os.system) is not looked at.
+    """
+    from torch import nn
+
+    module, _, name = target.rpartition(".")
+    if not module.startswith("rgbt.models."):
+        return False
+    try:
+        found = getattr(import_module(module), name, None)
+    except ImportError:
+        return False
+    return isinstance(found, type) and issubclass(found, nn.Module) and found.__module__ == module
 
 
 def _is_there(overrides: tuple[str, ...]) -> bool:
@@ -111,10 +132,11 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     out         the new file; one that exists is left alone
     checkpoint  best (by the selection split) or last
     """
+    from rgbt.pretrained import differences
     from rgbt.stored import find_run
     from rgbt.weights.layout import family_named
     from rgbt.weights.read import read
-    from rgbt.weights.release import save
+    from rgbt.weights.release import CONVENTIONS, save
 
     for word in overrides:
         raise InputError(
@@ -139,6 +161,12 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     }
     out = Path(arguments["out"])
     remark = save(out, arguments["format"], family, contents.tensors, note)
+    others = differences(model, CONVENTIONS.get((arguments["format"], family), ()))
+    if others:
+        sys.stderr.write(
+            f"rgbt: the authors' code does {' '.join(others)}, this run did something else; there "
+            "its scores will not be ours.\n"
+        )
     if remark:
         sys.stderr.write(f"rgbt: {remark}.\n")
     sys.stdout.write(f"{out}\n")
@@ -147,8 +175,12 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
 
 def _stored(path: Path) -> DictConfig:
     register_resolvers()
-    config = OmegaConf.load(path)
-    assert isinstance(config, DictConfig), "a stored configuration is a mapping"
+    try:
+        config = OmegaConf.load(path)
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise InputError(f"{path} cannot be read as the configuration of a run.") from error
+    if not isinstance(config, DictConfig):
+        raise InputError(f"{path} is not the configuration of a run, which is a mapping.")
     return config
 
 

@@ -35,6 +35,9 @@ class Facts:
         prefix: before every name that belongs to the network.
         window: side of the attention windows in tokens, where there are such.
         fits: command-line overrides of the networks that the file fits; the first is the usual.
+        convention: overrides of what the release does and its weights do not tell: how the
+            network is fed and evaluated.
+        inputs: how the network was fed, as the file itself says it; None where it does not.
         remarks: what whoever uses the file should know.
     """
 
@@ -46,6 +49,8 @@ class Facts:
     prefix: str = ""
     window: int | None = None
     fits: tuple[Overrides, ...] = ()
+    convention: Overrides = ()
+    inputs: Mapping[str, object] | None = None
     remarks: tuple[str, ...] = ()
 
     @property

@@ -65,7 +65,9 @@ def plan_for(
     rule = _rule(model, contents, facts)
     if rule is None:
         raise InputError(_another_network(model, contents, facts))
-    plan = make_plan(model.state_dict(), contents.tensors, rule, prefix=facts.prefix, fresh=fresh)
+    plan = make_plan(
+        model.state_dict(keep_vars=True), contents.tensors, rule, prefix=facts.prefix, fresh=fresh
+    )
     kinds = sorted({str(contents.tensors[name].dtype) for name in plan.values.values()})
     short = [kind.removeprefix("torch.") for kind in kinds if kind.endswith("float16")]
     converted = (f"{' and '.join(short)} converted",) if short else ()

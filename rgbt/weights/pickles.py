@@ -7,6 +7,7 @@ which put together inert values of ours. Every other name is refused where it oc
 
 from __future__ import annotations
 
+import os
 import pickletools
 from collections.abc import Callable, Mapping
 from typing import IO, Any
@@ -24,6 +25,11 @@ from rgbt.weights.records import (
 
 Persistent = Callable[[Any], Any]
 
+GROWTH, SMALL = 8, 1_000_000
+"""What may be copied while reading: so many times the bytes of the file, and a little more."""
+
+SIZED = (str, bytes, bytearray, list, tuple, dict, set, frozenset)
+
 
 def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Persistent) -> Any:
     """The value of the next pickle in `stream`; the stream is left right behind it.
@@ -37,7 +43,10 @@ def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Per
         RefusedError: a name or opcode that is not among the known ones.
         DamagedError: not a pickle, cut short, or senseless.
     """
-    machine = Machine(builders, persistent)
+    start = stream.tell()
+    stream.seek(0, os.SEEK_END)
+    machine = Machine(builders, persistent, budget=GROWTH * stream.tell() + SMALL)
+    stream.seek(start)
     try:
         for opcode, argument, _ in pickletools.genops(stream):
             step = STEPS.get(opcode.name)
@@ -56,9 +65,12 @@ def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Per
 class Machine:
     """Stack, marks and memo of one pickle. Values on the stack are plain Python or `records`."""
 
-    def __init__(self, builders: Mapping[str, Builder], persistent: Persistent) -> None:
+    def __init__(
+        self, builders: Mapping[str, Builder], persistent: Persistent, *, budget: int
+    ) -> None:
         self.builders = builders
         self.persistent = persistent
+        self.budget = budget
         self.stack: list[Any] = []
         self.marks: list[list[Any]] = []
         self.memo: dict[int, Any] = {}
@@ -98,6 +110,7 @@ class Machine:
         """
         if not isinstance(callee, Name) or not isinstance(arguments, tuple):
             raise TypeError("only names are called, with a tuple")
+        self.spend(arguments)
         if callee.full in STAND_INS:
             self.push(Inert(callee.full))
         elif callee.full in self.builders:
@@ -108,10 +121,23 @@ class Machine:
     def build(self, _: object) -> None:
         """Hand a state to the value below it; only our own records take one."""
         state, target = self.stack.pop(), self.stack[-1]
+        self.spend(state if isinstance(state, tuple) else (state,))
         if isinstance(target, Inert | Array | NumberType):
             target.build(state)
         elif type(target) is not dict:  # attributes of an ordered dictionary mean nothing here
             raise TypeError(f"{type(target).__name__} takes no state")
+
+    def spend(self, values: tuple[Any, ...]) -> None:
+        """Count what is about to be copied, which a file may ask for over and over.
+
+        Raises:
+            RefusedError: it is far more than the file holds.
+        """
+        self.budget -= sum(len(value) for value in values if isinstance(value, SIZED))
+        if self.budget < 0:
+            raise RefusedError(
+                "would take far more memory than it has bytes; it is damaged, or made to do harm."
+            )
 
     def extend(self, items: list[Any]) -> None:
         """Append to a list."""

@@ -56,7 +56,7 @@ def make_plan(
     """Find a place for everything.
 
     Args:
-        state: entries of the network, as `state_dict()` gives them.
+        state: entries of the network, as `state_dict(keep_vars=True)` gives them.
         tensors: of the file.
         rule: how this network is filled from this kind of file.
         prefix: before every name in the file that belongs to the network.
@@ -154,12 +154,10 @@ def _shape(tensor: Tensor) -> str:
 def _torn(
     state: Mapping[str, Tensor], tensors: Mapping[str, Tensor], values: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
-    """Entries that share their memory and would get different values."""
-    shared: dict[tuple[int, tuple[int, ...]], list[str]] = defaultdict(list)
+    """Entries that are one parameter under two names and would get different values."""
+    shared: dict[int, list[str]] = defaultdict(list)
     for entry in values:
-        value = state[entry]
-        if not value.is_meta and value.numel():
-            shared[value.data_ptr(), tuple(value.shape)].append(entry)
+        shared[id(state[entry])].append(entry)
     for first, *others in shared.values():
         for other in others:
             if not torch.equal(tensors[values[first]], tensors[values[other]]):

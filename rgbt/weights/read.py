@@ -175,9 +175,15 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
         others=tuple(printable(str(key), 40) for key in [*outside, *inside]),
         settings=_settings(value) if inner else {},
         ours=value.keys() in OURS,
-        note={str(k): str(v) for k, v in note.items()} if isinstance(note, dict) else {},
+        note=_texts(note),
     )
     return _without_prefixes(contents, tensors)
+
+
+def _texts(note: object) -> dict[str, str]:
+    """Texts by name; anything else a stranger's file may hold there is left alone."""
+    items = note.items() if isinstance(note, dict) else ()
+    return {k: v for k, v in items if type(k) is str and type(v) is str}
 
 
 def _is_tensor(value: object) -> bool:

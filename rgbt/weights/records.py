@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -128,8 +129,9 @@ class Array:
             raise TypeError("not the state of an array")
         self.shape, self.kind, self.fortran, self.data = sizes_of(shape), kind, bool(fortran), data
 
-    def tensor(self) -> Tensor:
-        """A copy.
+    @cached_property
+    def copied(self) -> Tensor:
+        """The numbers as a tensor of their own, one however many names they have.
 
         Raises:
             DamagedError: shape and data do not fit.
@@ -140,6 +142,10 @@ class Array:
         flat = np.frombuffer(self.data, dtype)
         array = flat.reshape(self.shape, order="F" if self.fortran else "C")
         return torch.from_numpy(np.array(array, dtype.newbyteorder("="), order="C"))
+
+    def tensor(self) -> Tensor:
+        """See `copied`."""
+        return self.copied
 
 
 class Inert:

@@ -46,6 +46,16 @@ RELEASED: Mapping[str, Container] = {
 }
 """Family -> what its release's torch.load gives."""
 
+CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
+    ("released", "cmx"): cmx.RELEASED,
+    ("released_temporal", "cmx"): cmx.TEMPORAL,
+    ("released", "rtfnet"): rtfnet.CONVENTION,
+    ("released", "mfnet"): mfnet.CONVENTION,
+    ("released", "pspnet"): heatnet.CONVENTION,
+}
+"""Format and family -> how the authors' code feeds and evaluates the network."""
+
 SAID: Mapping[tuple[str, str], str] = {
     ("released", "pspnet"): (
         "no name under module.critics. is written, because a critic is not part of this network; "
@@ -74,7 +84,7 @@ def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -
         if family != "cmx":
             raise InputError(
                 f"format={layout} is the temporal release's CMX; this network is "
-                f"{FAMILIES.get(family, 'none of rgbt.models')}, take format=released."
+                f"{FAMILIES.get(family, 'none of rgbt.models')}; take another format."
             )
         return cmx.released_temporal(state)
     if family not in RELEASED:

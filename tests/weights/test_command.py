@@ -125,7 +125,9 @@ def test_a_configuration_beside_a_file_runs_nothing(
 ) -> None:
     marker = run / "marker"
     evil = {"_target_": "os.system", "command": f"touch {marker}"}
-    for model in (evil, {"_target_": "rgbt.models.mfnet.MFNet", "inputs": evil}):
+    imported = {**evil, "_target_": "rgbt.models.inputs.torch.os.system"}
+    part = {"_target_": "rgbt.models.mfnet.MFNet"}
+    for model in (evil, imported, {**part, "inputs": evil}, {**part, "inputs": imported}, 3):
         (run / "config.yaml").write_text(yaml.safe_dump({"model": model}))
         code, out, _ = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
         assert code == 0
@@ -178,7 +180,36 @@ def test_usage_errors(
 
 
 def test_help(monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
-    for words in (("--help",), ("inspect", "--help"), ("export", "--help")):
+    said = {
+        ("--help",): "python -m rgbt.weights inspect FILE",
+        ("inspect", "--help"): "FILE      of weights",
+        ("export", "--help"): "released_temporal (CMX",
+    }
+    for words, sentence in said.items():
         code, out, _ = called(monkeypatch, capsys, *words)
         assert code == 0
-        assert "FILE" in out or "out" in out
+        assert sentence in out
+
+
+def test_a_broken_configuration_beside_a_file_is_named(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    for text in ("[1, 2]", "model: [", "model: {a: ${b}"):
+        (run / "config.yaml").write_text(text)
+        code, _, err = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
+        assert code == 2
+        assert "configuration of a run" in err
+
+
+def test_an_export_that_the_authors_code_feeds_otherwise_is_said(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    words = (f"run={run}", "format=released")
+    _, _, err = called(monkeypatch, capsys, "export", *words, f"out={tmp_path / 'a.pth'}")
+    assert "authors' code" not in err
+    stored = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(
+        stored.replace("final_activation: true", "final_activation: false")
+    )
+    _, _, err = called(monkeypatch, capsys, "export", *words, f"out={tmp_path / 'b.pth'}")
+    assert "authors' code does model.final_activation=true, this run did something else" in err

@@ -334,6 +334,31 @@ def test_a_key_whose_hash_would_take_for_ever(tmp_path: Path) -> None:
         read(written(tmp_path / "file.pkl", content))
 
 
+def copies(times: int) -> bytes:
+    """A pickle of one list of 10,000 numbers that is made a torch.Size again and again."""
+    start = b"\x80\x02]q\x00(" + b"K\x01" * 10_000 + b"ectorch\nSize\nq\x01"
+    return start + b"h\x01h\x00\x85R0" * times + b"."
+
+
+def test_a_small_file_that_would_take_much_memory(tmp_path: Path) -> None:
+    path = written(tmp_path / "greedy.pkl", copies(2000))
+    with pytest.raises(InputError, match="far more memory than it has bytes") as refused:
+        read(path)
+    sentence(refused)
+    nested: Any = "x"
+    for _ in range(40):
+        nested = [nested, nested]
+    path = saved(tmp_path, {"model": {"a": torch.zeros(1)}, "rgbt": {"note": nested}})
+    assert read(path).note == {}
+
+
+def test_an_array_of_many_names_is_copied_once(tmp_path: Path) -> None:
+    array = np.ones(1000, np.float32)
+    path = written(tmp_path / "many.pkl", pickle.dumps({"a": array, "b": array}))
+    tensors = read(path).tensors
+    assert tensors["a"].data_ptr() == tensors["b"].data_ptr()
+
+
 def test_names_are_harmless_in_a_terminal(tmp_path: Path) -> None:
     name = "\x1b[2J" + "x" * 1000
     with pytest.raises(InputError) as error:

@@ -36,7 +36,7 @@ def recognise(contents: Contents) -> Facts | None:
         size=mit_title(size),
         classes=size_at(shapes, CLASSIFIER),
         fits=((f"model=cmx_{size}", *convention),) if size else (),
-        remarks=(f"as released it is fed and evaluated with {' '.join(convention)}",),
+        convention=convention,
     )
 
 

@@ -19,6 +19,9 @@ FITS = {1: "heatnet_thermal", 3: "heatnet_rgb", 4: "heatnet_early"}
 """Channels of a single stem -> configuration."""
 
 
+CONVENTION = ("model/inputs=half", "model.align_corners=false")
+
+
 def recognise(contents: Contents) -> Facts | None:
     """A file with names under "trgb_segnet."."""
     shapes = shapes_of(contents.tensors)
@@ -35,6 +38,7 @@ def recognise(contents: Contents) -> Facts | None:
         classes=size_at(shapes, f"{PREFIX}final.0.weight"),
         prefix=PREFIX,
         fits=((f"model={name}",),) if name else (),
+        convention=CONVENTION,
     )
 
 

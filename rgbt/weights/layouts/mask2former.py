@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -48,6 +49,7 @@ def recognise(contents: Contents) -> Facts | None:
         classes=None if rows is None else rows - 1,
         prefix=prefix,
         fits=(overrides,) if overrides else (),
+        convention=("model/inputs=crm", *_fusion(contents)),
     )
 
 
@@ -61,13 +63,22 @@ def _size(shapes: Shapes) -> str:
 
 def _settings(contents: Contents) -> tuple[str, ...]:
     """What the configuration in the file says and the weights do not, where it is not usual."""
-    found = {key.split("MODEL.")[-1]: value for key, value in contents.settings.items()}
-    added = str(found.get("FUSION.AGGREGATION")).upper() == "ADD"
+    found = _configuration(contents)
     share = found.get("SWIN.SHARE_START_IDX", share_start(contents))
     return (
-        *(("model.fusion=add",) if added else ()),
+        *(each for each in _fusion(contents) if each != "model.fusion=max"),
         *((f"model.share_start={share}",) if share in (0, 1, 2, 3) else ()),
     )
+
+
+def _configuration(contents: Contents) -> dict[str, Any]:
+    return {key.split("MODEL.")[-1]: value for key, value in contents.settings.items()}
+
+
+def _fusion(contents: Contents) -> tuple[str, ...]:
+    """How the file's configuration joins the branches; nothing where it holds none."""
+    said = _configuration(contents).get("FUSION.AGGREGATION")
+    return () if said is None else (f"model.fusion={str(said).lower()}",)
 
 
 def share_start(contents: Contents) -> int:

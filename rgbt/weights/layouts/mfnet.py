@@ -14,6 +14,9 @@ WIDTHS = {"conv1_rgb": 16, "conv5_rgb.conv1_left": 48, "conv5_inf.conv1_left": 1
 """Channels of some units of the published size."""
 
 
+CONVENTION = ("model/inputs=unit", "model.final_activation=true")
+
+
 def recognise(contents: Contents) -> Facts | None:
     """A file with both encoders ("inf" is thermal) and the decoder."""
     shapes = shapes_of(contents.tensors)
@@ -29,6 +32,7 @@ def recognise(contents: Contents) -> Facts | None:
         family="mfnet",
         classes=size_at(shapes, "decode1.conv.weight"),
         fits=(("model=mfnet",),) if published else (),
+        convention=CONVENTION,
     )
 
 

@@ -11,6 +11,8 @@ from rgbt.weights.layout import Facts, Rule, count_blocks, shapes_of, size_at
 from rgbt.weights.layouts.resnet import DEPTHS
 from rgbt.weights.read import Contents
 
+CONVENTION = ("model/inputs=unit", "model.final_relu=true")
+
 
 def recognise(contents: Contents) -> Facts | None:
     """A file with both encoders and the decoder."""
@@ -30,6 +32,7 @@ def recognise(contents: Contents) -> Facts | None:
         size=f"ResNet-{layers}" if layers else "",
         classes=size_at(shapes, "deconv5.1.conv1.weight"),
         fits=((f"model=rtfnet_{layers}",),) if layers else (),
+        convention=CONVENTION,
     )
 
 
