@@ -42,9 +42,8 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
         @wraps(main)
         def entry() -> None:
             codes: list[int] = []
-            # Shells keep ~ after "=", and Hydra cannot read it. argparse takes overrides on
-            # one side of an option only, and people write -m anywhere.
-            words = [re.sub(r"=~(?=/|$)", f"={Path.home()}", word) for word in sys.argv[1:]]
+            # argparse takes overrides on one side of an option only, and people write -m anywhere.
+            words = readable_paths(sys.argv[1:])
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
@@ -55,6 +54,24 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
         return entry
 
     return decorate
+
+
+PATHS = ("model.weights", "dataset.root", "runs_dir", "out")
+
+
+def readable_paths(words: list[str]) -> list[str]:
+    """Arguments as Hydra reads them: shells keep ~ after "=", and file names hold anything.
+
+    A path with "=", spaces or brackets (epoch=299.ckpt) is put in quotes; a comma still makes a
+    grid.
+    """
+    found = []
+    for word in words:
+        key, equals, value = re.sub(r"=~(?=/|$)", f"={Path.home()}", word).partition("=")
+        if key in PATHS and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
+            value = "'" + value.replace("'", "\\'") + "'"
+        found.append(f"{key}{equals}{value}")
+    return found
 
 
 def task_overrides() -> list[str]:
@@ -181,9 +198,9 @@ def _split(own: Mapping[str, str | None], arguments: list[str]) -> tuple[dict[st
         if not equals:
             raise InputError(f"'{item}': expected key=value; {nearest(key, own)}.")
         if key in own:
-            values[key] = value
+            values[key] = re.sub(r"^~(?=/|$)", str(Path.home()), value)
         else:
-            overrides.append(item)
+            overrides += readable_paths([item])
     for key in own:
         if key not in values:
             raise InputError(f"'{key}' has no value; give one with {key}=...")

@@ -183,9 +183,9 @@ def _typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any]
             _check_value(f"{path}.{key}", value, OF_THE_RUN[path][key])
             continue
         if key not in parameters:
+            known = [*OF_THE_RUN.get(path, ()), *(name for name in parameters if name in hints)]
             raise InputError(
-                f"'{path}.{key}' is not a setting of {node['_target_']}; "
-                f"{nearest(key, [name for name in parameters if name in hints])}."
+                f"'{path}.{key}' is not a setting of {node['_target_']}; {nearest(key, known)}."
             )
         if isinstance(value, DictConfig) and "_target_" in value:
             values[key] = nested(value, f"{path}.{key}")

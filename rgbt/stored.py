@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config import check, conf_dir, flatten, register_resolvers, run_key, weights_file
-from rgbt.engine.checkpoint import load_checkpoint, load_weights
+from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
 
@@ -133,7 +133,7 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
                 f"{folder} was trained with the classes {', '.join(trained)}, but "
                 f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
             )
-    load_weights(session.model, payload["model"], weights)
+    restore_weights(session.model, payload["model"], weights)
     step = payload["step"] if checkpoint == "best" else payload["state"]["step"]
     return Stored(session, step, folder / "evaluations", config.name)
 

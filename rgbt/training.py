@@ -20,7 +20,7 @@ from rgbt.checks import InputError
 from rgbt.config import build, run_key
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.engine.checkpoint import State, load_checkpoint, load_weights
+from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
@@ -118,11 +118,11 @@ def prepare(config: DictConfig) -> Prepared:
         # One draw for nothing: cells that do not fit the crop are told before the run is begun.
         centre = torch.zeros(1, 2, dtype=torch.int64)
         masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
-    no_weights = config.model.weights is None
-    if no_weights and config.optimizer.get("backbone_multiplier", 1.0) < 1.0:
+    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
+    if expected and session.weights is None:
         _say(
-            "the backbone starts from random weights with a learning rate meant for pretrained "
-            "ones; name a file with model.weights=..., or expect less than published."
+            "the published recipe starts from ImageNet weights, this run from random ones; name a "
+            "file with model.weights=..., or expect less than published."
         )
     builder = build(config.optimizer)
     model, optimizer = session.fabric.setup(session.model, builder(session.model))
@@ -236,7 +236,7 @@ class Run:
     def _test(self, session: Session, state: State) -> None:
         """Counts, tables and figures of the best checkpoint on the test split."""
         best = self.folder.path / "best.pt"
-        load_weights(session.model, load_checkpoint(best)["model"], best)
+        restore_weights(session.model, load_checkpoint(best)["model"], best)
         found = evaluate(session, session.model, "test", keep=panel_names(session.dataset))
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))

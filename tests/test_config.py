@@ -76,6 +76,10 @@ def test_recipes_of_the_reference_networks() -> None:
         sgd = config.optimizer
         assert (sgd.lr, sgd.momentum, sgd.weight_decay) == (0.01, 0.9, 5e-4)
         assert (config.schedule.factor, config.trainer.clip_norm) == (0.95, None)
+    assert (rtfnet.schedule.epoch_steps, mfnet.trainer.max_steps) == (1568 // 3, 100 * (784 // 8))
+    assert (cmx.model.inputs.thermal_scale, cmx.model.drop_path_stage2) == (
+        *("image_max", "released"),
+    )
     batch_sizes = [config.data.batch_size for config in (cmx, rtfnet, mfnet)]
     assert batch_sizes == [1, 3, 8]
     for config in (cmx, rtfnet, mfnet):
@@ -151,3 +155,14 @@ def test_flatten_gives_dotted_keys() -> None:
 
 def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
     assert conf_dir() == Path(__file__).resolve().parents[1] / "conf"
+
+
+def test_paths_are_read_as_they_are_typed() -> None:
+    from rgbt.command import readable_paths
+
+    typed = ["model.weights=a/epoch=299 (best).ckpt", "dataset.root=~/MF", "model.weights=a,b"]
+    first, root, grid = readable_paths([*typed, "masker.sigma_div=1,2", "-m"])[:3]
+    assert compose(first).model.weights == "a/epoch=299 (best).ckpt"
+    assert root == f"dataset.root={Path.home()}/MF"
+    assert grid == "model.weights=a,b"
+    assert readable_paths(["-m", "masker.sigma_div=1,2"]) == ["-m", "masker.sigma_div=1,2"]

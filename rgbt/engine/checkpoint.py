@@ -87,7 +87,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return payload
 
 
-def load_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
+def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
     """Put `weights` into `model`; every key must fit.
 
     Raises:

@@ -27,7 +27,8 @@ class Poly:
     Attributes:
         power: 0.9 in both releases.
         per: what t counts.
-        warmup_steps: steps over which the factor rises linearly from 1 / warmup_steps.
+        warmup_steps: steps over which the factor rises linearly from 1 / warmup_steps to 1; the
+            decay, counted from step 0, takes over after them (as in the temporal release).
     """
 
     power: float
@@ -42,25 +43,28 @@ class Poly:
         """See `Schedule`."""
         done = step if self.per == "iteration" else step // steps_per_epoch
         decay = max(0.0, 1.0 - done / max_steps) ** self.power
-        warmup = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
-        return float(decay * warmup)
+        return (step + 1) / self.warmup_steps if step < self.warmup_steps else float(decay)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Exponential:
-    """``factor ** epoch``, epochs counted from 0.
+    """``factor ** epoch``, epochs counted from 0 and rounded down.
 
     Source: MFNet and RTFNet releases.
 
     Attributes:
         factor: 0.95 in both releases' code; MFNet's released weights were trained with 0.94.
+        epoch_steps: length of an epoch in steps, where a release's list is longer than ours;
+            null: the list's own.
     """
 
     factor: float
+    epoch_steps: int | None
 
     def __post_init__(self) -> None:
         check_range("schedule.factor", self.factor, 0.0, 1.0)
+        check_range("schedule.epoch_steps", self.epoch_steps or 1, 1, 2**40)
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""
-        return float(self.factor ** (step // steps_per_epoch))
+        return float(self.factor ** (step // (self.epoch_steps or steps_per_epoch)))

@@ -97,6 +97,7 @@ class Scale:
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
+        pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
     """
 
     pixel_factor: float
@@ -114,3 +115,4 @@ class Scale:
     clip_norm: float | None
     warmup_steps: int
     precision: str
+    pretrained: bool

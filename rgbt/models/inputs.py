@@ -80,7 +80,7 @@ class Inputs(nn.Module):
     def forward(
         self, rgb: Tensor, thermal: Tensor, masks: MaskPair | None = None, *, multiple: int = 1
     ) -> Images:
-        """Normalised images; hidden pixels and padding are 0, which is the mean colour.
+        """Normalised images; hidden pixels and padding are 0: the mean, or black where that is 0.
 
         Args:
             rgb: (N, 3, H, W) float in [0, 1].

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError, check_choice, check_range
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
@@ -74,6 +74,8 @@ class PSPNet(nn.Module):
         check_rates(dropout)
         if min(depths) < 1:
             raise InputError(f"model.depths needs at least one block per stage, got {depths}.")
+        check_range("model.base_width", base_width, 1, 4096)
+        check_range("model.decoder_width", decoder_width, 1, 4096)
         self.num_classes = num_classes
         self.views = VIEWS_OF[modalities]
         self.modalities = modalities

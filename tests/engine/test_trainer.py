@@ -11,7 +11,7 @@ from lightning_fabric import Fabric
 from torch import nn
 
 from rgbt.checks import InputError, RunError
-from rgbt.engine.checkpoint import State, load_checkpoint, load_weights, save_checkpoint
+from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights, save_checkpoint
 from rgbt.engine.optimizers import SGD, AdamW
 from rgbt.engine.schedules import Exponential, Poly
 from rgbt.engine.settings import TrainerSettings
@@ -182,6 +182,10 @@ def test_schedule_values() -> None:
     warm = Poly(power=0.9, per="iteration", warmup_steps=4)
     assert warm(0, 10**9, 1) == pytest.approx(0.25)
     assert warm(3, 10**9, 1) == pytest.approx(1.0)
+    # Temporal release: 6e-5 at the end of the warm-up, then 5.72931e-5 at step 18740 of 374800.
+    temporal = Poly(power=0.9, per="iteration", warmup_steps=18740)
+    assert 6e-5 * temporal(18739, 374800, 1) == pytest.approx(6e-5)
+    assert 6e-5 * temporal(18740, 374800, 1) == pytest.approx(5.72931e-5, rel=1e-5)
 
 
 def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings() -> None:
@@ -240,9 +244,9 @@ def test_sgd_refuses_values_out_of_range(change: dict[str, float]) -> None:
 
 
 def test_exponential_falls_by_the_epoch() -> None:
-    schedule = Exponential(factor=0.5)
-    factors = [schedule(step, 100, 3) for step in range(7)]
-    assert factors == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
+    own, longer = (Exponential(factor=0.5, epoch_steps=steps) for steps in (None, 6))
+    assert [own(step, 100, 3) for step in range(7)] == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
+    assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]
 
 
 def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
@@ -250,9 +254,9 @@ def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) ->
     save_checkpoint(path, {"model": nn.Linear(2, 3).state_dict()})
     weights = load_checkpoint(path)["model"]
     with pytest.raises(InputError, match=r"another model: 0 keys missing.*weight"):
-        load_weights(nn.Linear(2, 4), weights, path)
+        restore_weights(nn.Linear(2, 4), weights, path)
     with pytest.raises(InputError, match=r"1 keys unexpected \(bias\)"):
-        load_weights(nn.Linear(2, 3, bias=False), weights, path)
+        restore_weights(nn.Linear(2, 3, bias=False), weights, path)
 
 
 def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:

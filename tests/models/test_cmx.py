@@ -131,6 +131,9 @@ def test_other_views_raise(views: tuple[str, ...]) -> None:
     [
         ({"num_heads": [3, 1, 1, 1]}, "num_heads"),
         ({"depths": [1, 0, 1, 1]}, "depths"),
+        ({"decoder_dim": 0}, "decoder_dim"),
+        ({"mlp_ratio": 0.0}, "mlp_ratio"),
+        ({"embed_dims": [0, 4, 4, 4]}, "embed_dims"),
         ({"drop_path_rate": 1.0}, "drop_path_rate"),
         ({"decoder_dropout": -0.1}, "decoder_dropout"),
         ({"decoder_norm_eps": 0.0}, "decoder_norm_eps"),

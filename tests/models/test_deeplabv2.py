@@ -156,6 +156,7 @@ def test_shapes(changes: dict[str, Any], size: tuple[int, int]) -> None:
         ({"dropout": (0.3, 0.15)}, "model.dropout"),
         ({**RELEASED, "dropout": (1.0, 0.0)}, "model.dropout"),
         ({"depths": (1, 1, 1, 0)}, "model.depths"),
+        ({"base_width": -1}, "model.base_width"),
         ({"inputs": half(1)}, "model/inputs=half_three"),
     ],
 )

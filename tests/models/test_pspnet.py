@@ -88,6 +88,8 @@ def test_sizes_of_the_release() -> None:
     [
         ({"modalities": "late"}, "model.modalities.*late_fusion"),
         ({"depths": (1, 0, 1, 1)}, "model.depths"),
+        ({"base_width": 0}, "model.base_width"),
+        ({"decoder_width": 0}, "model.decoder_width"),
         ({"dropout": (0.3, 1.0)}, "model.dropout"),
     ],
 )

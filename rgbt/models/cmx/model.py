@@ -139,7 +139,7 @@ class CMX(nn.Module):
     ) -> None:
         super().__init__()
         shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
-        _check(shape, drop_path_rate, decoder_dropout)
+        _check(shape, decoder_dim, drop_path_rate, decoder_dropout)
         check_choice("model.drop_path_stage2", drop_path_stage2, ("ramp", "released"))
         self.num_classes = num_classes
         # The smallest image whose every map is at least as large as the kernel that shrinks it.
@@ -212,7 +212,9 @@ class CMX(nn.Module):
         return Output(logits, {})
 
 
-def _check(shape: MitShape, drop_path_rate: float, decoder_dropout: float) -> None:
+def _check(
+    shape: MitShape, decoder_dim: int, drop_path_rate: float, decoder_dropout: float
+) -> None:
     """Refuse sizes that do not fit each other, naming the key."""
     check_range("model.drop_path_rate", drop_path_rate, 0, 0.999)
     check_range("model.decoder_dropout", decoder_dropout, 0, 0.999)
@@ -220,6 +222,11 @@ def _check(shape: MitShape, drop_path_rate: float, decoder_dropout: float) -> No
         raise InputError(
             "model.depths and model.sr_ratios must be at least 1 in every stage, got "
             f"{shape.depths} and {shape.sr_ratios}."
+        )
+    if min(decoder_dim, *(int(dim * shape.mlp_ratio) for dim in shape.embed_dims)) < 1:
+        raise InputError(
+            "model.decoder_dim, model.embed_dims and model.mlp_ratio must be positive, got "
+            f"{decoder_dim}, {shape.embed_dims} and {shape.mlp_ratio:g}."
         )
     for stage, (dim, heads) in enumerate(zip(shape.embed_dims, shape.num_heads, strict=True)):
         if heads < 1 or dim % heads:

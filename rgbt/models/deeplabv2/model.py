@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError, check_choice, check_range
 from rgbt.geometry import padded_hw
 from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
 from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid
@@ -72,6 +72,7 @@ class DeepLabV2(nn.Module):
         inputs: Inputs,
     ) -> None:
         super().__init__()
+        check_range("model.base_width", base_width, 1, 4096)
         shape = HeadShape(
             32 * base_width, num_classes, decoder, rates, summed_rates, dropout, align_corners
         )
