@@ -8,16 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config import conf_dir
 from rgbt.models.inputs import Inputs
 from rgbt.models.rtfnet import RTFNet, UpceptionA, UpceptionB
 from rgbt.types import MaskPair
-from tests.models.golden import network
+from tests.models.golden import compose, network
 
 DEPTHS = (18, 34, 50, 101, 152)
 
@@ -288,9 +286,9 @@ def test_images_that_do_not_fit_each_other_raise() -> None:
 
 @pytest.mark.parametrize("name", ["tiny", *DEPTHS])
 def test_yaml_names_every_argument(name: str | int) -> None:
-    node = OmegaConf.load(conf_dir() / "model" / f"rtfnet_{name}.yaml")
-    wanted = set(inspect.signature(RTFNet).parameters) - {"inputs"}
-    assert set(node) - {"defaults", "_target_"} == wanted
+    node = compose(f"model=rtfnet_{name}").model
+    wanted = set(inspect.signature(RTFNet).parameters)
+    assert set(node) - {"_target_", "weights", "fresh"} == wanted
 
 
 @pytest.mark.parametrize(
