@@ -90,6 +90,23 @@ def test_recipes_of_the_reference_networks() -> None:
     ]
 
 
+def test_published_settings_of_the_networks() -> None:
+    """Values that neither parameter counts nor recorded outputs in evaluation mode would show."""
+    cmx = compose("model=cmx_b2").model
+    assert (cmx.drop_path_rate, cmx.decoder_dropout, cmx.decoder_norm_eps) == (0.1, 0.1, 1e-3)
+    assert (cmx.drop_path_stage2, cmx.decoder_norm_eps_eval) == ("ramp", None)
+    heatnet = compose("model=heatnet").model
+    assert (list(heatnet.dropout), heatnet.align_corners) == ([0.3, 0.15], False)
+    modified = compose("model=deeplabv2_two_heads_modified").model
+    assert (list(modified.dropout), modified.align_corners) == ([0.3, 0.15], False)
+    for size in "tsb":
+        assert compose(f"model=mask2former_swin_{size}").model.drop_path_rate == 0.3
+    for depth in (18, 34, 50, 101, 152):
+        rtfnet = compose(f"model=rtfnet_{depth}").model
+        assert (rtfnet.final_relu, rtfnet.thermal_stem) == (True, "rgb_mean")
+    assert compose("model=mfnet").model.final_activation
+
+
 @pytest.mark.parametrize("name", ["deeplabv2", "deeplabv2_two_heads", "deeplabv2_tiny"])
 def test_deeplab_pools_as_released_and_counts_all_rates(name: str) -> None:
     model = compose(f"model={name}").model

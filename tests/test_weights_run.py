@@ -14,6 +14,7 @@ from rgbt import evaluate, predict
 from rgbt.command import plain_command
 from rgbt.config import run_key
 from rgbt.metrics.counts import Counts
+from rgbt.weights.__main__ import main as weights_main
 from tests.commands import Call, assert_one_sentence, only_run, short, train
 from tests.models.golden import SHARED, compose
 
@@ -86,6 +87,16 @@ def test_another_way_of_feeding_is_said(call: Call, data: Path, tmp_path: Path) 
     first = only_run(tmp_path / "first")
     for runs, inputs in (("same", "unit"), ("other", "crm")):
         words = (f"model.weights={first}", f"model/inputs={inputs}")
+        code, _, err = train(call, data, tmp_path / runs, *one, *words)
+        assert code == 0, err
+        assert ("this network with something else" in err) == (inputs == "crm")
+
+    # An export carries what it was fed with; the released layout of MFNet has no room for that.
+    exported = tmp_path / "mine.safetensors"
+    words = ("export", f"run={first}", "format=safetensors", f"out={exported}")
+    assert call(weights_main, *words)[0] == 0
+    for runs, inputs in (("third", "unit"), ("fourth", "crm")):
+        words = (f"model.weights={exported}", f"model/inputs={inputs}")
         code, _, err = train(call, data, tmp_path / runs, *one, *words)
         assert code == 0, err
         assert ("this network with something else" in err) == (inputs == "crm")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -36,5 +38,20 @@ def recognise(contents: Contents) -> Facts:
         # How it is fed is in the note and cannot be told from the layout.
         origin = " ".join(filter(None, map(contents.note.get, ("run", "checkpoint"))))
         said = f"exported from {printable(origin or 'this project')}, fed as its note says"
-        return replace(facts, fits=tuple(each[:1] for each in facts.fits), remarks=(said,))
+        return replace(
+            facts,
+            fits=tuple(each[:1] for each in facts.fits),
+            convention=(),
+            inputs=_inputs(contents.note.get("inputs", "")),
+            remarks=(said,),
+        )
     return facts
+
+
+def _inputs(text: str) -> Mapping[str, object] | None:
+    """`model.inputs` as an export notes it, None where it does not."""
+    try:
+        said = json.loads(text)
+    except json.JSONDecodeError:
+        return None
+    return said if isinstance(said, dict) else None

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-
 from torch import nn
 
 from rgbt.weights.layout import FAMILIES, Facts, Rule
@@ -29,16 +26,7 @@ def recognise(contents: Contents) -> Facts | None:
         size=guess.size,
         classes=guess.classes,
         fits=tuple(overrides[:1] for overrides in guess.fits),
-        inputs=_inputs(contents.note.get("inputs", "null")),
     )
-
-
-def _inputs(text: str) -> Mapping[str, object] | None:
-    try:
-        said = json.loads(text)
-    except json.JSONDecodeError:
-        return None
-    return said if isinstance(said, dict) else None
 
 
 def rule(family: str, _model: nn.Module, facts: Facts) -> Rule | None:
