@@ -124,12 +124,24 @@ def prepare(config: DictConfig) -> Prepared:
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
             "file with model.weights=..., or expect less than published."
         )
+    loss = build(config.loss)
+    _check_loss(loss, session.model)
     builder = build(config.optimizer)
     model, optimizer = session.fabric.setup(session.model, builder(session.model))
-    scheme: Scheme = build(
-        config.scheme, model=model, loss=build(config.loss), masker=masker, sdc=sdc, sdn=sdn
-    )
+    scheme: Scheme = build(config.scheme, model=model, loss=loss, masker=masker, sdc=sdc, sdn=sdn)
     return Prepared(session, model, optimizer, scheme, build(config.schedule))
+
+
+def _check_loss(loss: object, model: nn.Module) -> None:
+    """Refuse a loss that reads what the network does not return, where both say it."""
+    reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
+    if None in (reads, predicts) or reads == predicts:
+        return
+    advice = {"scores": "loss=cross_entropy", "masks": "loss=set_criterion"}
+    raise InputError(
+        f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts {predicts}; "
+        f"choose {advice[str(predicts)]}, or another network."
+    )
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,9 @@ View = Literal["rgbt", "rgb", "thermal"]
 
 VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
+Predicts = Literal["scores", "masks"]
+"""What a network returns in training: dense class scores, or masks and classes of queries."""
+
 GeneratorOf = Callable[[str], torch.Generator]
 """purpose -> generator; the same purpose in the same step always gives the same draws."""
 
@@ -125,10 +128,15 @@ class Network(Protocol):
         num_classes: K.
         views: what it can predict from; the first is what it is evaluated with unless told
             otherwise.
+        predicts: what it returns in training, which its loss must read.
+        pretrained_parts: beginnings of the names of the parameters that an ImageNet file covers;
+            they get the backbone's learning rate.
     """
 
     num_classes: int
     views: tuple[View, ...]
+    predicts: Predicts
+    pretrained_parts: tuple[str, ...]
 
     def __call__(
         self,

@@ -432,3 +432,21 @@ def test_real_pairs_train_and_evaluate_like_the_embedded_data(call: Call, tmp_pa
     # Labelled pixels per class of these 100 images, counted independently of this project.
     labelled = [29157290, 176251, 290344, 553653, 108846, 134539, 0, 223949, 75128]
     assert counts.whole().sum(1).tolist() == labelled
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("+experiment=baseline", "model=cmx_tiny"), "choose loss=cross_entropy"),
+        (("+experiment=mfnet", "model=mask2former_tiny"), "choose loss=set_criterion"),
+        (("+experiment=crm", "model=rtfnet_tiny", "loss=cross_entropy"), "scheme=supervised"),
+    ],
+)
+def test_a_loss_or_scheme_that_does_not_fit_leaves_no_folder(
+    call: Call, data: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    patch = [] if "+experiment=crm" in words else ["masker.patch_size=null"]
+    code, _, err = train(call, data, tmp_path / "runs", *words, *patch, *short(1))
+    assert code == 2
+    assert_one_sentence(err, sentence)
+    assert not (tmp_path / "runs").exists()

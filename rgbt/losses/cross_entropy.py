@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
-from rgbt.types import IGNORE, Batch, Output
+from rgbt.types import IGNORE, Batch, Output, Predicts
 
 
 class CrossEntropy:
@@ -21,6 +21,8 @@ class CrossEntropy:
     Raises:
         InputError: a negative weight.
     """
+
+    reads: Predicts = "scores"
 
     def __init__(self, *, class_weights: tuple[float, ...] | None) -> None:
         if class_weights is not None and min(class_weights, default=-1.0) < 0:

@@ -17,7 +17,7 @@ from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
 from rgbt.losses.points import Points, PointSource
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
-from rgbt.types import Batch, Output
+from rgbt.types import Batch, Output, Predicts
 
 
 class SetCriterion:
@@ -49,6 +49,8 @@ class SetCriterion:
     Raises:
         InputError: a setting out of its range.
     """
+
+    reads: Predicts = "masks"
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,

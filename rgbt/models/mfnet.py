@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.models.inputs import Inputs, only_view
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 16
 """Four halvings, which the decoder undoes exactly."""
@@ -99,6 +99,7 @@ class MFNet(nn.Module):
     """
 
     views: tuple[View, ...] = ("rgbt",)
+    predicts: Predicts = "scores"
     pretrained_parts: tuple[str, ...] = ()
 
     def __init__(

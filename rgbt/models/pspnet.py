@@ -12,7 +12,7 @@ from rgbt.checks import InputError, check_choice, check_range
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 8
 """Of the encoder; the decoder doubles the size three times."""
@@ -55,6 +55,7 @@ class PSPNet(nn.Module):
         inputs: normalisation of the images.
     """
 
+    predicts: Predicts = "scores"
     pretrained_parts: tuple[str, ...] = ("feats.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError, check_choice
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.resnet import basic_stage, bottleneck_stage
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 32
 """Five halvings, which the decoder undoes exactly."""
@@ -112,6 +112,7 @@ class RTFNet(nn.Module):
     """
 
     views: tuple[View, ...] = ("rgbt",)
+    predicts: Predicts = "scores"
     pretrained_parts: tuple[str, ...] = ("encoder_",)
 
     def __init__(

@@ -14,7 +14,7 @@ from rgbt.models.cmx.fusion import Fusion, Rectification
 from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.stochastic import keep_factors
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import MaskPair, Output, Predicts, View
 
 STREAMS = ("", "extra_")
 """Beginnings of the released names: RGB, and the other modality."""
@@ -118,6 +118,7 @@ class CMX(nn.Module):
     """
 
     views: tuple[View, ...] = ("rgbt",)
+    predicts: Predicts = "scores"
     pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -12,7 +12,7 @@ from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
 from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.upsampling import DropRates
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 8
 """Of the backbone; the modified decoders double the size three times."""
@@ -52,6 +52,7 @@ class DeepLabV2(nn.Module):
     """
 
     views: tuple[View, ...] = ("rgb", "thermal")
+    predicts: Predicts = "scores"
     pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -15,7 +15,7 @@ from rgbt.models.mask2former.backbone import RgbtBackbone
 from rgbt.models.mask2former.decoder import Predictions, Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
-from rgbt.types import VIEWS, MaskPair, Output, View
+from rgbt.types import VIEWS, MaskPair, Output, Predicts, View
 
 
 class Head(nn.Module):
@@ -60,6 +60,7 @@ class Mask2Former(nn.Module):
     """
 
     views: tuple[View, ...] = VIEWS
+    predicts: Predicts = "masks"
     pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
