@@ -63,7 +63,8 @@ class Exponential:
 
     def __post_init__(self) -> None:
         check_range("schedule.factor", self.factor, 0.0, 1.0)
-        check_range("schedule.epoch_steps", self.epoch_steps or 1, 1, 2**40)
+        if self.epoch_steps is not None:
+            check_range("schedule.epoch_steps", self.epoch_steps, 1, 2**40)
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""

@@ -247,6 +247,8 @@ def test_exponential_falls_by_the_epoch() -> None:
     own, longer = (Exponential(factor=0.5, epoch_steps=steps) for steps in (None, 6))
     assert [own(step, 100, 3) for step in range(7)] == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
     assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]
+    with pytest.raises(InputError, match="schedule.epoch_steps"):
+        Exponential(factor=0.5, epoch_steps=0)
 
 
 def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
