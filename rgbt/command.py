@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
-from rgbt.config import check, conf_dir, register_resolvers
+from rgbt.config import check, compose, conf_dir, register_resolvers
 
 Main = Callable[[DictConfig], int | None]
 
@@ -149,11 +149,10 @@ def _composed_without(full_key: str) -> DictConfig:
     """The configuration that was asked for, but for the key that it does not know."""
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
     others = [word for word in words if word.lstrip("+~").partition("=")[0] != full_key]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        try:
-            return hydra.compose("config", others)
-        except HydraException:  # a second mistake, or the comma lists of a grid
-            return hydra.compose("config")
+    try:
+        return compose(others)
+    except HydraException:  # a second mistake, or the comma lists of a grid
+        return compose([])
 
 
 def _unknown_key(full_key: str) -> str:

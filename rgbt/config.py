@@ -11,10 +11,11 @@ import hashlib
 import inspect
 import json
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import hydra
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -49,6 +50,13 @@ def conf_dir() -> Path:
     here = Path(__file__).resolve().parent
     inside = here / "conf"
     return inside if inside.is_dir() else here.parent / "conf"
+
+
+def compose(overrides: Sequence[str]) -> DictConfig:
+    """The configuration that `rgbt.run` would get from these overrides, not checked."""
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", list(overrides))
 
 
 def register_resolvers() -> None:

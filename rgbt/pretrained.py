@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config import conf_dir, weights_file
+from rgbt.config import compose, weights_file
+from rgbt.tracking.terminal import tell
 from rgbt.weights.load import load_weights
 from rgbt.weights.report import Report
 
@@ -35,13 +34,15 @@ def start(model: nn.Module, config: DictConfig) -> Report | None:
             )
         return None
     report = load_weights(model, source, fresh)
-    _say(report.sentence())
+    tell(report.sentence())
     others = differences(config.model, report.facts.convention)
     if not others and _fed_otherwise(config.model, report, source):
         others = ["the inputs noted beside it"]
     if others:
-        _say(f"{source} goes with {' '.join(others)}, this network with something else: its scores "
-             "are not those that the weights were trained for.")  # fmt: skip
+        tell(
+            f"{source} goes with {' '.join(others)}, this network with something else: its scores "
+            "are not those that the weights were trained for."
+        )
     return report
 
 
@@ -58,9 +59,7 @@ def differences(node: DictConfig, convention: Iterable[str]) -> list[str]:
 def _holds(node: DictConfig, override: str) -> bool:
     key, _, text = override.partition("=")
     if key == "model/inputs":
-        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            released = hydra.compose("config", [override]).model.inputs
-        return bool(_plain(node.inputs) == _plain(released))
+        return bool(_plain(node.inputs) == _plain(compose([override]).model.inputs))
     try:
         value = json.loads(text)
     except json.JSONDecodeError:
@@ -88,7 +87,3 @@ def _plain(inputs: Any) -> Any:
         key: [float(each) for each in value] if isinstance(value, list) else value
         for key, value in plain.items()
     }
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"rgbt: {text}\n")

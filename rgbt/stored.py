@@ -6,12 +6,11 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config import check, conf_dir, flatten, register_resolvers, run_key, weights_file
+from rgbt.config import check, compose, flatten, register_resolvers, run_key, weights_file
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
@@ -59,7 +58,7 @@ def open_trained(
     """
     if run:
         return open_run(find_run(run, runs_dir), overrides, checkpoint)
-    config = _composed(["scale=paper", f"runs_dir={runs_dir}", *overrides])
+    config = compose(["scale=paper", f"runs_dir={runs_dir}", *overrides])
     source = weights_file(config)
     if source is None:
         raise InputError(
@@ -78,12 +77,6 @@ def open_trained(
     # Copies of a data set in other places may hold other images.
     place = f"{run_key(config)}-{session.dataset.fingerprint()[:8]}"
     return Stored(session, 0, runs_dir / "evaluations" / place, source.name)
-
-
-def _composed(overrides: list[str]) -> DictConfig:
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose("config", overrides)
 
 
 def find_run(run: str, runs_dir: Path) -> Path:
@@ -148,7 +141,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     groups = [key for key, _ in pairs if key in GROUPS]
     for group in groups:
         own = [f"{key}={value}" for key, value in pairs if key.split(".")[0] == group]
-        composed = _composed(own)[group]
+        composed = compose(own)[group]
         for name in OmegaConf.missing_keys(composed):
             raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)

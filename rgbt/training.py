@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import textwrap
 import time
 from collections.abc import Iterator, Sequence
@@ -34,7 +33,7 @@ from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.pictures import Example, Legend, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.tables import ResultTables
-from rgbt.tracking.terminal import result_view, show
+from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.types import Batch, Masker
 
 LABEL_WIDTH = 40
@@ -77,15 +76,11 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
 def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> None:
     known = folder.description()
     assert known is not None, "a finished run has its description"
-    _say(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
+    tell(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
     # A point of a grid that is the default elsewhere: the name that says more is the one to read.
     shown = asked if len(asked.name) > len(known.name) else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish()
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"rgbt: {text}\n")
 
 
 @dataclass(frozen=True)
@@ -120,7 +115,7 @@ def prepare(config: DictConfig) -> Prepared:
         masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
     expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
     if expected and session.weights is None:
-        _say(
+        tell(
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
             "file with model.weights=..., or expect less than published."
         )
@@ -198,7 +193,7 @@ class Run:
                 "(dataset.name=...)."
             )
         if begun["files"] != found["files"]:
-            _say(f"files of {dataset.root} have changed since this run was begun.")
+            tell(f"files of {dataset.root} have changed since this run was begun.")
         write_atomic(marker, json.dumps(found).encode())
         config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
         self.folder.write_config(config)
@@ -208,7 +203,7 @@ class Run:
         state = State(seed=session.config.seed)
         trainer = self._trainer(session, state)
         if trainer.resume(state):
-            _say(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
+            tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
         self.folder.truncate_after(state.step)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
@@ -260,7 +255,7 @@ class Run:
         if found.kept:
             self._draw(session, tables, found.kept)
         else:
-            _say("none of the images of the panel could be read; no pictures were drawn.")
+            tell("none of the images of the panel could be read; no pictures were drawn.")
 
     def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
         palette = np.array(session.dataset.palette, np.uint8)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import hydra
 import pytest
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import NODES, build, check, conf_dir, flatten, register_resolvers, run_key
+from rgbt.config import NODES, build, check, conf_dir, flatten, run_key
+from tests.models.golden import compose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,12 +20,6 @@ class Knob:
     kind: Literal["a", "b"]
     inner: Knob | None = None
     model: object = None
-
-
-def compose(*overrides: str) -> DictConfig:
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose("config", list(overrides))
 
 
 def options(group: str) -> list[str]:

@@ -32,6 +32,11 @@ def keep_factors(
     return ((draw < probability) / probability).to(device, non_blocking=True)
 
 
+def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
+    """``x + factor * residual``; None, where nothing is dropped, is 1."""
+    return x + residual if factor is None else torch.addcmul(x, residual, factor)
+
+
 def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
     """Whole channels of (N, C, H, W) set to 0 with probability `rate`, the others rescaled.
 

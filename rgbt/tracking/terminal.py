@@ -1,7 +1,8 @@
-"""The end of a run in the terminal: tables and where everything is, on stdout."""
+"""What a run says in the terminal: remarks on stderr; tables and where everything is on stdout."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,11 @@ from rgbt.tracking.tables import Grid, ResultTables, result_grids
 
 WIDTH = 240
 """Columns that a table may take; nine regions need about 110."""
+
+
+def tell(sentence: str) -> None:
+    """A line on stderr that is no error."""
+    sys.stderr.write(f"rgbt: {sentence}\n")
 
 
 def rich_table(grid: Grid) -> Table:

@@ -21,7 +21,7 @@ from yaml import YAMLError
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.command import plain_command
-from rgbt.config import build, conf_dir, register_resolvers
+from rgbt.config import build, compose, conf_dir, register_resolvers
 from rgbt.weights.layout import Facts
 from rgbt.weights.read import Contents
 
@@ -72,11 +72,7 @@ def _network(
         overrides = [*usual, *overrides]
     if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
         overrides = [*overrides, f"model.num_classes={facts.classes}"]
-    import hydra
-
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose("config", overrides).model, " ".join(overrides)
+    return compose(overrides).model, " ".join(overrides)
 
 
 def _is_ours(node: object) -> bool:
@@ -134,6 +130,7 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     from rgbt.pretrained import differences
     from rgbt.stored import find_run
+    from rgbt.tracking.terminal import tell
     from rgbt.weights.layout import family_named
     from rgbt.weights.read import read
     from rgbt.weights.release import CONVENTIONS, save
@@ -163,12 +160,12 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     remark = save(out, arguments["format"], family, contents.tensors, note)
     others = differences(model, CONVENTIONS.get((arguments["format"], family), ()))
     if others:
-        sys.stderr.write(
-            f"rgbt: the authors' code does {' '.join(others)}, this run did something else; there "
-            "its scores will not be ours.\n"
+        tell(
+            f"the authors' code does {' '.join(others)}, this run did something else; there its "
+            "scores will not be ours."
         )
     if remark:
-        sys.stderr.write(f"rgbt: {remark}.\n")
+        tell(f"{remark}.")
     sys.stdout.write(f"{out}\n")
     return 0
 

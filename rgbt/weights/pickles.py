@@ -28,6 +28,12 @@ Persistent = Callable[[Any], Any]
 GROWTH, SMALL = 8, 1_000_000
 """What may be copied while reading: so many times the bytes of the file, and a little more."""
 
+SENSELESS = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    *(MemoryError, RecursionError),
+)
+"""What opcodes in an order that nobody writes lead to."""
+
 SIZED = (str, bytes, bytearray, list, tuple, dict, set, frozenset)
 
 
@@ -56,9 +62,7 @@ def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Per
                 )
             step(machine, argument)
         return machine.stack.pop()
-    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-        raise DamagedError from error
-    except (MemoryError, RecursionError) as error:
+    except SENSELESS as error:
         raise DamagedError from error
 
 

@@ -15,14 +15,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from rgbt.config import build, conf_dir, register_resolvers
+from rgbt import config
+from rgbt.config import build
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
 FOLDER = SHARED / "golden"
@@ -79,9 +79,7 @@ def load(name: str) -> Golden:
 
 def compose(*overrides: str) -> DictConfig:
     """The configuration for these overrides."""
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose("config", list(overrides))
+    return config.compose(overrides)
 
 
 def network(yaml: str, num_classes: int = 9, **changed: Any) -> Any:

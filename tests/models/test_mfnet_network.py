@@ -16,7 +16,11 @@ from rgbt.checks import InputError
 from rgbt.config import conf_dir
 from rgbt.models.inputs import Inputs
 from rgbt.models.mfnet import MFNet, doubled
-from rgbt.types import MaskPair
+from tests.models.contract import (
+    check_gradient_reaches_every_parameter,
+    check_hidden_pixels_do_not_count,
+    check_nothing_is_drawn,
+)
 from tests.models.golden import network
 
 
@@ -164,34 +168,16 @@ def test_padding_is_black() -> None:
 
 
 def test_hidden_pixels_do_not_count() -> None:
-    net = nano()
-    rgb, thermal = images(1, 64, 96)
-    hidden = torch.zeros(1, 2, 3, dtype=torch.bool)
-    hidden[0, 1, 2] = True
-    masks = MaskPair(hidden, hidden)
-    changed = rgb.clone(), thermal.clone()
-    for image in changed:
-        image[..., 32:, 64:] = 0.5
-    assert torch.equal(net(rgb, thermal, masks).logits, net(*changed, masks).logits)
-    assert not torch.allclose(net(rgb, thermal).logits, net(*changed).logits)
+    check_hidden_pixels_do_not_count(nano(), images(1, 64, 96))
 
 
 def test_gradient_reaches_every_parameter() -> None:
     """A bias before a normalisation has none but rounding, so that it is checked in evaluation."""
-    net = nano()
-    logits = net(*images(2)).logits
-    weight = torch.randn(logits.shape, generator=torch.Generator().manual_seed(2))
-    (logits * weight).sum().backward()
-    idle = [n for n, p in net.named_parameters() if p.grad is None or not p.grad.any()]
-    assert idle == []
-    assert all(p.grad.isfinite().all() for p in net.parameters())
+    check_gradient_reaches_every_parameter(nano(), images(2))
 
 
 def test_nothing_is_drawn_while_training() -> None:
-    net = nano().train()
-    state = torch.get_rng_state()
-    net(*images(2))
-    assert torch.equal(state, torch.get_rng_state())
+    check_nothing_is_drawn(nano().train(), images(2))
 
 
 def test_three_thermal_channels() -> None:

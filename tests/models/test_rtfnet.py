@@ -14,7 +14,11 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.models.inputs import Inputs
 from rgbt.models.rtfnet import RTFNet, UpceptionA, UpceptionB
-from rgbt.types import MaskPair
+from tests.models.contract import (
+    check_gradient_reaches_every_parameter,
+    check_hidden_pixels_do_not_count,
+    check_nothing_is_drawn,
+)
 from tests.models.golden import compose, network
 
 DEPTHS = (18, 34, 50, 101, 152)
@@ -190,33 +194,15 @@ def test_padding_is_black() -> None:
 
 
 def test_hidden_pixels_do_not_count() -> None:
-    net = randomised(nano(final_relu=False))
-    rgb, thermal = images(1)
-    hidden = torch.zeros(1, 2, 3, dtype=torch.bool)
-    hidden[0, 1, 2] = True
-    masks = MaskPair(hidden, hidden)
-    changed = rgb.clone(), thermal.clone()
-    for image in changed:
-        image[..., 32:, 64:] = 0.5
-    assert torch.equal(net(rgb, thermal, masks).logits, net(*changed, masks).logits)
-    assert not torch.allclose(net(rgb, thermal).logits, net(*changed).logits)
+    check_hidden_pixels_do_not_count(randomised(nano(final_relu=False)), images(1))
 
 
 def test_gradient_reaches_every_parameter() -> None:
-    net = nano(final_relu=False).train()
-    logits = net(*images(2)).logits
-    weight = torch.randn(logits.shape, generator=torch.Generator().manual_seed(2))
-    (logits * weight).sum().backward()
-    idle = [n for n, p in net.named_parameters() if p.grad is None or not p.grad.any()]
-    assert idle == []
-    assert all(p.grad.isfinite().all() for p in net.parameters())
+    check_gradient_reaches_every_parameter(nano(final_relu=False).train(), images(2))
 
 
 def test_nothing_is_drawn_while_training() -> None:
-    net = nano().train()
-    state = torch.get_rng_state()
-    net(*images(2))
-    assert torch.equal(state, torch.get_rng_state())
+    check_nothing_is_drawn(nano().train(), images(2))
 
 
 def test_three_thermal_channels() -> None:

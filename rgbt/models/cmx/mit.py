@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rgbt.models.stochastic import add_residual
+
 BLOCK_NORM_EPS = 1e-6
 """Of the normalisations in front of attention and feed-forward and after a stage; those of patch
 embeddings and keys have torch's 1e-5."""
@@ -132,12 +134,8 @@ class Block(nn.Module):
             (N, H, W, C).
         """
         first, second = (None, None) if keep is None else keep.unbind()
-        x = _add(x, self.attn(self.norm1(x)), first)
-        return _add(x, self.mlp(self.norm2(x)), second)
-
-
-def _add(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
-    return x + residual if factor is None else torch.addcmul(x, residual, factor)
+        x = add_residual(x, self.attn(self.norm1(x)), first)
+        return add_residual(x, self.mlp(self.norm2(x)), second)
 
 
 def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn.Module]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.windows import relative_index, shift_mask
-from rgbt.models.stochastic import keep_factors
+from rgbt.models.stochastic import add_residual, keep_factors
 
 PATCH = 4
 
@@ -149,8 +149,8 @@ class Block(nn.Module):
             (N, H, W, C).
         """
         first, second = (None, None) if keep is None else keep.unbind()
-        x = _add(x, self._attend(self.norm1(x)), first)
-        return _add(x, self.mlp(self.norm2(x)), second)
+        x = add_residual(x, self._attend(self.norm1(x)), first)
+        return add_residual(x, self.mlp(self.norm2(x)), second)
 
     def _attend(self, x: Tensor) -> Tensor:
         """Window attention on a map of any size."""
@@ -165,10 +165,6 @@ class Block(nn.Module):
             x = x.roll((self.shift, self.shift), (1, 2))
         out: Tensor = self.attn.proj(x[:, :height, :width])
         return out
-
-
-def _add(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
-    return x + residual if factor is None else torch.addcmul(x, residual, factor)
 
 
 class PatchMerging(nn.Module):
