@@ -1,6 +1,7 @@
 """The command line: Hydra overrides in, one sentence and an exit code out.
 
-Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong.
+Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 130 and 143
+stopped by Ctrl-C and by SIGTERM.
 """
 
 from __future__ import annotations
@@ -8,10 +9,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
+from types import FrameType
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -25,7 +29,13 @@ from rgbt.config import check, compose, conf_dir, register_resolvers
 Main = Callable[[DictConfig], int | None]
 
 
-def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]:
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which a cluster sends before it takes a machine away."""
+
+
+def command(
+    config_name: str = "config", *, sweeper: str = "basic"
+) -> Callable[[Main], Callable[[], None]]:
     """Make ``main(config)`` a command that is called with Hydra overrides.
 
     The configuration is composed and checked before `main` sees it. With ``-m`` every point runs,
@@ -33,6 +43,7 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
 
     Args:
         config_name: file of ``conf/`` without extension.
+        sweeper: what works off the points of ``-m``, unless ``hydra/sweeper=`` is given.
 
     Returns:
         decorator; the decorated function takes no arguments and leaves by ``sys.exit``.
@@ -44,16 +55,38 @@ def command(config_name: str = "config") -> Callable[[Main], Callable[[], None]]
             codes: list[int] = []
             # argparse takes overrides on one side of an option only, and people write -m anywhere.
             words = readable_paths(sys.argv[1:])
+            if not any(word.startswith("hydra/sweeper=") for word in words):
+                words.append(f"hydra/sweeper={sweeper}")
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
                 codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
 
-            sys.exit(max([_report(lambda: _compose(config_name, job)), *codes]))
+            with _terminable():
+                code = max([_report(lambda: _compose(config_name, job)), *codes])
+            sys.exit(code)
 
         return entry
 
     return decorate
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM raises `Terminated`, so that a run says where it stopped before it goes."""
+    process = os.getpid()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if os.getpid() != process:  # a worker forked from us: it has nothing to tidy up
+            os._exit(143)
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 PATHS = ("model.weights", "dataset.root", "runs_dir", "out")
@@ -107,13 +140,16 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
     except RunError as error:
         return _say(str(error), 1)
     except (HydraException, OmegaConfBaseException) as error:
-        return _say(_hydra_sentence(error), 2)
+        words = [word for word in sys.argv[1:] if not word.startswith("-")]
+        return _say(_hydra_sentence(error, words), 2)
     except OSError as error:
         return _say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         if not catch_interrupt:
             raise
-        return _say("interrupted; a training called again goes on from its checkpoint.", 130)
+        terminated = isinstance(interrupt, Terminated)
+        word, code = ("stopped by SIGTERM", 143) if terminated else ("interrupted", 130)
+        return _say(f"{word}; a training called again goes on from its checkpoint.", code)
 
 
 def _say(sentence: str, code: int) -> int:
@@ -122,7 +158,16 @@ def _say(sentence: str, code: int) -> int:
     return code
 
 
-def _hydra_sentence(error: Exception) -> str:
+@contextmanager
+def composing(overrides: Sequence[str]) -> Iterator[None]:
+    """Turn what Hydra or OmegaConf refuses about `overrides` into an InputError."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(_hydra_sentence(error, overrides)) from error
+
+
+def _hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     """What Hydra or OmegaConf refused, in one sentence with the nearest known name."""
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
@@ -140,23 +185,22 @@ def _hydra_sentence(error: Exception) -> str:
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:
-        return _unknown_key(key.group(2))
+        return _unknown_key(key.group(2), overrides)
     first = str(error).splitlines()[0].rstrip(".")
     return f"{first}; see `python -m rgbt.run --help`."
 
 
-def _composed_without(full_key: str) -> DictConfig:
+def _composed_without(full_key: str, overrides: Sequence[str]) -> DictConfig:
     """The configuration that was asked for, but for the key that it does not know."""
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    others = [word for word in words if word.lstrip("+~").partition("=")[0] != full_key]
+    others = [word for word in overrides if word.lstrip("+~").partition("=")[0] != full_key]
     try:
         return compose(others)
     except HydraException:  # a second mistake, or the comma lists of a grid
         return compose([])
 
 
-def _unknown_key(full_key: str) -> str:
-    config = _composed_without(full_key)
+def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
+    config = _composed_without(full_key, overrides)
     *parents, last = full_key.split(".")
     node: object = config
     for parent in parents:

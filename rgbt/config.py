@@ -12,10 +12,12 @@ import inspect
 import json
 import typing
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -55,8 +57,31 @@ def conf_dir() -> Path:
 def compose(overrides: Sequence[str]) -> DictConfig:
     """The configuration that `rgbt.run` would get from these overrides, not checked."""
     register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+    with _own_hydra():
         return hydra.compose("config", list(overrides))
+
+
+def compose_sweeper(name: str) -> DictConfig:
+    """The node of the sweeper in that file of ``conf/hydra/sweeper``."""
+    register_resolvers()
+    with _own_hydra():
+        whole = hydra.compose("config", [f"hydra/sweeper={name}"], return_hydra_config=True)
+    node: DictConfig = whole.hydra.sweeper
+    return node
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Hydra with our configuration, also inside a command that Hydra runs."""
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().clear()
+        if outer is not None:
+            GlobalHydra.instance().initialize(outer)
 
 
 def register_resolvers() -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
+from rgbt.checks import InputError
 from rgbt.config import flatten
 from rgbt.tracking.folder import Description
+
+TAGS = "RGBT_TAGS"
+"""Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it."""
 
 
 def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
@@ -16,7 +22,7 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
     Only what differs from the experiment is named; keys are cut to their last part where that
     says enough.
     """
-    silent = ("experiment", "runs_dir", "tracking", "dataset.root", "name", "seed")
+    silent = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed")
     pairs = [item.lstrip("+").partition("=")[::2] for item in overrides]
     changed = [(k, v) for k, v in pairs if k not in silent and not k.startswith("tracking.")]
     ends = [key.rpartition(".")[2] for key, _ in changed]
@@ -26,7 +32,12 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
         for (key, value), end, ok in zip(changed, ends, clear, strict=True)
     ]
     group = " ".join([config.name, *shown])
-    tags = {"rgbt.experiment": config.name, "rgbt.group": group, "rgbt.seed": str(config.seed)}
+    tags = {
+        "rgbt.experiment": config.name,
+        "rgbt.group": group,
+        "rgbt.seed": str(config.seed),
+        **_asked_tags(),
+    }
     params = {
         key: str(value)
         for key, value in flatten(config).items()
@@ -34,3 +45,16 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
         if not key.endswith("_target_") and not key.startswith("tracking.")
     }
     return Description(f"{group} seed={config.seed}", tags, params)
+
+
+def _asked_tags() -> dict[str, str]:
+    text = os.environ.get(TAGS, "{}")
+    try:
+        tags = json.loads(text)
+        if not isinstance(tags, dict):
+            raise TypeError("not a mapping")
+    except (json.JSONDecodeError, TypeError) as error:
+        raise InputError(
+            f'{TAGS}={text}: expected JSON such as {{"ticket": "42"}} ({error}).'
+        ) from error
+    return {str(name): str(value) for name, value in tags.items()}

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-@command()
+@command(sweeper="study")
 def main(config: DictConfig) -> int:
     """Train, evaluate the best checkpoint on the test split, show the tables."""
     from rgbt.training import train  # torch and mlflow load here, after --help has been answered

@@ -32,7 +32,7 @@ from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.pictures import Example, Legend, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
-from rgbt.tracking.tables import ResultTables
+from rgbt.tracking.tables import ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.types import Batch, Masker
 
@@ -80,7 +80,7 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     # A point of a grid that is the default elsewhere: the name that says more is the one to read.
     shown = asked if len(asked.name) > len(known.name) else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
-    tracking.finish()
+    tracking.finish("FINISHED")
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,14 @@ class Run:
             state = self._train(session)
             self._test(session, state)
             self._finish(session, state, time.time() - started)
-        finally:
+        except KeyboardInterrupt:
+            self.tracking.finish("KILLED")
+            raise
+        except BaseException:
             # A run that stops on an error is shown as failed, not as running for ever.
-            self.tracking.finish()
+            self.tracking.finish("FAILED")
+            raise
+        self.tracking.finish("FINISHED")
 
     def _finish(self, session: Session, state: State, seconds: float) -> None:
         self.folder.finish(
@@ -175,8 +180,15 @@ class Run:
                 "best_score": state.best_score,
                 "seconds_of_last_process": round(seconds, 1),
                 "skipped": state.skipped,
+                **self._scores(state),
             }
         )
+
+    def _scores(self, state: State) -> dict[str, dict[str, float | None]]:
+        """What the best checkpoint reached on the selection split and on the test split."""
+        lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
+        found = {"val": lines["val", state.best_step], "test": lines["test", state.step]}
+        return {kind: without_nan(values) for kind, values in found.items()}
 
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was begun on other images."""

@@ -140,7 +140,7 @@ class RunFolder:
         if not path.exists():
             return []
         whole, newline, _ = path.read_text().rpartition("\n")
-        return [_metric_line(text) for text in (whole + newline).splitlines()]
+        return [metric_line(text) for text in (whole + newline).splitlines()]
 
     def truncate_after(self, step: int) -> None:
         """Drop what a run that resumes at `step` will write again.
@@ -200,7 +200,8 @@ class RunFolder:
             raise InputError(f"{path} is not JSON ({error}); remove it or the run.") from error
 
 
-def _metric_line(text: str) -> MetricLine:
+def metric_line(text: str) -> MetricLine:
+    """One line of ``metrics.jsonl``, read."""
     plain = json.loads(text)
     values = {name: math.nan if v is None else float(v) for name, v in plain["values"].items()}
     return MetricLine(plain["step"], plain["kind"], plain["time"], values)

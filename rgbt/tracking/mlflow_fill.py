@@ -37,6 +37,7 @@ FILES = (
     "result.json",
     "*.patch",
     "counts_*.npz",
+    "evaluations/*.npz",
     "figures/*.png",
 )
 TABLE_FILE = "tables/iou.json"
@@ -211,6 +212,7 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
         "rgbt.command": first.get("command", ""),
         "mlflow.source.git.commit": first.get("git_commit") or "",
         "rgbt.folder": str(folder.path),
+        "rgbt.dataset": (folder.result() or {}).get("dataset", ""),
         **({} if description is None else description.tags),
     }
     if tables is not None:

@@ -46,8 +46,8 @@ class Tracking(Protocol):
         """Something new lies in the folder; called after every evaluation."""
         ...
 
-    def finish(self) -> None:
-        """The process leaves the run: finished if there is a result, else failed."""
+    def finish(self, status: Status) -> None:
+        """The process leaves the run, which is finished, failed or was stopped (killed)."""
         ...
 
     def links(self) -> list[Link]:
@@ -71,7 +71,7 @@ class NoTracking:
     def update(self) -> None:
         """Nothing to tell."""
 
-    def finish(self) -> None:
+    def finish(self, status: Status) -> None:
         """Nothing to tell."""
 
     def links(self) -> list[Link]:
@@ -123,9 +123,9 @@ class MlflowTracking:
         if time.monotonic() >= self._quiet_until:
             self._guarded("RUNNING")
 
-    def finish(self) -> None:
+    def finish(self, status: Status) -> None:
         """Send what is new and close the run."""
-        self._guarded("FAILED")
+        self._guarded(status)
 
     def links(self) -> list[Link]:
         """The command that opens the pages, then the addresses of this run and of the charts."""
@@ -147,13 +147,18 @@ class MlflowTracking:
 
         Unlike the calls of a running training this raises what the store raises.
         """
-        if self._store is None:
-            self._store = open_store(self.uri, self.artifact_uri, self.experiment)
+        store = self.store()
         # A training and a sync by hand may meet in one folder.
         with holding(folder.path / "mlflow.lock", wait=True):
             sent = self._sent(folder)
-            fill(self._store, folder, sent, status)
+            fill(store, folder, sent, status)
         return sent.run_id
+
+    def store(self) -> Store:
+        """The open store, made where it does not exist; raises what MLflow raises."""
+        if self._store is None:
+            self._store = open_store(self.uri, self.artifact_uri, self.experiment)
+        return self._store
 
     def _sent(self, folder: RunFolder) -> Sent:
         """What this store has of the run; nothing if the folder was sent to another one."""
@@ -162,11 +167,10 @@ class MlflowTracking:
         same = sent is not None and (sent.uri, sent.experiment) == (fresh.uri, fresh.experiment)
         return sent if sent is not None and same else fresh
 
-    def _guarded(self, unfinished: Status) -> None:
-        """Sync with status `unfinished`, or "FINISHED" where there is a result."""
+    def _guarded(self, status: Status) -> None:
+        """Sync; what the store raises becomes a line on stderr, once."""
         assert self._folder is not None, "start() comes first"
         try:
-            status = unfinished if self._folder.result() is None else "FINISHED"
             self.sync(self._folder, status)
         except Exception as error:  # The one border: a dead tracker never stops a training.
             self._quiet_until = time.monotonic() + PAUSE_S

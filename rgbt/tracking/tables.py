@@ -70,7 +70,7 @@ class ResultTables:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for `RunFolder.write_tables`; NaN becomes None."""
-        return dict(_without_nan(asdict(self)))
+        return dict(without_nan(asdict(self)))
 
     @classmethod
     def from_json(cls, plain: Mapping[str, Any]) -> ResultTables:
@@ -177,11 +177,12 @@ def number(value: float) -> str:
     return ABSENT if math.isnan(value) else f"{value:.2f}"
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """`value` with None for every NaN inside, which JSON does not know."""
     if isinstance(value, dict):
-        return {key: _without_nan(child) for key, child in value.items()}
+        return {key: without_nan(child) for key, child in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(child) for child in value]
+        return [without_nan(child) for child in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

@@ -99,8 +99,8 @@ def finished(runs_dir: Path) -> RunFolder:
     folder.append(15, "train", {"loss": 1.0})
     second.update()
     conclude(folder)
-    second.finish()
-    second.finish()
+    second.finish("FINISHED")
+    second.finish("FINISHED")
     return folder
 
 
@@ -173,7 +173,7 @@ def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> 
     folder = RunFolder(runs_dir / "failed")
     tracker = tracking(runs_dir)
     begin(folder, tracker)
-    tracker.finish()
+    tracker.finish("FAILED")
     sent = read_sent(folder)
     assert sent is not None
     store = client(runs_dir)
@@ -205,7 +205,7 @@ def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
         folder.append(step, "train", {"loss": float(step)})
         tracker.update()
     conclude(folder)
-    tracker.finish()
+    tracker.finish("FAILED")
     warning = capsys.readouterr().err
     assert warning.count("rgbt: MLflow at http://127.0.0.1:9 cannot be used") == 1
     assert f"-m rgbt.tracking.sync run={folder.path}" in warning
@@ -228,7 +228,7 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     tracker = NoTracking()
     begin(folder, tracker)
     tracker.update()
-    tracker.finish()
+    tracker.finish("FAILED")
     assert tracker.links() == []
     assert read_sent(folder) is None
     shutil.rmtree(runs_dir / "dead", ignore_errors=True)  # has no reachable store if it ran alone

@@ -1,0 +1,45 @@
+"""Hydra's way to `sweeps`: ``hydra/sweeper=study``.
+
+Hydra finds sweepers only in modules below ``hydra_plugins`` and imports them at every start, also
+for ``--help``: nothing but the stub lives here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+
+class StudySweeper(Sweeper):
+    """Runs a grid, a list or a search, each point in a process of its own (`sweeps.sweep`).
+
+    Args:
+        settings: keys of ``conf/hydra/sweeper/study.yaml``; checked when the sweep begins.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self.settings = settings
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """Keep the configuration; the task function is not used, points are commands."""
+        del task_function
+        self.config = config
+        self.hydra_context = hydra_context
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Run every point of the overrides `arguments`.
+
+        Raises:
+            InputError: settings, space or a point that do not fit.
+            RunError: points failed; the others were run.
+        """
+        from sweeps.sweep import sweep
+
+        assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
+        assert self.config is not None, "as above"
+        sweep(arguments, self.config, self.hydra_context.config_loader)

@@ -1,0 +1,46 @@
+"""Names of what is noted beside trials and studies in Optuna's storage."""
+
+from __future__ import annotations
+
+KEY = "rgbt.key"
+"""Key of the point: its run keys, or one of them where it has one run."""
+
+RUNS = "rgbt.runs"
+"""Keys of the runs that the point is made of, one per seed."""
+
+OVERRIDES = "rgbt.overrides"
+"""Overrides of `python -m rgbt.run`, without the seeds of replicates."""
+
+LABEL = "rgbt.label"
+OWNER = "rgbt.owner"
+"""Who works on the trial: host, process, start of the process, see `sweeps.owner`."""
+
+BEAT = "rgbt.beat"
+"""Seconds since 1970 at which the owner last said that it is alive."""
+
+TOKEN = "rgbt.token"
+"""Random text by which a driver finds the trial that it has added."""
+
+REASON = "rgbt.reason"
+"""Why the trial failed, was pruned or dropped, in one sentence."""
+
+DROPPED = "rgbt.dropped"
+"""True: the trial does not count, another one stands for the same point."""
+
+SECONDS = "rgbt.seconds"
+"""How long the point's runs took, all processes together."""
+
+RESULTS = "rgbt.results"
+""""val/..." and "test/..." scores of the point, mean over its seeds; percent, Var as it is."""
+
+KIND = "rgbt.kind"
+"""Of a study: "search", "grid" or "list"."""
+
+SIGNATURE = "rgbt.signature"
+"""Of a study: hash of what must not change, its space and its objectives."""
+
+METRICS = "rgbt.metrics"
+"""Of a study: names of the objectives, in order."""
+
+COMMAND = "rgbt.command"
+"""Of a study: the command that began it."""

@@ -1,0 +1,173 @@
+"""Works off points: some at a time, each in a process of its own, failures isolated.
+
+Any number of drivers, on any number of machines, may work on one study. None runs a point that
+another one runs, each takes over what a dead one left, and a driver that is started again finds
+everything that is finished.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from rgbt.naming import TAGS
+from sweeps import attributes as names
+from sweeps.executors import Executor, Job
+from sweeps.found import Runs
+from sweeps.ledger import Ledger
+from sweeps.live import View
+from sweeps.owner import BEAT_S
+from sweeps.settings import Settings
+from sweeps.sources import Source, Task
+from sweeps.work import PointError, Pruned, Surroundings, Work, mean_scores
+
+POLL_S = 0.2
+LOOK_S = 2.0
+"""Seconds between two looks at the storage for work that others left or gave up."""
+
+
+@dataclass
+class Driver:
+    """One process that works on one study.
+
+    Attributes:
+        ledger: the study.
+        source: gives the work.
+        runs: where finished runs are found.
+        executor: makes processes.
+        settings: workers, GPUs, threads, budget.
+        view: what a person sees.
+        metrics: names of the study's objectives.
+    """
+
+    ledger: Ledger
+    source: Source
+    runs: Runs
+    executor: Executor
+    settings: Settings
+    view: View
+    metrics: Sequence[str]
+    works: dict[int, Work] = field(default_factory=dict)
+    failures: int = 0
+    _began: float = field(default_factory=time.monotonic)
+    _looked: float = -math.inf
+    _beaten: float = field(default_factory=time.monotonic)
+
+    def run(self) -> None:
+        """Work until nothing is left to do; on Ctrl-C or SIGTERM give back what is not done."""
+        try:
+            while self._round():
+                time.sleep(POLL_S)
+        except BaseException:
+            self._give_back()
+            raise
+
+    def _round(self) -> bool:
+        """Look after everything once; whether there is more to do."""
+        for slot, work in list(self.works.items()):
+            if self._advance(work):
+                del self.works[slot]
+        now = time.monotonic()
+        if now - self._beaten > BEAT_S:
+            self._beaten = now
+            self.ledger.beat([work.number for work in self.works.values()])
+        free = self.settings.workers - len(self.works)
+        due = now - self._looked > LOOK_S
+        if free > 0 and due:
+            self._take_up(free)
+        self.view.update(list(self.works.values()))
+        if self.works or not due:
+            return True
+        return not (self._is_over() or self.source.is_exhausted(wait=self.settings.wait))
+
+    def _take_up(self, free: int) -> None:
+        """Begin as many points as there are free slots."""
+        for trial in self.ledger.orphans():
+            self.ledger.release(trial.number, "its driver was gone", again=self.source.again)
+        while free > 0 and not self._is_over():
+            task = self.source.next()
+            if task is None:
+                self._looked = time.monotonic()
+                return
+            slot = min(set(range(self.settings.workers)) - set(self.works))
+            work = self._begin(task, slot)
+            # What is finished elsewhere needs no process and gives the slot back at once.
+            if not self._advance(work):
+                self.works[slot] = work
+                free -= 1
+
+    def _is_over(self) -> bool:
+        """Whether the budget of this call is spent."""
+        most, hours = self.settings.max_failures, self.settings.hours
+        spent = hours is not None and time.monotonic() - self._began > 3600 * hours
+        return spent or (most is not None and self.failures > most)
+
+    def _begin(self, task: Task, slot: int) -> Work:
+        start = partial(self._start, slot=slot, tags=task.plan.point.tags)
+        minutes = self.settings.timeout_minutes
+        around = Surroundings(self.runs, start, None if minutes is None else 60 * minutes)
+        work = Work(task.plan, task.number, around, task.report)
+        self.view.began(work)
+        return work
+
+    def _start(
+        self, command: Sequence[str], log: Path, *, slot: int, tags: Mapping[str, str]
+    ) -> Job:
+        environment = {TAGS: json.dumps(dict(tags))}
+        if self.settings.executor == "local":
+            threads = self.settings.threads or max(1, usable_cores() // self.settings.workers)
+            environment |= {"OMP_NUM_THREADS": str(threads)}
+        if self.settings.gpus:
+            gpu = self.settings.gpus[slot % len(self.settings.gpus)]
+            environment |= {"CUDA_VISIBLE_DEVICES": str(gpu)}
+        return self.executor.start(command, environment, log)
+
+    def _advance(self, work: Work) -> bool:
+        """Whether the work is done with, well or badly; the study is told."""
+        notes = {names.SECONDS: round(work.seconds, 1)}
+        try:
+            found = work.advance()
+            if found is None:
+                return False
+            scores = mean_scores(found)
+            values = [_finite(name, scores) for name in self.metrics]
+        except Pruned as reason:
+            self.ledger.prune(work.number, str(reason), notes)
+            for run in work.plan.runs:
+                self.runs.stopped(run.key, str(reason))
+            self.view.ended(work, "pruned", str(reason))
+        except PointError as error:
+            self.failures += 1
+            self.ledger.fail(work.number, str(error), notes)
+            self.view.ended(work, "failed", str(error))
+        else:
+            self.ledger.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
+            self.view.ended(work, "finished", "")
+        return True
+
+    def _give_back(self) -> None:
+        """Stop all processes and give the trials back; their runs continue at the next call."""
+        for work in self.works.values():
+            work.stop()
+        while not all(work.is_stopped() for work in self.works.values()):
+            time.sleep(POLL_S)
+        for work in self.works.values():
+            self.ledger.release(work.number, "its driver was stopped", again=self.source.again)
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def _finite(name: str, scores: Mapping[str, float]) -> float:
+    value = scores.get(name)
+    if value is None or not math.isfinite(value):
+        raise PointError(f"its runs have no {name} that is a number")
+    return value

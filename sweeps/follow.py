@@ -1,0 +1,93 @@
+"""What a running run writes: its metric lines as they come, and why it stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from pathlib import Path
+
+from rgbt.tracking.folder import MetricLine, metric_line
+
+OUT_OF_MEMORY = "the system kills what takes too much memory"
+
+
+class Follower:
+    """Reads ``metrics.jsonl`` of a run as it grows.
+
+    Args:
+        folder: the run folder, which need not exist yet.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "metrics.jsonl"
+        self._inode = -1
+        self._offset = 0
+        self.step = 0
+        """Last step seen."""
+
+    def new_lines(self) -> list[MetricLine]:
+        """Whole lines since the last call; all of them again where the run has resumed."""
+        try:
+            with self._path.open("rb") as file:
+                inode = os.fstat(file.fileno()).st_ino
+                if inode != self._inode:  # a run that resumes writes the file anew
+                    self._inode, self._offset = inode, 0
+                file.seek(self._offset)
+                whole, newline, _ = file.read().rpartition(b"\n")
+        except FileNotFoundError:
+            return []
+        self._offset += len(whole) + len(newline)
+        lines = [metric_line(text) for text in whole.decode().splitlines()]
+        if lines:
+            self.step = lines[-1].step
+        return lines
+
+
+def why(code: int, log: Path, start: int) -> str:
+    """Why a process ended, in one sentence.
+
+    Args:
+        code: exit code; negative for a signal.
+        log: file with its output.
+        start: where its output begins in that file, bytes.
+    """
+    said = _last_words(log, start)
+    if code >= 0:
+        return said or f"it left with exit code {code} and said nothing; see {log}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    hint = f" ({OUT_OF_MEMORY})" if name == "SIGKILL" else ""
+    return f"stopped by {name}{hint}"
+
+
+def _last_words(log: Path, start: int) -> str:
+    """The last sentence of ours, or the last line of a traceback."""
+    if not log.exists():
+        return ""
+    with log.open("rb") as file:
+        file.seek(start)
+        text = file.read().decode(errors="replace")
+    lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+    told = [line.removeprefix("rgbt: ") for line in lines if line.startswith("rgbt: ")]
+    if "Traceback (most recent call last):" in lines:
+        errors = [line for line in lines if re.match(r"[\w.]+(Error|Exception|Interrupt)\b", line)]
+        return errors[-1][:300] if errors else lines[-1][:300]
+    return told[-1][:300] if told else (lines[-1][:300] if lines else "")
+
+
+def stop_holder(folder: Path) -> None:
+    """Send SIGTERM to the process that trains in `folder`, if it is on this machine."""
+    lock = folder / "lock"
+    found = re.fullmatch(r"process (\d+) on (\S+)", lock.read_text()) if lock.exists() else None
+    if found and found.group(2) == os.uname().nodename:
+        os.kill(int(found.group(1)), signal.SIGTERM)
+
+
+def known_seconds(folder: Path) -> float | None:
+    """How long the finished run in `folder` took, as far as its last process knows."""
+    path = folder / "result.json"
+    if not path.exists():
+        return None
+    seconds = json.loads(path.read_text()).get("seconds_of_last_process")
+    return None if seconds is None else float(seconds)

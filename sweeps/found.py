@@ -1,0 +1,214 @@
+"""Finished runs: in the folder of runs, or in MLflow where another machine has sent them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from rgbt.checks import RunError
+from rgbt.config import build
+from rgbt.metrics.counts import Counts
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.mlflow_fill import shown
+from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.terminal import tell
+from sweeps.points import Evaluation
+
+FETCHED = ".fetched"
+"""Folder inside the folder of runs: what was taken from MLflow of runs made elsewhere."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A finished run.
+
+    Attributes:
+        key: its config key.
+        folder: where its files lie here: the run folder, or copies of what MLflow holds.
+        run_id: its MLflow run where the files came from there, else "".
+    """
+
+    key: str
+    folder: Path
+    run_id: str = ""
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """``result.json`` of the run (see `rgbt.training`)."""
+        return dict(json.loads((self.folder / "result.json").read_text()))
+
+    @property
+    def dataset(self) -> str:
+        """Fingerprint of the data set it was made on."""
+        return str(self.result["dataset"])
+
+    @property
+    def commit(self) -> str | None:
+        """Git commit of the code that made it; "+" is added for changes that were not committed."""
+        path = self.folder / "provenance.json"
+        if not path.exists():
+            return None
+        first = json.loads(path.read_text())[0]
+        commit = first.get("git_commit")
+        return None if commit is None else f"{commit[:10]}{'+' if first.get('git_dirty') else ''}"
+
+    def scores(self) -> dict[str, float]:
+        """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
+        result = self.result
+        return {
+            f"{split}/{name}": in_percent(name, value)
+            for split in ("val", "test")
+            for name, value in result.get(split, {}).items()
+            if value is not None
+        }
+
+    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+        """Counts of the test split.
+
+        Args:
+            evaluation: None: those that the run itself ended with.
+
+        Raises:
+            InputError: the file is missing or not readable.
+        """
+        return Counts.load(self.counts_file(evaluation))
+
+    def counts_file(self, evaluation: Evaluation | None = None) -> Path:
+        """Where the counts lie, whether they are there yet or not."""
+        if evaluation is None:
+            return self.folder / "counts_test.npz"
+        regions = evaluation.regions.replace(" ", "-")
+        return self.folder / "evaluations" / f"table_{evaluation.modality}_{regions}.npz"
+
+
+def in_percent(name: str, value: float) -> float:
+    """A score as MLflow shows it (percent, Var as it is), with all its digits."""
+    return 100 * value if shown(name, 1.0) == 100 else value
+
+
+def open_runs(config: DictConfig) -> Runs:
+    """Finished runs where a configuration says that runs lie and how they are tracked."""
+    return Runs(Path(config.runs_dir).expanduser().resolve(), build(config.tracking))
+
+
+class Runs:
+    """All finished runs that can be found from here.
+
+    Args:
+        runs_dir: the folder of runs.
+        tracking: as the configuration builds it; MLflow is asked for runs that have no result here.
+    """
+
+    def __init__(self, runs_dir: Path, tracking: Tracking) -> None:
+        self.runs_dir = runs_dir
+        self.tracking = tracking
+        self._is_away = False
+
+    def find(self, key: str, dataset: str) -> Found | None:
+        """The finished run `key` on the data set with that fingerprint; None if there is none.
+
+        Raises:
+            RunError: the run folder is finished, but on other files of the data set.
+        """
+        folder = self.runs_dir / key
+        if not (folder / "result.json").exists():
+            return self._remote(key, dataset)
+        found = Found(key, folder)
+        if found.dataset != dataset:
+            raise RunError(
+                f"{folder} was made on other files of the data set ({found.dataset[:8]}, now "
+                f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
+            )
+        return found
+
+    def tag(self, found: Found, tags: Mapping[str, str]) -> None:
+        """Add MLflow tags to a finished run that lacks them."""
+        if found.run_id:
+            self._guarded(lambda tracking: _set_tags(tracking, found.run_id, tags))
+            return
+        folder = RunFolder(found.folder)
+        description = folder.description()
+        assert description is not None, "a finished run has its description"
+        if tags.items() <= description.tags.items():
+            return
+        folder.describe(replace(description, tags={**description.tags, **tags}))
+        self._guarded(lambda tracking: tracking.sync(folder, "FINISHED"))
+
+    def send(self, found: Found) -> None:
+        """Bring MLflow up to date with a run folder that has got new files."""
+        self._guarded(lambda tracking: tracking.sync(RunFolder(found.folder), "FINISHED"))
+
+    def stopped(self, key: str, reason: str) -> None:
+        """Show in MLflow why a run was stopped before its end."""
+        if not (self.runs_dir / key / "run.json").exists():
+            return
+        folder = RunFolder(self.runs_dir / key)
+        description = folder.description()
+        assert description is not None, "run.json exists"
+        folder.describe(replace(description, tags={**description.tags, "rgbt.stopped": reason}))
+        self._guarded(lambda tracking: tracking.sync(folder, "KILLED"))
+
+    def touch(self) -> None:
+        """Open the store once, before several processes would make its tables at the same time."""
+        self._guarded(lambda tracking: tracking.store())
+
+    def _remote(self, key: str, dataset: str) -> Found | None:
+        copy = self.runs_dir / FETCHED / key
+        known = copy / "run_id"
+        if known.exists():
+            found = Found(key, copy, known.read_text())
+            return found if found.dataset == dataset else None
+        fetched: Found | None = self._guarded(lambda t: _fetch(t, (key, dataset), copy))
+        return fetched
+
+    def _guarded(self, work: Any) -> Any:
+        """`work` on MLflow; None without it, and where it cannot be reached, which is told once."""
+        if self._is_away or not isinstance(self.tracking, MlflowTracking):
+            return None
+        try:
+            return work(self.tracking)
+        except Exception as error:  # The border to a store that may fail in any way.
+            self._is_away = True
+            reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+            tell(
+                f"MLflow cannot be used ({reason}); runs are looked for in {self.runs_dir} alone, "
+                "and `python -m rgbt.tracking.sync` sends them later."
+            )
+            return None
+
+
+def _fetch(tracking: MlflowTracking, wanted: tuple[str, str], copy: Path) -> Found | None:
+    """Copy what MLflow holds of a finished run; None where it does not know it."""
+    key, dataset = wanted
+    store = tracking.store()
+    query = (
+        f"attributes.status = 'FINISHED' and tags.`rgbt.key` = '{key}' "
+        f"and tags.`rgbt.dataset` = '{dataset}'"
+    )
+    runs = store.client.search_runs([store.experiment_id], filter_string=query, max_results=1)
+    if not runs:
+        return None
+    run_id = runs[0].info.run_id
+    copy.mkdir(parents=True, exist_ok=True)
+    for name in ("result.json", "counts_test.npz", "provenance.json", "evaluations"):
+        if _holds(store.client, run_id, name):
+            store.client.download_artifacts(run_id, name, str(copy))
+    if not (copy / "result.json").exists() or not (copy / "counts_test.npz").exists():
+        return None
+    # Written last: without it the copy is not whole and is made again.
+    (copy / "run_id").write_text(run_id)
+    return Found(key, copy, run_id)
+
+
+def _holds(client: Any, run_id: str, name: str) -> bool:
+    return name in {item.path for item in client.list_artifacts(run_id)}
+
+
+def _set_tags(tracking: MlflowTracking, run_id: str, tags: Mapping[str, str]) -> None:
+    for name, value in tags.items():
+        tracking.store().client.set_tag(run_id, name, value)

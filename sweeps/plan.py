@@ -1,0 +1,108 @@
+"""From points to run keys: the configuration of every run of a point, composed and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError
+from rgbt.command import composing
+from rgbt.config import build, check, compose, run_key
+from rgbt.data.mfnet import MFNet
+from sweeps.points import Point
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a point.
+
+    Attributes:
+        key: config key, which names its folder.
+        dataset: fingerprint of its data set.
+        overrides: of `python -m rgbt.run`.
+        steps: optimiser steps it takes.
+    """
+
+    key: str
+    dataset: str
+    overrides: tuple[str, ...]
+    steps: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A point with the runs it is made of.
+
+    Attributes:
+        point: the point.
+        key: names the point in a study: the key of its run, or a hash where there is more to it.
+        runs: one, or one per seed.
+    """
+
+    point: Point
+    key: str
+    runs: tuple[PlannedRun, ...]
+
+
+class Planner:
+    """Plans points; every data set is looked at once.
+
+    Args:
+        base: overrides that all runs have, e.g. where runs and data lie.
+    """
+
+    def __init__(self, base: Sequence[str] = ()) -> None:
+        self.base = tuple(base)
+        self._fingerprints: dict[str, str] = {}
+
+    def plan(self, point: Point) -> Plan:
+        """Compose and check all runs of `point`.
+
+        Raises:
+            InputError: a configuration or a data set that does not fit, in one sentence.
+        """
+        runs = tuple(self._run(overrides) for overrides in point.runs())
+        key = runs[0].key
+        if len(runs) > 1 or point.evaluations:
+            parts = [[run.key for run in runs], [vars(each) for each in point.evaluations]]
+            key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+        return Plan(point, key, runs)
+
+    def config(self, overrides: Sequence[str]) -> DictConfig:
+        """The checked configuration of one run.
+
+        Raises:
+            InputError: see `plan`; what Hydra refuses is told in the words of the command line.
+        """
+        with composing(overrides):
+            config = compose(overrides)
+            check(config)
+        return config
+
+    def _run(self, overrides: tuple[str, ...]) -> PlannedRun:
+        every = (*self.base, *overrides)
+        config = self.config(every)
+        key = run_key(config)
+        return PlannedRun(key, self._fingerprint(config), every, int(config.trainer.max_steps))
+
+    def _fingerprint(self, config: DictConfig) -> str:
+        text = json.dumps(_plain(config.dataset), sort_keys=True)
+        if text not in self._fingerprints:
+            dataset: MFNet = build(config.dataset)
+            if not any(dataset.list_path(split).is_file() for split in dataset.splits):
+                raise InputError(
+                    f"{dataset.root} holds none of the lists {', '.join(dataset.splits.values())} "
+                    "of the data set; name its folder with dataset.root=..."
+                )
+            self._fingerprints[text] = dataset.fingerprint()
+        return self._fingerprints[text]
+
+
+def _plain(node: DictConfig) -> object:
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_container(node, resolve=True)

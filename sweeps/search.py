@@ -1,0 +1,155 @@
+"""A search: a sampler chooses the points, bad ones are pruned, any number of drivers share it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rgbt.checks import InputError, RunError
+from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.terminal import tell
+from sweeps import attributes as names
+from sweeps.driver import Driver
+from sweeps.found import Runs
+from sweeps.ledger import Ledger
+from sweeps.lists import make_executor
+from sweeps.live import View
+from sweeps.owner import Owner
+from sweeps.plan import Planner
+from sweeps.samplers import build_pruner, build_sampler
+from sweeps.settings import Settings
+from sweeps.sources import SearchSource
+from sweeps.space import Parameter, signature
+from sweeps.storage import begin_study, existing_study, open_storage
+from sweeps.study import dashboard_command, report, show_places, study_folder
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched.
+
+    Attributes:
+        study: name of the study.
+        fixed: overrides that all trials share.
+        parameters: the space.
+        runs: where finished runs are found.
+        identity: what of `fixed` must not change in a study: all but where things lie.
+    """
+
+    study: str
+    fixed: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    runs: Runs
+    identity: Sequence[Any]
+
+
+def search(wanted: Search, settings: Settings) -> None:
+    """Run trials until the budget is spent, then show what was found.
+
+    Raises:
+        InputError: settings that do not fit, or a study of that name with another space.
+        RunError: no trial has finished.
+    """
+    if settings.trials is None and settings.hours is None:
+        raise InputError(
+            "a search needs a budget: hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both."
+        )
+    sampler, pruner = _sampler_and_pruner(settings)
+    if settings.dry_run:
+        _preview(wanted, settings)
+        return
+    storage = open_storage(settings.storage, wanted.runs.runs_dir)
+    wanted.runs.touch()
+    attributes = {
+        names.KIND: "search",
+        names.SIGNATURE: signature(
+            wanted.parameters, settings.objectives, settings.replicates, list(wanted.identity)
+        ),
+    }
+    study = begin_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
+    if names.COMMAND not in study.user_attrs:
+        study.set_user_attr(names.COMMAND, without_passwords(shlex.join(sys.orig_argv)))
+    ledger = Ledger(study, storage, Owner.me())
+    tell(f"study {wanted.study}: the same command on other machines takes part in it.")
+    _drive(wanted, settings, ledger)
+    _check_end(ledger, wanted.study)
+    runs_dir = wanted.runs.runs_dir
+    links = report(study, study_folder(runs_dir, wanted.study), wanted.runs.tracking)
+    show_places([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
+
+
+def _drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
+    def done() -> int:
+        return sum(trial.state.is_finished() for trial in ledger.trials())
+
+    view = View(wanted.study, settings.trials, settings.workers, done)
+    source = SearchSource(
+        wanted.fixed, wanted.parameters, ledger, Planner(), settings, view.refused
+    )
+    driver = Driver(
+        ledger=ledger,
+        source=source,
+        runs=wanted.runs,
+        executor=make_executor(settings, wanted.runs.runs_dir),
+        settings=settings,
+        view=view,
+        metrics=[objective.metric for objective in settings.objectives],
+    )
+    with view:
+        driver.run()
+
+
+def _sampler_and_pruner(settings: Settings) -> tuple[Any, Any]:
+    count = len(settings.objectives)
+    kind, seed, options = _chosen(settings.sampler, "sampler")
+    sampler = build_sampler(kind, seed, options, count)
+    if settings.pruner is None:
+        return sampler, build_pruner("none", {}, count)
+    kind, _, options = _chosen(settings.pruner, "pruner")
+    if not settings.objectives[0].metric.startswith("val/"):
+        raise InputError(
+            f"pruner: trials are compared while they train, but {settings.objectives[0].metric} is "
+            "known at the end alone; follow val/mIoU or take hydra.sweeper.pruner=null."
+        )
+    return sampler, build_pruner(kind, options, count)
+
+
+def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any]]:
+    options = {key: value for key, value in node.items() if key not in ("kind", "seed")}
+    if "kind" not in node:
+        raise InputError(f"hydra.sweeper.{what}: 'kind' has no value, such as {{kind: tpe}}.")
+    seed = node.get("seed", 0)
+    if not isinstance(seed, int):
+        raise InputError(f"hydra.sweeper.{what}.seed: expected a whole number, got {seed}.")
+    return str(node["kind"]), seed, options
+
+
+def _preview(wanted: Search, settings: Settings) -> None:
+    """Say what would be searched, and what there is; write nothing."""
+    study = existing_study(wanted.study, settings.storage, wanted.runs.runs_dir)
+    trials = [] if study is None else study.get_trials(deepcopy=False)
+    counted = [trial for trial in trials if not trial.user_attrs.get(names.DROPPED)]
+    states = Counter(trial.state.name.lower() for trial in counted)
+    sys.stdout.write(f"study {wanted.study}: {dict(states) or 'not begun'}\n")
+    for parameter in wanted.parameters:
+        sys.stdout.write(f"  {parameter}\n")
+    for objective in settings.objectives:
+        sys.stdout.write(f"  {objective.direction} {objective.metric}\n")
+    sys.stdout.write(f"  python -m rgbt.run {shlex.join(wanted.fixed)} ...\n")
+    if settings.trials is not None:
+        left = max(0, settings.trials - len(counted))
+        sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
+
+
+def _check_end(ledger: Ledger, name: str) -> None:
+    trials = ledger.trials()
+    states = Counter(trial.state.name for trial in trials)
+    failed = [trial for trial in trials if trial.state.name == "FAIL"]
+    for trial in failed[:5]:
+        tell(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
+    if trials and not states["COMPLETE"] and not states["RUNNING"]:
+        raise RunError(f"no trial of {name} has finished; see the reasons above.")

@@ -1,0 +1,116 @@
+"""Settings of a sweep: the keys of ``conf/hydra/sweeper/study.yaml``, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError, nearest
+from rgbt.config import build
+
+
+@dataclass(frozen=True)
+class Objective:
+    """One number that a search follows.
+
+    Attributes:
+        metric: "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
+            being those of `rgbt.metrics.names`.
+        direction: which way is better.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    metric: str
+    direction: Literal["maximize", "minimize"]
+
+    def __post_init__(self) -> None:
+        if not self.metric.startswith(("val/", "test/")):
+            raise InputError(
+                f"objective '{self.metric}': expected val/<score> or test/<score>, such as "
+                "val/mIoU or val/Var."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
+
+    storage: str | None
+    workers: int
+    gpus: tuple[int, ...] | None
+    threads: int | None
+    executor: Literal["local", "submitit"]
+    submitit: dict[str, Any]
+    retries: int
+    retry: Literal["none", "failed"]
+    timeout_minutes: float | None
+    max_failures: int | None
+    wait: bool
+    dry_run: bool
+    study: str | None
+    params: dict[str, Any]
+    points: tuple[tuple[str, ...], ...]
+    space: dict[str, dict[str, Any]]
+    objectives: tuple[Objective, ...]
+    sampler: dict[str, Any]
+    pruner: dict[str, Any] | None
+    trials: int | None
+    hours: float | None
+    replicates: int
+
+    def __post_init__(self) -> None:
+        at_least = {"workers": 1, "retries": 0, "replicates": 1, "threads": 1, "trials": 1}
+        for name, least in at_least.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"{name} must be at least {least}, got {value}.")
+        for name in ("hours", "timeout_minutes"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise InputError(f"{name} must be positive or null, got {value:g}.")
+        if self.gpus is not None and not self.gpus:
+            raise InputError("gpus=[]: expected numbers of GPUs such as [0,1], or null.")
+        if self.submitit and self.executor != "submitit":
+            raise InputError("submitit={...} are options of executor=submitit; add that.")
+        if not self.objectives:
+            raise InputError("objectives: expected at least one, such as val/mIoU.")
+
+
+EXECUTION = (
+    *("storage", "workers", "gpus", "threads", "executor", "submitit", "retries", "retry"),
+    *("timeout_minutes", "max_failures", "wait", "dry_run"),
+)
+"""Keys that say how points are run; the others say which."""
+
+
+AS_WRITTEN: dict[str, type] = {"space": dict, "params": dict, "points": list}
+"""Keys whose interpolations (``${px:64}``) are for the runs and not for the sweep to resolve."""
+
+
+def read_settings(node: DictConfig) -> Settings:
+    """Settings from the node ``hydra.sweeper``.
+
+    Raises:
+        InputError: an unknown key, a missing one, a wrong type or value.
+    """
+    known = Settings.__dataclass_fields__
+    raw = OmegaConf.to_container(node, resolve=False)
+    assert isinstance(raw, dict), "the node of a sweeper is a mapping"
+    for key in raw:
+        if key not in known and key != "_target_":
+            raise InputError(
+                f"'hydra.sweeper.{key!s}' is not a setting; {nearest(str(key), known)}."
+            )
+    for key, kind in AS_WRITTEN.items():
+        if not isinstance(raw[key], kind):
+            what = "mapping" if kind is dict else "list"
+            raise InputError(f"'hydra.sweeper.{key!s}' must be a {what}, got {raw[key]!r}.")
+    values = {key: node[key] for key in known if key not in AS_WRITTEN}
+    empty = {key: kind() for key, kind in AS_WRITTEN.items()}
+    own = {"_target_": "sweeps.settings.Settings", **values, **empty}
+    settings: Settings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
+    points = tuple(tuple(map(str, point)) for point in raw["points"])
+    return replace(settings, space=raw["space"], params=raw["params"], points=points)

@@ -1,0 +1,171 @@
+"""Where studies are kept: a journal file, SQLite, or PostgreSQL for several machines."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rgbt.checks import InputError, nearest
+from rgbt.tracking.provenance import without_passwords
+from sweeps import attributes as names
+from sweeps.settings import Objective
+
+if TYPE_CHECKING:
+    import optuna
+
+Opened = TypeVar("Opened")
+
+JOURNAL = "studies.journal"
+ATTEMPTS = 8
+PAUSE_S = 0.7
+
+
+def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseStorage:
+    """Open the storage, making it where it does not exist.
+
+    Args:
+        storage: None for the journal file ``<runs_dir>/studies.journal``; a path that ends in
+            .journal; or a database: sqlite:///file.db, postgresql://user@host/name (psycopg 3; the
+            password belongs in ~/.pgpass).
+        runs_dir: the folder of runs.
+
+    Raises:
+        InputError: the storage cannot be opened, or a package for it is missing.
+    """
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    url = str(runs_dir / JOURNAL) if storage is None else storage
+    if url.endswith(".journal"):
+        path = Path(url).expanduser().resolve()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
+    if "://" not in url:
+        raise InputError(
+            f"storage={without_passwords(url)}: expected a file that ends in .journal, "
+            "sqlite:///FILE or postgresql://USER@HOST/NAME."
+        )
+    return _patiently(lambda: optuna.storages.RDBStorage(_with_driver(url)), url)
+
+
+def _with_driver(url: str) -> str:
+    """SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install."""
+    scheme, mark, rest = url.partition("://")
+    return f"postgresql+psycopg{mark}{rest}" if scheme in ("postgresql", "postgres") else url
+
+
+def _patiently(opening: Callable[[], Opened], url: str) -> Opened:
+    """Two processes that make the tables of a fresh database at once get in each other's way."""
+    import sqlalchemy.exc
+
+    shown = without_passwords(url)
+    for attempt in range(ATTEMPTS):
+        try:
+            return opening()
+        except ImportError as error:
+            raise InputError(
+                f"storage={shown}: {error}; for PostgreSQL install pip install 'rgbt[cluster]'."
+            ) from error
+        except sqlalchemy.exc.ArgumentError as error:
+            raise InputError(f"storage={shown}: {error}.") from error
+        except Exception as error:  # Whatever the driver raises: a later try finds the tables made.
+            if attempt == ATTEMPTS - 1 or _is_unreachable(error):
+                reason = str(error).splitlines()[0]
+                raise InputError(f"storage={shown} cannot be opened: {reason}") from error
+            time.sleep(PAUSE_S * (1 + attempt))
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _is_unreachable(error: Exception) -> bool:
+    words = ("connection refused", "could not translate", "authentication", "does not exist")
+    return "connection" in str(error).lower() and any(w in str(error).lower() for w in words)
+
+
+def study_names(storage: optuna.storages.BaseStorage) -> list[str]:
+    """Names of all studies of a storage."""
+    import optuna
+
+    return sorted(optuna.get_all_study_names(storage))
+
+
+def begin_study(
+    name: str,
+    storage: optuna.storages.BaseStorage,
+    objectives: Sequence[Objective],
+    attributes: Mapping[str, Any],
+    sampler: optuna.samplers.BaseSampler | None = None,
+    pruner: optuna.pruners.BasePruner | None = None,
+) -> optuna.Study:
+    """The study called `name`, made if it does not exist.
+
+    Args:
+        name: of the study.
+        storage: where.
+        objectives: what is told of its trials.
+        attributes: of the study; `attributes.SIGNATURE` must not have changed.
+        sampler: of a search.
+        pruner: of a search.
+
+    Raises:
+        InputError: there is a study of that name with another space or other objectives.
+    """
+    import optuna
+
+    study = _patiently(
+        lambda: optuna.create_study(
+            study_name=name,
+            storage=storage,
+            directions=[objective.direction for objective in objectives],
+            sampler=sampler,
+            pruner=pruner,
+            load_if_exists=True,
+        ),
+        name,
+    )
+    metrics = [objective.metric for objective in objectives]
+    wanted = {names.METRICS: metrics, **attributes}
+    known = study.user_attrs
+    for fixed in (names.METRICS, names.SIGNATURE):
+        if fixed in known and known[fixed] != wanted.get(fixed):
+            what = "other objectives" if fixed == names.METRICS else "another space or budget"
+            raise InputError(
+                f"there is a study '{name}' with {what} already; give this one another name: "
+                "hydra.sweeper.study=..."
+            )
+    for key, value in wanted.items():
+        if known.get(key) != value:
+            study.set_user_attr(key, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        study.set_metric_names(metrics)
+    return study
+
+
+def existing_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
+    """The study called `name`; None where it, or the file of the storage, does not exist."""
+    path = runs_dir / JOURNAL if storage is None else Path(storage.removeprefix("sqlite:///"))
+    if "://" not in str(storage or "").removeprefix("sqlite:///") and not path.exists():
+        return None
+    opened = open_storage(storage, runs_dir)
+    return load_study(name, opened) if name in study_names(opened) else None
+
+
+def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
+    """The study called `name`.
+
+    Raises:
+        InputError: there is none; the sentence lists those there are.
+    """
+    import optuna
+
+    names = study_names(storage)
+    if name not in names:
+        known = nearest(name, names) if names else "the storage holds none"
+        raise InputError(f"there is no study '{name}'; {known}.")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.load_study(study_name=name, storage=storage)

@@ -1,0 +1,196 @@
+"""Report of a study: ``python -m sweeps.study name=search/grbm``, also while it runs.
+
+Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV with the figures, and
+MLflow a run that holds these files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError
+from rgbt.command import composing, plain_command, readable_paths
+from rgbt.tracking.provenance import without_passwords
+from sweeps.storage import JOURNAL, load_study, open_storage, study_names
+
+if TYPE_CHECKING:
+    import optuna
+
+    from rgbt.tracking.mlflow_store import Link, Tracking
+    from rgbt.tracking.tables import Grid
+    from sweeps.study_data import Importances, StudyData
+    from sweeps.study_figures import Picture
+
+OWN = {"name": "", "storage": "", "runs_dir": "runs", "out": ""}
+
+NAME_LENGTH = 80
+"""Characters of a folder name; longer study names are cut and told apart by their hash."""
+
+
+def main(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Show what a study has found: best trials, failures, importances, figures.
+
+    name      of the study; without one, those of the storage are listed
+    storage   file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME;
+              default: studies.journal in the folder of runs
+    runs_dir  folder of runs
+    out       folder for Markdown, CSV and PNGs; default: studies/<name> in the folder of runs
+    overrides of the tracker, such as tracking=none or tracking.uri=http://host:5000
+    """
+    runs_dir = Path(arguments["runs_dir"])
+    place = arguments["storage"] or None
+    _check_exists(place, runs_dir)
+    storage = open_storage(place, runs_dir)
+    if not arguments["name"]:
+        known = ", ".join(study_names(storage)) or "none"
+        raise InputError(f"give the study with name=...; the storage holds: {known}.")
+    study = load_study(arguments["name"], storage)
+    tracking = _tracking(runs_dir, overrides)
+    out = Path(arguments["out"] or study_folder(runs_dir, study.study_name))
+    links = report(study, out, tracking)
+    show_places([*links, ("dashboard", dashboard_command(place, runs_dir))])
+    return 0
+
+
+def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
+    """Print the tables of a study, write its files and send them to the tracker.
+
+    Args:
+        study: finished or still running.
+        out: folder for ``study.md``, ``trials.csv`` and the PNGs, made where it is missing.
+        tracking: where a run of kind "study" is recorded.
+
+    Returns:
+        where everything is, as (name, place).
+    """
+    from rich.console import Group
+    from rich.text import Text
+
+    from rgbt.tracking.files import write_atomic
+    from rgbt.tracking.terminal import show
+    from sweeps.records import record
+    from sweeps.study_data import importances, read
+    from sweeps.study_figures import draw
+    from sweeps.study_tables import tables, terminal_table, trials_csv
+
+    data = read(study)
+    shares = importances(data)
+    grids = tables(data, shares)
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = draw(data, shares, out)
+    said = remarks(shares, pictures)
+    text = markdown(data, grids, said)
+    write_atomic(out / "study.md", (text + gallery(pictures)).encode())
+    write_atomic(out / "trials.csv", trials_csv(data).encode())
+    show(Group(*map(terminal_table, grids), Text("\n".join(said))))
+    drawn = [picture.path for picture in pictures if picture.path is not None]
+    links = record(
+        tracking,
+        # A table and its study may have one name, and are two records.
+        name=f"study {data.name}",
+        kind="study",
+        files=[out / "study.md", out / "trials.csv", *drawn],
+        metrics=metrics(data),
+        tags={"rgbt.study": data.name, "rgbt.study.kind": data.kind},
+        note=text,
+    )
+    return [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}"), *links]
+
+
+def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str:
+    """The report in Markdown, without figures: MLflow's descriptions cannot show them."""
+    from sweeps.study_tables import markdown_table
+
+    way = ["highest" if up else "lowest" for up in data.maximize]
+    wanted = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
+    begun = f"Begun by `{without_passwords(data.command)}`.\n" if data.command else ""
+    head = f"# Study {data.name}\n\nKind: {data.kind}. Objectives: {wanted}.\n{begun}"
+    remarked = "".join(f"- {line}\n" for line in said)
+    return "\n".join([head, *map(markdown_table, grids), remarked])
+
+
+def gallery(pictures: Sequence[Picture]) -> str:
+    """The figures in Markdown, by the names of their files."""
+    drawn = [picture for picture in pictures if picture.path is not None]
+    return "".join(f"\n## {p.title}\n\n![{p.title}]({p.name}.png)\n" for p in drawn)
+
+
+def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
+    """What a person should know: how good the importances are, and which figures there are not."""
+    missing: dict[str, list[str]] = {}
+    for picture in pictures:
+        if picture.path is None:
+            missing.setdefault(picture.reason, []).append(picture.name)
+    lines = [f"No figure {', '.join(names)}: {reason}" for reason, names in missing.items()]
+    is_said = shares.remark in missing
+    return [*([f"Importances: {shares.remark}"] if shares.remark and not is_said else []), *lines]
+
+
+def metrics(data: StudyData) -> dict[str, float]:
+    """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
+    from sweeps.study_data import pruning
+    from sweeps.study_tables import WORDS
+
+    found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
+    for index, metric in enumerate(data.metrics):
+        values = [trial.values[index] for trial in data.complete]
+        if values:
+            found[f"best/{metric}"] = max(values) if data.maximize[index] else min(values)
+    saved = pruning(data)
+    if saved is not None:
+        found["steps_saved"] = 100.0 * saved.share
+    return found
+
+
+def study_folder(runs_dir: Path, name: str) -> Path:
+    """Where the report of a study goes: "spatialseg/table3" makes one folder, and a clear one."""
+    safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:NAME_LENGTH]
+    if safe != name:
+        safe += "-" + hashlib.sha256(name.encode()).hexdigest()[:6]
+    return runs_dir / "studies" / safe
+
+
+def dashboard_command(storage: str | None, runs_dir: Path) -> str:
+    """The command that opens optuna-dashboard on a storage, passwords hidden."""
+    return f"optuna-dashboard {without_passwords(storage or str(runs_dir / JOURNAL))}"
+
+
+def _check_exists(storage: str | None, runs_dir: Path) -> None:
+    """Refuse a file that is not there: opening it would make an empty one."""
+    place = str(runs_dir / JOURNAL) if storage is None else storage
+    path = Path(place.removeprefix("sqlite:///")).expanduser()
+    is_file = "://" not in place or place.startswith("sqlite:///")
+    if is_file and not path.is_file():
+        raise InputError(
+            f"there is no file of studies {path}; give the folder of runs with runs_dir=... or the "
+            "storage with storage=..."
+        )
+
+
+def _tracking(runs_dir: Path, overrides: Sequence[str]) -> Any:
+    """The tracker as the configuration has it."""
+    from rgbt.config import build, check_node, compose
+
+    every = [*readable_paths([f"runs_dir={runs_dir}"]), *overrides]
+    with composing(every):
+        config = compose(every)
+    check_node(config.tracking, "tracking")
+    return build(config.tracking)
+
+
+def show_places(places: Sequence[Link]) -> None:
+    """Print where everything is, one "name  place" pair per line."""
+    from rich.text import Text
+
+    from rgbt.tracking.terminal import show
+
+    width = max(len(name) for name, _ in places)
+    show(Text("\n".join(f"{name:<{width}}  {place}" for name, place in places), no_wrap=True))
+
+
+if __name__ == "__main__":
+    plain_command(OWN, main)()

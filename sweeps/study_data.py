@@ -1,0 +1,245 @@
+"""What a study has found, read once from Optuna's storage: also while the study still runs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from sweeps import attributes
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
+
+STATES = ("COMPLETE", "PRUNED", "FAIL", "RUNNING", "WAITING")
+
+FEWEST = 10
+"""Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth."""
+
+ADVISED = 50
+"""Complete trials from which the best tenth has the five that PED-ANOVA's authors ask for."""
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """A study at one moment.
+
+    Attributes:
+        name: of the study.
+        kind: "search", "grid" or "list".
+        metrics: names of the objectives.
+        maximize: whether more is better, by objective.
+        trials: those that count, by number; dropped duplicates are left out.
+        command: that began the study, or "".
+    """
+
+    name: str
+    kind: str
+    metrics: tuple[str, ...]
+    maximize: tuple[bool, ...]
+    trials: tuple[FrozenTrial, ...]
+    command: str = ""
+
+    def of_state(self, *states: str) -> list[FrozenTrial]:
+        """Trials in one of these states (names as in `STATES`), by number."""
+        return [trial for trial in self.trials if trial.state.name in states]
+
+    @cached_property
+    def complete(self) -> list[FrozenTrial]:
+        """Trials whose objectives are all known and finite, by number."""
+        found = self.of_state("COMPLETE")
+        return [trial for trial in found if all(map(math.isfinite, trial.values))]
+
+    def counts(self) -> dict[str, int]:
+        """Number of trials by state, those of `STATES` in order."""
+        found = Counter(trial.state.name for trial in self.trials)
+        return {state: found[state] for state in STATES}
+
+    @cached_property
+    def distributions(self) -> Mapping[str, BaseDistribution]:
+        """Each parameter's distribution, in the order in which the trials first have them."""
+        found: dict[str, BaseDistribution] = {}
+        for trial in self.trials:
+            for name, distribution in trial.distributions.items():
+                found.setdefault(name, distribution)
+        return found
+
+    @cached_property
+    def front(self) -> list[FrozenTrial]:
+        """The Pareto front, best first objective first; with one objective its best trials."""
+        if not self.complete:
+            return []
+        # The copy has the complete trials alone, so that its numbers are places in our list.
+        best = [self.complete[trial.number] for trial in self.copy().best_trials]
+        return sorted(best, key=self.rank)
+
+    @cached_property
+    def standing(self) -> list[FrozenTrial]:
+        """The last trial of each point: earlier ones failed and were tried again."""
+        last = {t.user_attrs.get(attributes.KEY, t.number): t for t in self.trials}
+        return sorted(last.values(), key=lambda trial: trial.number)
+
+    def rank(self, trial: FrozenTrial) -> tuple[float, int]:
+        """Sorts complete trials by their first objective, best first, then by number."""
+        return (-1.0 if self.maximize[0] else 1.0) * trial.values[0], trial.number
+
+    def copy(self) -> optuna.Study:
+        """A study in memory of the complete trials, numbered anew, for Optuna's own functions."""
+        import optuna
+
+        way = optuna.study.StudyDirection
+        directions = [way.MAXIMIZE if up else way.MINIMIZE for up in self.maximize]
+        study = optuna.create_study(directions=directions)
+        study.add_trials(self.complete)
+        return study
+
+    def label(self, trial: FrozenTrial) -> str:
+        """What a person sees of a trial: its label, else its parameters, else its number."""
+        short = short_names(self.distributions)
+        pairs = [f"{short[name]}={shown(value)}" for name, value in trial.params.items()]
+        return str(trial.user_attrs.get(attributes.LABEL) or " ".join(pairs) or trial.number)
+
+
+def read(study: optuna.Study) -> StudyData:
+    """Read a study whole."""
+    notes = study.user_attrs
+    names = notes.get(attributes.METRICS) or study.metric_names
+    count = len(study.directions)
+    metrics = tuple(names or (f"objective {index + 1}" for index in range(count)))
+    trials = study.get_trials(deepcopy=False)
+    return StudyData(
+        name=study.study_name,
+        kind=str(notes.get(attributes.KIND, "search")),
+        metrics=metrics,
+        maximize=tuple(direction.name == "MAXIMIZE" for direction in study.directions),
+        trials=tuple(t for t in trials if not t.user_attrs.get(attributes.DROPPED)),
+        command=str(notes.get(attributes.COMMAND, "")),
+    )
+
+
+def short_names(names: Collection[str]) -> dict[str, str]:
+    """Dotted keys cut to their last part where that says enough: "masker.sigma_div": "sigma_div".
+
+    Example:
+        >>> short_names(["optimizer.lr", "head.lr", "masker.alpha"])["masker.alpha"]
+        'alpha'
+    """
+    ends = Counter(name.rpartition(".")[2] for name in names)
+    return {name: end if ends[end := name.rpartition(".")[2]] == 1 else name for name in names}
+
+
+def shown(value: object) -> str:
+    """A parameter's value for people: four significant digits."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class Importances:
+    """How much the objectives depend on each parameter.
+
+    Attributes:
+        shares: parameter -> share by objective, which sum to 1 over the parameters; NaN for an
+            objective that has one value only. Most important for the first objective first.
+        remark: why there are none, what was left out, or how rough they are; "" if nothing.
+    """
+
+    shares: Mapping[str, tuple[float, ...]]
+    remark: str
+
+
+def importances(data: StudyData) -> Importances:
+    """Importances by PED-ANOVA, which is Optuna's default: of reaching the best tenth.
+
+    Source: Watanabe et al., "PED-ANOVA", IJCAI 2023, arXiv 2304.10255.
+    """
+    count = len(data.complete)
+    if data.kind == "list":
+        return Importances({}, "")
+    if count < FEWEST:
+        return Importances({}, f"they need {FEWEST} complete trials, and there are {count}.")
+    varied = [name for name in data.distributions if _is_varied(data, name)]
+    if not varied:
+        return Importances({}, "no parameter took two values.")
+    found = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
+    said = " ".join(_remarks(data, varied, found))
+    shares = {name: tuple(shares[name] for shares in found) for name in varied}
+    if all(math.isnan(share) for of_objectives in shares.values() for share in of_objectives):
+        return Importances({}, said)
+    ordered = dict(sorted(shares.items(), key=lambda item: _descending(item[1])))
+    return Importances(ordered, said)
+
+
+def _is_varied(data: StudyData, name: str) -> bool:
+    return len({trial.params[name] for trial in data.complete if name in trial.params}) > 1
+
+
+def _descending(shares: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(0.0 if math.isnan(share) else -share for share in shares)
+
+
+def _of_objective(data: StudyData, index: int, names: list[str]) -> dict[str, float]:
+    import optuna
+
+    if len({trial.values[index] for trial in data.complete}) == 1:
+        return dict.fromkeys(names, math.nan)
+    sign = -1.0 if data.maximize[index] else 1.0
+    with warnings.catch_warnings():
+        # The sign is right, and how rough the shares are is said in words (`_remarks`).
+        warnings.filterwarnings("ignore", "PedAnovaImportanceEvaluator computes", UserWarning)
+        warnings.filterwarnings("ignore", "Some regimes for parameter", UserWarning)
+        return optuna.importance.get_param_importances(
+            data.copy(), params=names, target=lambda trial: sign * trial.values[index]
+        )
+
+
+def _remarks(data: StudyData, varied: list[str], found: list[dict[str, float]]) -> list[str]:
+    constant = [name for name in data.distributions if name not in varied]
+    flat = [
+        metric
+        for metric, shares in zip(data.metrics, found, strict=True)
+        if all(map(math.isnan, shares.values()))
+    ]
+    count = len(data.complete)
+    return [
+        *([f"{', '.join(constant)}: one value only, left out."] if constant else []),
+        *([f"{', '.join(flat)}: the same value in all trials."] if flat else []),
+        *([f"rough: {count} complete trials, {ADVISED} are advised."] if count < ADVISED else []),
+    ]
+
+
+@dataclass(frozen=True)
+class Pruning:
+    """What pruning saved.
+
+    Attributes:
+        trials: pruned ones that reported.
+        share: of the training steps that complete and pruned trials would have made, 0..1.
+    """
+
+    trials: int
+    share: float
+
+
+def pruning(data: StudyData) -> Pruning | None:
+    """Training steps saved; None where it cannot be told (no complete trial reported its steps).
+
+    A pruned trial saves what lies between its last report and the last step of complete trials, and
+    all steps of its further seeds, which are not begun.
+    """
+    full = max((step for trial in data.complete for step in trial.intermediate_values), default=0)
+    pruned = [trial for trial in data.of_state("PRUNED") if trial.intermediate_values]
+    if full <= 0:
+        return None
+    wanted = sum(full * _num_runs(trial) for trial in [*pruned, *data.complete])
+    saved = sum(full * _num_runs(t) - max(t.intermediate_values) for t in pruned)
+    return Pruning(len(pruned), max(saved, 0) / wanted)
+
+
+def _num_runs(trial: FrozenTrial) -> int:
+    return max(1, len(trial.user_attrs.get(attributes.RUNS, ())))

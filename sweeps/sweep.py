@@ -1,0 +1,150 @@
+"""What ``-m`` does: a grid of comma lists, a list of points, or a search."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra.core.config_loader import ConfigLoader
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError, RunError
+from rgbt.metrics import names
+from rgbt.tracking.tables import ABSENT, Grid, number
+from rgbt.tracking.terminal import rich_table, show, tell
+from sweeps.found import Runs, open_runs
+from sweeps.grid import GridPoint, Swept, distributions, grid_points, list_points, split
+from sweeps.lists import Outcome, PointList, estimated_seconds, survey, work_off
+from sweeps.live import duration
+from sweeps.points import Point
+from sweeps.search import Search, search
+from sweeps.settings import Settings, read_settings
+from sweeps.sources import short
+from sweeps.space_merge import merge_space
+
+PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking", "trainer.threads")
+"""Overrides that may differ between two calls of the same sweep."""
+
+
+def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:
+    """Run what the overrides of ``-m`` ask for.
+
+    Args:
+        arguments: the task's overrides as typed.
+        config: composed from them, with Hydra's own node.
+        loader: of Hydra.
+
+    Raises:
+        InputError: settings, space or points that do not fit.
+        RunError: points failed; all others were run.
+    """
+    settings = read_settings(config.hydra.sweeper)
+    typed = [*(f"{key}={value}" for key, value in settings.params.items()), *arguments]
+    fixed, swept, intervals = split(typed, loader)
+    base = tuple(_forwarded(config))
+    runs = open_runs(config)
+    if settings.space or intervals:
+        parameters = merge_space(settings.space, fixed, swept, intervals)
+        taken = {parameter.key for parameter in parameters}
+        shared = (*base, *(word for word in fixed if word.partition("=")[0] not in taken))
+        identity = (shared, parameters, settings.objectives, settings.replicates)
+        name = settings.study or _name(config, [p.key for p in parameters], identity)
+        search(Search(name, shared, parameters, runs, _plain(shared)), settings)
+        return
+    points = _points(settings, fixed, swept)
+    name = settings.study or _name(config, list(points[0].params), [p.overrides for p in points])
+    kind = "list" if settings.points else "grid"
+    _grid(_point_list(name, kind, points, (runs, base)), settings)
+
+
+def _points(settings: Settings, fixed: Sequence[str], swept: Swept) -> list[GridPoint]:
+    grid = grid_points(fixed, swept)
+    if not settings.points:
+        return grid
+    found = []
+    for each in grid:
+        for own in list_points(settings.points, each.overrides):
+            found.append(GridPoint({**each.params, **own.params}, own.overrides))
+    return found
+
+
+def _point_list(
+    name: str, kind: str, points: Sequence[GridPoint], place: tuple[Runs, tuple[str, ...]]
+) -> PointList:
+    runs, base = place
+    every = tuple(
+        Point(
+            label=" ".join(short(f"{key}={value}") for key, value in point.params.items()) or name,
+            overrides=point.overrides,
+            params=point.params,
+            tags={f"rgbt.study/{name}": "grid"},
+        )
+        for point in points
+    )
+    return PointList(name, name, kind, every, runs, base, distributions(points))
+
+
+def _grid(wanted: PointList, settings: Settings) -> None:
+    if settings.dry_run:
+        outcomes = survey(wanted, settings)
+        show(rich_table(grid_table(wanted, outcomes)))
+        seconds = estimated_seconds(outcomes, settings.workers)
+        missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
+        guess = "" if seconds is None else f", about {duration(seconds)}"
+        tell(f"{missing} of {len(outcomes)} points would be run{guess}.")
+        return
+    outcomes = survey(wanted, settings)
+    wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
+    if wrong:
+        # Nothing was run yet: a typing mistake is told before hours are spent on the other points.
+        raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
+    outcomes = work_off(wanted, settings)
+    show(rich_table(grid_table(wanted, outcomes)))
+    tell(f"study {wanted.study}; its figures: python -m sweeps.study name={wanted.study}")
+    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
+    if failed:
+        raise RunError(
+            f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
+            f"{failed[0].reason} (hydra.sweeper.retry=failed tries them again)."
+        )
+
+
+def grid_table(wanted: PointList, outcomes: Sequence[Outcome]) -> Grid:
+    """One row per point: what it is, its scores on the test split, its state."""
+    metrics = (names.MIOU, names.VAR)
+    rows = []
+    for outcome in outcomes:
+        scores: Mapping[str, float] = outcome.found[0].scores() if outcome.found else {}
+        shown = [f"test/{metric}" for metric in metrics]
+        values = [number(scores[name]) if name in scores else ABSENT for name in shown]
+        key = outcome.keys[0] if outcome.keys else ABSENT
+        state = outcome.reason[:80] if outcome.reason else outcome.state
+        rows.append((outcome.point.label, *values, key, state))
+    return Grid(wanted.title, ("point", *metrics, "run", "state"), tuple(rows))
+
+
+def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:
+    """A name that the same command gives again: method, what varies, a hash of everything."""
+    text = json.dumps(_plain(identity), sort_keys=True, default=vars)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
+    varied = "-".join(key.rpartition(".")[2] for key in keys)
+    return f"{config.name}-{varied[:60]}-{digest}" if varied else f"{config.name}-{digest}"
+
+
+def _plain(value: Any) -> Any:
+    """`value` without the overrides that only say where things lie."""
+    if isinstance(value, str):
+        key = value.partition("=")[0].lstrip("+")
+        return None if key in PLACES or key.startswith("tracking.") else value
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _forwarded(config: DictConfig) -> list[str]:
+    """Overrides of Hydra itself that a run needs too, and what keeps it from being a sweep."""
+    given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
+    is_search = "search" in config.hydra.runtime.choices
+    return [*given, *(["hydra.mode=RUN"] if is_search else [])]

@@ -1,0 +1,94 @@
+"""Small tables, counts and outcomes with values that can be followed by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rgbt.metrics.counts import Counts
+from sweeps.lists import Outcome
+from sweeps.points import Evaluation, Point
+from sweeps.scoring import Scored, score
+from sweeps.table import Column, Row, Table
+
+DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
+NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
+"""Two regions of two classes. Together: [[4, 0], [2, 2]] and [[3, 1], [0, 4]]."""
+
+
+def counts_of(*images: Any, night: tuple[bool, ...] | None = (False, True)) -> Counts:
+    """Counts of the images, by default one by day and one by night."""
+    array = np.array(images or (DAY, NIGHT), np.int64)
+    return Counts(
+        counts=array,
+        names=tuple(f"{index:05d}" for index in range(len(array))),
+        night=night,
+        classes=("road", "car"),
+        partition="ring2",
+        dataset="d",
+        split="test",
+    )
+
+
+def right(share: int) -> Counts:
+    """One region and image whose pixel accuracy is `share` percent."""
+    return counts_of([[[share, 100 - share], [0, 0]]], night=None)
+
+
+@dataclass(frozen=True)
+class FakeFound:
+    """Stands for `sweeps.found.Found`."""
+
+    key: str
+    made: Mapping[Evaluation | None, Counts]
+    commit: str | None = "aaaaaaaaaa"
+
+    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+        return self.made[evaluation]
+
+
+def outcome(
+    key: str, made: Counts | Mapping[Evaluation | None, Counts], commit: str | None = "aaaaaaaaaa"
+) -> Outcome:
+    """A finished run."""
+    by_evaluation = {None: made} if isinstance(made, Counts) else made
+    found: Any = FakeFound(key, by_evaluation, commit)
+    return Outcome(Point(key, ()), "finished", found=(found,))
+
+
+def failed(reason: str) -> Outcome:
+    """A run that failed."""
+    return Outcome(Point("", ()), "failed", reason)
+
+
+def table(rows: tuple[Row, ...], columns: tuple[Column, ...] = (), **others: Any) -> Table:
+    """A table with one column of pixel accuracy unless others are given."""
+    accuracy = Column(name="acc", metric="pixel_accuracy")
+    given = {"paper": "own", "number": "TABLE I", "caption": "Rows", "data": "somewhere", **others}
+    return Table(columns=columns or (accuracy,), rows=rows, **given)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A table of pixel accuracies in percent: label -> (ours by seed, printed)."""
+
+    rows: Mapping[str, tuple[tuple[int, ...], float | None]]
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+    def table(self) -> Table:
+        rows = tuple(
+            Row(label=label, experiment="crm", values={} if printed is None else {"acc": printed})
+            for label, (_, printed) in self.rows.items()
+        )
+        return table(rows, **self.others)
+
+    def scored(self) -> Scored:
+        runs = {
+            (label, seed): outcome(f"{label}{seed}", right(share))
+            for label, (shares, _) in self.rows.items()
+            for seed, share in enumerate(shares)
+        }
+        return score("own/made", self.table(), runs, scale="demo")
