@@ -80,6 +80,8 @@ def _terminable() -> Iterator[None]:
         del number, frame
         if os.getpid() != process:  # a worker forked from us: it has nothing to tidy up
             os._exit(143)
+        # Clusters signal a process more than once; the first one is being answered.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise Terminated
 
     before = signal.signal(signal.SIGTERM, stop)

@@ -61,15 +61,6 @@ def compose(overrides: Sequence[str]) -> DictConfig:
         return hydra.compose("config", list(overrides))
 
 
-def compose_sweeper(name: str) -> DictConfig:
-    """The node of the sweeper in that file of ``conf/hydra/sweeper``."""
-    register_resolvers()
-    with _own_hydra():
-        whole = hydra.compose("config", [f"hydra/sweeper={name}"], return_hydra_config=True)
-    node: DictConfig = whole.hydra.sweeper
-    return node
-
-
 @contextmanager
 def _own_hydra() -> Iterator[None]:
     """Hydra with our configuration, also inside a command that Hydra runs."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from sweeps.cells import evaluation_of, is_counted
-from sweeps.lists import Outcome
 from sweeps.points import Evaluation, Point
 from sweeps.table import Table
+
+if TYPE_CHECKING:
+    from sweeps.lists import Outcome
 
 DEFAULT_SCALE = "demo"
 """What a run is without ``scale=...``."""

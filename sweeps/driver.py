@@ -12,10 +12,12 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from rgbt.checks import RunError
 from rgbt.naming import TAGS
 from sweeps import attributes as names
 from sweeps.executors import Executor, Job
@@ -28,6 +30,10 @@ from sweeps.sources import Source, Task
 from sweeps.work import PointError, Pruned, Surroundings, Work, mean_scores
 
 POLL_S = 0.2
+AWAY_S = 600.0
+"""How long a storage that cannot be reached is waited for."""
+
+PAUSE_S = 5.0
 LOOK_S = 2.0
 """Seconds between two looks at the storage for work that others left or gave up."""
 
@@ -58,15 +64,35 @@ class Driver:
     _began: float = field(default_factory=time.monotonic)
     _looked: float = -math.inf
     _beaten: float = field(default_factory=time.monotonic)
+    _away_since: float = 0.0
 
     def run(self) -> None:
         """Work until nothing is left to do; on Ctrl-C or SIGTERM give back what is not done."""
         try:
-            while self._round():
+            while self._patient_round():
                 time.sleep(POLL_S)
         except BaseException:
             self._give_back()
             raise
+
+    def _patient_round(self) -> bool:
+        """A round; a storage that cannot be reached is waited for while the runs go on."""
+        from optuna.exceptions import StorageInternalError
+
+        try:
+            more = self._round()
+        except StorageInternalError as error:
+            now = time.monotonic()
+            self._away_since = self._away_since or now
+            if now - self._away_since > AWAY_S:
+                raise RunError(
+                    f"the storage of the study cannot be reached for {AWAY_S / 60:g} minutes "
+                    f"({str(error).splitlines()[0]}); the same command goes on."
+                ) from error
+            time.sleep(PAUSE_S)
+            return True
+        self._away_since = 0.0
+        return more
 
     def _round(self) -> bool:
         """Look after everything once; whether there is more to do."""
@@ -88,7 +114,8 @@ class Driver:
 
     def _take_up(self, free: int) -> None:
         """Begin as many points as there are free slots."""
-        for trial in self.ledger.orphans():
+        mine = {work.number for work in self.works.values()}
+        for trial in self.ledger.orphans(mine):
             self.ledger.release(trial.number, "its driver was gone", again=self.source.again)
         while free > 0 and not self._is_over():
             task = self.source.next()
@@ -143,8 +170,8 @@ class Driver:
                 self.runs.stopped(run.key, str(reason))
             self.view.ended(work, "pruned", str(reason))
         except PointError as error:
-            self.failures += 1
             self.ledger.fail(work.number, str(error), notes)
+            self.failures += 1
             self.view.ended(work, "failed", str(error))
         else:
             self.ledger.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
@@ -153,12 +180,16 @@ class Driver:
 
     def _give_back(self) -> None:
         """Stop all processes and give the trials back; their runs continue at the next call."""
+        from optuna.exceptions import StorageInternalError
+
         for work in self.works.values():
             work.stop()
         while not all(work.is_stopped() for work in self.works.values()):
             time.sleep(POLL_S)
-        for work in self.works.values():
-            self.ledger.release(work.number, "its driver was stopped", again=self.source.again)
+        # Where the storage is away they are orphans, which the next driver takes up as well.
+        with suppress(StorageInternalError):
+            for work in self.works.values():
+                self.ledger.release(work.number, "its driver was stopped", again=self.source.again)
 
 
 def usable_cores() -> int:

@@ -174,12 +174,20 @@ class Ledger:
             self.study.enqueue_trial(dict(trial.params), user_attrs=attributes)
         self.drop(number, reason)
 
-    def orphans(self) -> Iterator[FrozenTrial]:
-        """Running trials whose driver is gone."""
+    def orphans(self, mine: Collection[int]) -> Iterator[FrozenTrial]:
+        """Running trials whose driver is gone.
+
+        Args:
+            mine: numbers that this driver works on; any other of its own was lost, when the storage
+                failed in the middle of a claim.
+        """
         for trial in self.trials():
-            if trial.state.name != "RUNNING":
+            if trial.state.name != "RUNNING" or trial.number in mine:
                 continue
             owner = trial.user_attrs.get(names.OWNER)
+            if owner == str(self.me):
+                yield trial
+                continue
             if owner is not None:
                 alive = Owner.parse(owner).is_alive(trial.user_attrs[names.BEAT])
             else:  # of a search: asked for this moment, or by a driver that died between two lines

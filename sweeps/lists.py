@@ -172,7 +172,7 @@ def make_executor(settings: Settings, runs_dir: Path) -> Executor:
         return LocalExecutor()
     from sweeps.submitit_executor import SubmititExecutor
 
-    return SubmititExecutor(runs_dir / ".submitit", settings.submitit)
+    return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:

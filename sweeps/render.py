@@ -8,7 +8,8 @@ from dataclasses import replace
 from rich.text import Text as RichText
 
 from sweeps.sheet import Sheet
-from sweeps.sheet_lines import WITH_SD, Text
+from sweeps.sheet_lines import WITH_SD
+from sweeps.sheet_texts import Text
 
 STYLES = ("", "bold", "underline")
 SIGNS = ("", "*", "_")

@@ -43,7 +43,7 @@ class Settings:
     gpus: tuple[int, ...] | None
     threads: int | None
     executor: Literal["local", "submitit"]
-    submitit: dict[str, Any]
+    submitit: dict[str, Any] | None
     retries: int
     retry: Literal["none", "failed"]
     timeout_minutes: float | None
@@ -75,6 +75,11 @@ class Settings:
             raise InputError("gpus=[]: expected numbers of GPUs such as [0,1], or null.")
         if self.submitit and self.executor != "submitit":
             raise InputError("submitit={...} are options of executor=submitit; add that.")
+        if self.executor == "submitit" and self.timeout_minutes is not None:
+            raise InputError(
+                "timeout_minutes would count the time in the queue too; with executor=submitit give "
+                "submitit={timeout_min: ...}."
+            )
         if not self.objectives:
             raise InputError("objectives: expected at least one, such as val/mIoU.")
 
@@ -105,6 +110,7 @@ def read_settings(node: DictConfig) -> Settings:
                 f"'hydra.sweeper.{key!s}' is not a setting; {nearest(str(key), known)}."
             )
     for key, kind in AS_WRITTEN.items():
+        raw[key] = kind() if raw[key] is None else raw[key]
         if not isinstance(raw[key], kind):
             what = "mapping" if kind is dict else "list"
             raise InputError(f"'hydra.sweeper.{key!s}' must be a {what}, got {raw[key]!r}.")

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sweeps.scoring import Scored
-from sweeps.sheet_lines import Builder, Footnotes, Line, Text
+from sweeps.sheet_lines import Builder
+from sweeps.sheet_texts import Footnotes, Line, Text
 
 DEMO = (
     "scale=demo: data and network are small; compare the order of the rows with the paper, not the "

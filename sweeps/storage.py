@@ -49,7 +49,14 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
             f"storage={without_passwords(url)}: expected a file that ends in .journal, "
             "sqlite:///FILE or postgresql://USER@HOST/NAME."
         )
-    return _patiently(lambda: optuna.storages.RDBStorage(_with_driver(url)), url)
+    return _patiently(lambda: _database(_with_driver(url)), url)
+
+
+def _database(url: str) -> optuna.storages.RDBStorage:
+    import optuna
+
+    # A firewall may cut a connection that is idle while a run trains for hours.
+    return optuna.storages.RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
 
 
 def _with_driver(url: str) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from sweeps.cells import Cell
 from sweeps.scoring import Scored, published
 from sweeps.sheet import Sheet
-from sweeps.sheet_lines import Text
+from sweeps.sheet_texts import Text
 
 LEGEND = "Bold: best, underlined: second best."
 

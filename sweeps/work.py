@@ -80,6 +80,7 @@ class Work:
         self._index = 0
         self._follower = Follower(Path())
         self._found: tuple[Found, ...] = ()
+        self._end_as: Exception | None = None
         self._steps = self._go()
 
     @property
@@ -100,12 +101,19 @@ class Work:
             PointError: a run failed.
             Pruned: the report said so; the process is gone.
         """
+        # A driver asks again where the storage could not be told how it ended.
+        if self._end_as is not None:
+            raise self._end_as
         try:
             next(self._steps)
         except StopIteration:
             return self._found
+        except (PointError, Pruned) as end:
+            self._end_as = end
         except RunError as error:
-            raise PointError(str(error)) from error
+            self._end_as = PointError(str(error))
+        if self._end_as is not None:
+            raise self._end_as
         return None
 
     def stop(self) -> None:

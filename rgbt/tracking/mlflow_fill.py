@@ -28,6 +28,9 @@ Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 PARAM_LENGTH = 500
 """Characters of a parameter's value that are sent; MLflow's pages show far fewer."""
 
+NAME_LENGTH = 250
+"""Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
+
 BATCH_LENGTH = 1000
 """Metrics in one call, MLflow's limit."""
 
@@ -101,8 +104,8 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
     description = folder.description()
-    if description is not None and description.name != name:
-        store.client.update_run(sent.run_id, name=description.name)
+    if description is not None and short_name(description.name) != name:
+        store.client.update_run(sent.run_id, name=short_name(description.name))
     if status == "RUNNING" and seen != status:
         store.client.update_run(sent.run_id, status=status)
     elif status != seen:
@@ -126,14 +129,20 @@ def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], st
                 return set(run.data.params), str(run.info.status), str(run.info.run_name)
     description = folder.description()
     assert description is not None, f"{folder.path}: describe() comes before fill()"
+    run_name = short_name(description.name)
     run = store.client.create_run(
-        store.experiment_id, start_time=_start_time(folder), run_name=description.name
+        store.experiment_id, start_time=_start_time(folder), run_name=run_name
     )
     sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
     sent.steps, sent.files, sent.profile = {}, {}, False
     # Written at once: a crash after this line must not leave a second run behind.
     write_sent(folder, sent)
-    return set(), str(run.info.status), description.name
+    return set(), str(run.info.status), run_name
+
+
+def short_name(name: str) -> str:
+    """A run's name as MLflow takes it; the whole one stays in the folder."""
+    return name if len(name) <= NAME_LENGTH else f"{name[: NAME_LENGTH - 4]} ..."
 
 
 def _send(store: Store, sent: Sent, entities: tuple[list[Any], list[Any], list[Any]]) -> None:

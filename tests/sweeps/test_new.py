@@ -48,7 +48,8 @@ def test_values_that_are_no_numbers_and_keys_that_end_alike(tmp_path: Path) -> N
         "masker=grbm_paper",
         "masker=grbm_released",
     ]
-    write_new("alike", "grbm", ["dataset.seed=0,1", "optimizer.lr=0.1,0.2"], tmp_path)
+    write_new("alike", "grbm", ["scale.lr=0.1,0.2", "recipe.lr=0.1,0.2"], tmp_path)
+    assert load_table("alike", tmp_path).rows[1].label == "scale.lr=0.1 recipe.lr=0.2"
     write_new("near", "grbm", ["masker.sigma_div=2,3"], tmp_path)
     factor = load_table("near", tmp_path).factor
     assert factor is not None

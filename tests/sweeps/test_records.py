@@ -37,6 +37,7 @@ def table_file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_record_is_one_run_that_a_repeat_updates(place: Path, table_file: Path) -> None:
     tracking = tracking_in(place)
     links = sent(tracking, table_file)
@@ -59,6 +60,7 @@ def test_a_record_is_one_run_that_a_repeat_updates(place: Path, table_file: Path
     assert run.info.run_id in links[1][1]
 
 
+@pytest.mark.slow
 def test_two_that_make_the_run_at_once_keep_the_older(place: Path, table_file: Path) -> None:
     tracking = tracking_in(place)
     store = tracking.store()

@@ -5,10 +5,8 @@ import io
 import re
 from typing import Any
 
-import pytest
 from rich.text import Text as RichText
 
-from sweeps.cell_points import seeds_of
 from sweeps.render import terminal
 from sweeps.scoring import Scored, score
 from sweeps.sheet import DEMO, sheet_of
@@ -170,8 +168,3 @@ def test_csv_read_back() -> None:
     }
     assert second["mean"] == second["runs"] == ""
     assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "flow")
-
-
-@pytest.mark.parametrize(("text", "seeds"), [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7))])
-def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
-    assert seeds_of(text) == seeds

@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mlflow import MlflowClient
 
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+from sweeps.attributes import DROPPED, KEY, OWNER, REASON, RUNS
 from sweeps.found import Runs
-from sweeps.storage import load_study, open_storage
+from sweeps.storage import load_study, open_storage, study_names
+from tests.commands import SMALL, short
 from tests.sweeps.servers import mlflow_server, new_database, postgres
 
 pytestmark = pytest.mark.servers
@@ -162,4 +165,70 @@ def test_no_password_is_written_into_a_run(servers: Servers, tmp_path: Path) -> 
     assert servers.password not in str(tracker.links())
 
 
-# Searches with several drivers on `database` and `servers`, one of them killed, belong here.
+def search_command(servers: Servers, data: Path, runs: Path) -> list[str]:
+    """A search of two objectives whose trials take seconds; the folder of runs is shared."""
+    return [
+        *(sys.executable, "-m", "rgbt.run", "-m", "+search=grbm", *SMALL, *short(2)),
+        *("dataset=mfnet", f"dataset.root={data}", f"runs_dir={runs}"),
+        *("masker.patch_size=32", f"tracking.uri={servers.mlflow}"),
+        *(f"hydra.sweeper.storage={servers.database}", "hydra.sweeper.study=shared-search"),
+        *("hydra.sweeper.trials=10", "hydra.sweeper.wait=true"),
+    ]
+
+
+def test_a_search_on_four_drivers_survives_the_death_of_one(
+    servers: Servers, data: Path, tmp_path: Path
+) -> None:
+    runs = tmp_path / "runs"
+    command = search_command(servers, data, runs)
+    drivers = []
+    for index in range(4):
+        with (tmp_path / f"driver{index}.log").open("w") as log:
+            drivers.append(subprocess.Popen(command, stdout=log, stderr=log))
+    storage = open_storage(servers.database, tmp_path)
+    victim = drivers[2]
+    while True:
+        assert all(driver.poll() is None for driver in drivers), log_of(tmp_path)
+        time.sleep(0.2)
+        owners = [
+            trial.user_attrs.get(OWNER, "")
+            for trial in (load_study("shared-search", storage).trials if names(storage) else ())
+            if trial.state.name == "RUNNING" and KEY in trial.user_attrs
+        ]
+        if any(f":{victim.pid}:" in owner for owner in owners):
+            break
+    victim.kill()
+    for driver in drivers:
+        code = driver.wait(timeout=300)
+        assert code == (-9 if driver is victim else 0), log_of(tmp_path)
+
+    trials = load_study("shared-search", storage).trials
+    counted = [trial for trial in trials if not trial.user_attrs.get(DROPPED)]
+    assert len(counted) == 10
+    assert {trial.state.name for trial in counted} == {"COMPLETE"}
+    assert all(trial.state.is_finished() for trial in trials)
+    dropped = [trial for trial in trials if trial.user_attrs.get(DROPPED)]
+    assert any("driver was gone" in trial.user_attrs[REASON] for trial in dropped)
+    # Every run was finished once, and MLflow knows each of them once.
+    keys = [key for trial in counted for key in trial.user_attrs[RUNS]]
+    assert len(set(keys)) == 10
+    assert {path.parent.name for path in runs.glob("*/result.json")} == set(keys)
+    client = MlflowClient(tracking_uri=servers.mlflow)
+    found = client.search_runs(
+        [client.get_experiment_by_name("rgbt").experiment_id],
+        "attributes.status = 'FINISHED' and tags.`rgbt.key` != ''",
+        max_results=100,
+    )
+    made = [run.data.tags["rgbt.key"] for run in found]
+    assert sorted(key for key in made if key in keys) == sorted(keys)
+    # The addresses that the runs and the reports keep hold no password.
+    for path in runs.rglob("*"):
+        assert path.is_dir() or servers.password.encode() not in path.read_bytes(), path
+
+
+def names(storage: object) -> list[str]:
+    return [name for name in study_names(storage) if name == "shared-search"]
+
+
+def log_of(folder: Path) -> str:
+    return "\n".join(path.read_text()[-3000:] for path in sorted(folder.glob("driver*.log")))

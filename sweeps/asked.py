@@ -1,0 +1,150 @@
+"""What the arguments of ``python -m sweeps.reproduce`` ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, check_choice, nearest
+from rgbt.command import composing, readable_paths
+from rgbt.config import check_node
+
+if TYPE_CHECKING:
+    from sweeps.cell_points import Wanted
+    from sweeps.found import Runs
+    from sweeps.lists import PointList
+    from sweeps.settings import Settings
+
+Arguments = Mapping[str, str]
+"""Values by key, as typed."""
+
+OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out")
+"""Arguments that are no settings of execution."""
+
+WORDS = ("storage", "retry", "executor")
+"""Settings that are text."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a table's runs and files lie.
+
+    Attributes:
+        runs_dir: the folder of runs.
+        out: folder of the table's files; None: ``tables/<table>_<scale>`` inside `runs_dir`.
+        tracker: overrides of the tracker.
+    """
+
+    runs_dir: Path
+    out: Path | None
+    tracker: tuple[str, ...] = ()
+
+    @property
+    def base(self) -> tuple[str, ...]:
+        """Overrides that every run has, whatever row it belongs to."""
+        return (*readable_paths([f"runs_dir={self.runs_dir}"]), *self.tracker)
+
+    def folder(self, wanted: Wanted) -> Path:
+        """Where the files go."""
+        return self.out or self.runs_dir / "tables" / f"{wanted.name}_{wanted.scale}"
+
+
+def settings_of(arguments: Arguments) -> Settings:
+    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
+
+    Raises:
+        InputError: a value of a wrong type.
+    """
+    from omegaconf import DictConfig, OmegaConf
+
+    from rgbt.config import conf_dir
+    from sweeps.settings import read_settings
+
+    node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
+    assert isinstance(node, DictConfig), "the file is a mapping"
+    for key, text in arguments.items():
+        if key not in OF_THE_TABLE:
+            node[key] = _parsed(key, text)
+    try:
+        return read_settings(node)
+    except InputError as error:
+        raise InputError(str(error).replace("hydra.sweeper.", "")) from error
+
+
+def _parsed(key: str, text: str) -> Any:
+    """A value as Hydra reads it."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    if key in WORDS:
+        return None if text in ("null", "") else text
+    try:
+        return OverridesParser.create().parse_override(f"{key}={text}").value()
+    except HydraException as error:
+        raise InputError(f"{key}={text}: cannot be read as a value.") from error
+
+
+def place_of(arguments: Arguments, overrides: Sequence[str]) -> tuple[Place, tuple[str, ...]]:
+    """Where everything lies, and the overrides of the rows.
+
+    Raises:
+        InputError: an override that belongs to the rows of the table.
+    """
+    for word in overrides:
+        key = word.lstrip("+~").partition("=")[0]
+        if key in ("seed", "experiment"):
+            other = "seeds=3" if key == "seed" else "another table"
+            raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
+        if word.startswith("-"):
+            raise InputError(f"'{word}' is no key=value; {nearest(word, arguments)}.")
+    tracker = tuple(word for word in overrides if word.lstrip("+~").startswith("tracking"))
+    rest = tuple(word for word in overrides if word not in tracker)
+    out = Path(arguments["out"]) if arguments["out"] else None
+    return Place(Path(arguments["runs_dir"]), out, tracker), rest
+
+
+def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted:
+    """The table called `name` at the scale and with the seeds that were given.
+
+    Raises:
+        InputError: no such table, scale or metric; no seeds.
+    """
+    from rgbt.config import conf_dir
+    from sweeps.cell_points import Wanted, seeds_of
+    from sweeps.scoring import check_metrics
+    from sweeps.table import load_table
+
+    scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
+    check_choice("scale", arguments["scale"], scales)
+    table = load_table(name)
+    if name.endswith((".yaml", ".yml")):
+        name = f"{table.paper}/{Path(name).stem}"
+    check_metrics(table, (row for row in table.rows if table.runnable(row)))
+    return Wanted(name, table, arguments["scale"], seeds_of(arguments["seeds"]), extra)
+
+
+def runs_of(place: Place) -> Runs:
+    """Where finished runs are found, as the overrides of the tracker say."""
+    from rgbt.config import build, compose
+    from sweeps.found import Runs
+
+    with composing(place.base):
+        config = compose(place.base)
+        check_node(config.tracking, "tracking")
+    return Runs(place.runs_dir.expanduser().resolve(), build(config.tracking))
+
+
+def point_list(wanted: Wanted, place: Place, runs: Runs) -> PointList:
+    """The runs of a table, as the driver takes them."""
+    from sweeps.lists import PointList
+
+    return PointList(
+        study=f"table/{wanted.name}",
+        title=f"{wanted.name} scale={wanted.scale}",
+        kind="list",
+        points=tuple(wanted.points()),
+        runs=runs,
+        base=place.base,
+    )

@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import lists, table_results
+from sweeps.asked import OF_THE_TABLE, settings_of
+from sweeps.lists import Outcome, PointList
+from sweeps.points import Point
+from sweeps.preview import duration
+from sweeps.reproduce import OWN, entry
+from sweeps.settings import EXECUTION, Settings
+from tests.commands import Call, assert_one_sentence
+from tests.sweeps.tabled import FakeFound, right
+
+OWN_TABLE = """\
+paper: my
+number: small
+caption: rows of a test
+data: nothing
+columns:
+  - {name: acc, metric: pixel_accuracy}
+rows:
+  - {label: one, experiment: grbm, overrides: [masker.sigma_div=1], values: {acc: 60.5}}
+  - {label: two, experiment: grbm, overrides: [masker.sigma_div=2], values: {acc: 61.5}}
+  - {label: later, experiment: grbm, needs: flow, values: {acc: 62.0}}
+"""
+
+Asked = list[tuple[PointList, Settings]]
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tables" / "my").mkdir(parents=True)
+    (tmp_path / "tables" / "my" / "small.yaml").write_text(OWN_TABLE)
+    return tmp_path
+
+
+@pytest.fixture
+def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
+    """Put a driver in place that tells `states` in turn instead of running anything."""
+
+    def drive(*states: str) -> Asked:
+        asked: Asked = []
+
+        def work(wanted: PointList, settings: Settings) -> Sequence[Outcome]:
+            asked.append((wanted, settings))
+            turns = [states[index % len(states)] for index in range(len(wanted.points))]
+            return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
+
+        monkeypatch.setattr(lists, "work_off", work)
+        monkeypatch.setattr(lists, "survey", work)
+        return asked
+
+    return drive
+
+
+def _outcome(point: Point, state: str, index: int) -> Outcome:
+    found: Any = FakeFound(f"k{index}", {None: right(40 + index)})
+    if state == "finished":
+        return Outcome(point, "finished", found=(found,), keys=(f"k{index}",))
+    return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]
+
+
+def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) -> None:
+    asked = driven("finished")
+    words = ("table=my/small", "seeds=2", "workers=2", "tracking=none", "dataset.root=/x")
+    code, out, err = call(entry, *words)
+    assert (code, err) == (0, "")
+    (wanted, settings), *others = asked
+    assert not others
+    assert wanted.study == "table/my/small"
+    assert wanted.base == ("runs_dir=runs", "tracking=none")
+    assert isinstance(wanted.runs.tracking, NoTracking)
+    assert [point.overrides for point in wanted.points][:2] == [
+        ("+experiment=grbm", "masker.sigma_div=1", "dataset.root=/x", "seed=0"),
+        ("+experiment=grbm", "masker.sigma_div=2", "dataset.root=/x", "seed=0"),
+    ]
+    assert (settings.workers, settings.retry, settings.dry_run) == (2, "none", False)
+    folder = place / "runs" / "tables" / "my" / "small_demo"
+    assert "one" in out
+    assert "41.00 ± 1.41" in out  # 40 and 42
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("figure.png", "table.csv", "table.md", "table.tex"),
+    ]
+    rows = list(csv.DictReader((folder / "table.csv").open()))
+    assert [row["mean"] for row in rows] == ["41.0", "42.0", ""]
+    assert rows[2]["reason"] == "flow"
+
+
+def test_a_table_given_as_a_file_goes_by_paper_and_name(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    asked = driven("finished")
+    path = place / "elsewhere" / "mine.yaml"
+    path.parent.mkdir()
+    path.write_text(OWN_TABLE)
+    assert call(entry, f"table={path}", "tracking=none")[0] == 0
+    assert asked[0][0].study == "table/my/mine"
+    assert (place / "runs/tables/my/mine_demo/table.md").exists()
+
+
+def test_a_failed_cell_is_told_and_the_table_still_comes(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    driven("finished", "failed")
+    code, out, err = call(entry, "table=my/small", "tracking=none", "out=here")
+    assert code == 1
+    assert "[1] seed 0: it broke." in out
+    assert_one_sentence(err, "1 of 2 runs failed")
+    assert "failed" in (place / "here" / "table.md").read_text()
+
+
+def test_cells_of_other_drivers_are_no_failure(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    driven("finished", "running")
+    code, out, err = call(entry, "table=my/small", "tracking=none")
+    assert code == 0
+    assert "running" in out
+    assert_one_sentence(err, "wait=true")
+
+
+def test_a_disk_that_is_full_costs_the_files_but_not_the_table(
+    call: Call, place: Path, driven: Callable[..., Asked], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    driven("finished")
+    monkeypatch.setattr(table_results, "write_atomic", full)
+    code, out, err = call(entry, "table=my/small", "tracking=none")
+    assert code == 1
+    assert "40.00" in out
+    assert_one_sentence(err, "No space left on device; the files were not written")
+
+
+def test_a_table_that_cannot_be_run_shows_what_is_printed(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    asked = driven("finished")
+    code, out, _ = call(entry, "table=multihead/table5", "tracking=none")
+    assert (code, asked) == (0, [])
+    assert "Cannot be run yet: " in out
+    assert (place / "runs/tables/multihead/table5_demo/table.md").exists()
+
+
+def test_dry_run_lists_the_cells_and_writes_nothing(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    driven("waiting", "failed")
+    code, out, err = call(entry, "table=my/small", "seeds=1", "dry_run=true", "tracking=none")
+    assert (code, err) == (0, "")
+    assert [line.split()[:3] for line in out.splitlines() if "seed=" in line] == [
+        ["one", "seed=0", "waiting"],
+        ["two", "seed=0", "failed"],
+    ]
+    assert "it broke" in out
+    assert "2 runs: 1 failed, 1 waiting." in out
+    assert "Row 'later' cannot be run yet; it needs flow." in out
+    assert not (place / "runs").exists()
+
+
+def test_all_tables_are_listed_and_only_listed(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    driven("waiting")
+    code, out, _ = call(entry, "table=all", "dry_run=true", "tracking=none")
+    assert code == 0
+    shown = {line.split()[0]: line.split()[1:4] for line in out.splitlines() if "/" in line}
+    assert shown["my/small"] == ["2", "of", "3"]
+    assert shown["spatialseg/table3"] == ["7", "of", "7"]
+    code, _, err = call(entry, "table=all", "tracking=none")
+    assert code == 2
+    assert_one_sentence(err, "dry_run=true")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("table=my/smal",), "did you mean 'my/small'"),
+        (("table=my/small", "scale=papr"), "did you mean 'paper'"),
+        (("table=my/small", "seeds=x"), "how many"),
+        (("table=my/small", "workers=0"), "workers must be at least 1"),
+        (("table=my/small", "workers=two"), "'workers'"),
+        (("table=my/small", "retry=all"), "'retry'"),
+        (("table=my/small", "seed=1"), "choose seeds=3"),
+        (("table=my/small", "+experiment=crm"), "choose another table"),
+        (("table=my/small", "tracking=mlfow"), "did you mean 'mlflow'"),
+        ((), "'table' has no value"),
+    ],
+)
+def test_mistakes_cost_one_sentence(
+    call: Call, place: Path, driven: Callable[..., Asked], words: tuple[str, ...], sentence: str
+) -> None:
+    asked = driven("finished")
+    code, _, err = call(entry, *words)
+    assert (code, asked) == (2, [])
+    assert_one_sentence(err, sentence)
+
+
+def test_every_key_of_execution_is_a_key_of_the_command() -> None:
+    assert set(OWN) - set(OF_THE_TABLE) == set(EXECUTION)
+
+
+def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() -> None:
+    given = {key: value for key, value in OWN.items() if value is not None}
+    plain = settings_of(given)
+    assert (plain.workers, plain.storage, plain.gpus, plain.submitit) == (1, None, None, {})
+    url = "postgresql://me@host/db?a=b"
+    options = {"storage": url, "gpus": "[0,1]", "executor": "submitit"}
+    asked = settings_of(given | options | {"submitit": "{cluster: slurm, timeout_min: 9}"})
+    assert (asked.storage, asked.gpus) == (url, (0, 1))
+    assert asked.submitit == {"cluster": "slurm", "timeout_min": 9}
+    with pytest.raises(InputError, match="gpus="):
+        settings_of(given | {"gpus": "[0"})
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(None, "unknown"), (40.4, "40 s"), (150.0, "2 min"), (7500.0, "2 h 05 min")],
+)
+def test_duration(seconds: float | None, words: str) -> None:
+    assert duration(seconds) == words
