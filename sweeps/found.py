@@ -185,6 +185,8 @@ class Runs:
 def _fetch(tracking: MlflowTracking, wanted: tuple[str, str], copy: Path) -> Found | None:
     """Copy what MLflow holds of a finished run; None where it does not know it."""
     key, dataset = wanted
+    if not is_there(tracking):
+        return None
     store = tracking.store()
     query = (
         f"attributes.status = 'FINISHED' and tags.`rgbt.key` = '{key}' "
@@ -203,6 +205,12 @@ def _fetch(tracking: MlflowTracking, wanted: tuple[str, str], copy: Path) -> Fou
     # Written last: without it the copy is not whole and is made again.
     (copy / "run_id").write_text(run_id)
     return Found(key, copy, run_id)
+
+
+def is_there(tracking: MlflowTracking) -> bool:
+    """Whether the store exists; opening a file of SQLite would make it."""
+    scheme, _, path = tracking.uri.partition(":///")
+    return scheme != "sqlite" or Path(path).exists()
 
 
 def _holds(client: Any, run_id: str, name: str) -> bool:

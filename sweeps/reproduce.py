@@ -23,7 +23,7 @@ OWN = {
     "retry": "none",
     "retries": "0",
     "dry_run": "false",
-    "wait": "false",
+    "wait": "true",
     "storage": "null",
     "gpus": "null",
     "threads": "null",
@@ -45,7 +45,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     retry     failed: try again what failed in an earlier call; retries: how often in this one
     workers   runs at a time; gpus=[0,1] gives each worker one, threads shares the cores out
     storage   where machines agree on who runs what: file.journal, postgresql://user@host/name
-    wait      true: stay until the cells that other commands run are done too
+    wait      false: leave cells to the commands that run them, do not stay until they are done
     timeout_minutes, max_failures, executor, submitit as in conf/hydra/sweeper/study.yaml
     out       folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder of runs
     overrides of every row: dataset.root=/data/MFNet tracking.uri=http://host:5000

@@ -77,8 +77,8 @@ class Settings:
             raise InputError("submitit={...} are options of executor=submitit; add that.")
         if self.executor == "submitit" and self.timeout_minutes is not None:
             raise InputError(
-                "timeout_minutes would count the time in the queue too; with executor=submitit give "
-                "submitit={timeout_min: ...}."
+                "timeout_minutes would count the time in the queue too; with executor=submitit "
+                "give submitit={timeout_min: ...}."
             )
         if not self.objectives:
             raise InputError("objectives: expected at least one, such as val/mIoU.")

@@ -1,0 +1,462 @@
+"""Stand-ins for everything that trains: plans, runs, processes, a driver of them and its view."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rgbt.metrics.counts import Counts
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import driver as drivers
+from sweeps import sources
+from sweeps.driver import Driver
+from sweeps.found import Runs
+from sweeps.ledger import Ledger
+from sweeps.owner import Owner
+from sweeps.plan import Plan, PlannedRun
+from sweeps.points import Point
+from sweeps.settings import Objective, Settings
+from sweeps.sources import ListSource, SearchSource
+from sweeps.space import parse_space
+from sweeps.storage import begin_study
+from sweeps.work import Work
+
+DATASET = "fingerprint-of-the-data"
+DEADLINE_S = 60.0
+"""Generous: the machine may be busy. Nothing waits for it but a test that fails."""
+
+DEAD = Owner("elsewhere", 1, "1")
+"""A driver on another machine."""
+
+
+def settings(**changes: Any) -> Settings:
+    """Settings of a sweep, as in study.yaml but for `changes`."""
+    plain: dict[str, Any] = {
+        "storage": None,
+        "workers": 1,
+        "gpus": None,
+        "threads": 1,
+        "executor": "local",
+        "submitit": {},
+        "retries": 0,
+        "retry": "none",
+        "timeout_minutes": None,
+        "max_failures": None,
+        "wait": False,
+        "dry_run": False,
+        "study": None,
+        "params": {},
+        "points": (),
+        "space": {},
+        "objectives": (Objective("test/mIoU", "maximize"),),
+        "sampler": {"kind": "random", "seed": 0},
+        "pruner": None,
+        "trials": None,
+        "hours": None,
+        "replicates": 1,
+    }
+    return Settings(**{**plain, **changes})
+
+
+def key_of(overrides: Sequence[str]) -> str:
+    """Stands for the config key."""
+    return hashlib.sha256("\n".join(overrides).encode()).hexdigest()[:12]
+
+
+def plan_of(point: Point, steps: int = 4) -> Plan:
+    """What `Planner.plan` makes, without a configuration."""
+    runs = tuple(PlannedRun(key_of(words), DATASET, words, steps) for words in point.runs())
+    whole = [word for words in point.runs() for word in words] + [str(point.evaluations)]
+    is_one = len(runs) == 1 and not point.evaluations
+    return Plan(point, runs[0].key if is_one else key_of(whole), runs)
+
+
+def plans(count: int, **point: Any) -> list[Plan]:
+    """Plans of that many points: x=0, x=1, ..."""
+    return [plan_of(Point(f"x={x}", (f"x={x}",), {"x": x}, **point)) for x in range(count)]
+
+
+class FakePlanner:
+    """Stands for `Planner`."""
+
+    def plan(self, point: Point) -> Plan:
+        return plan_of(point)
+
+
+def counts(right: int = 3, dataset: str = DATASET) -> Counts:
+    """One image of one region and two classes."""
+    return Counts(
+        counts=np.array([[[[right, 1], [0, 4]]]]),
+        names=("00001D",),
+        night=None,
+        classes=("road", "car"),
+        partition="ring1",
+        dataset=dataset,
+        split="test",
+    )
+
+
+def finish(
+    folder: Path,
+    *,
+    test: Mapping[str, float | None] | None = None,
+    val: Mapping[str, float | None] | None = None,
+    dataset: str = DATASET,
+    tags: Mapping[str, str] | None = None,
+) -> RunFolder:
+    """Write what a finished run leaves."""
+    run = RunFolder(folder)
+    run.describe(Description(f"fake {folder.name}", {"rgbt.key": folder.name, **(tags or {})}, {}))
+    counts(dataset=dataset).save(run.counts_path("test"))
+    run.finish(
+        {
+            "name": f"fake {folder.name}",
+            "key": folder.name,
+            "dataset": dataset,
+            "steps": 4,
+            "best_step": 4,
+            "seconds_of_last_process": 2.5,
+            "val": {"mIoU": 0.5} if val is None else dict(val),
+            "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
+        }
+    )
+    return run
+
+
+@dataclass
+class Call:
+    """A process that was asked for.
+
+    Attributes:
+        words: its overrides or arguments.
+        folder: of the run that it trains.
+    """
+
+    module: str
+    words: tuple[str, ...]
+    environment: dict[str, str]
+    log: Path
+    folder: Path
+    attempt: int
+    stops: int = 0
+
+    def value(self, name: str) -> str:
+        (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
+        return found
+
+    def say(self, text: str) -> None:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as file:
+            file.write(text + "\n")
+
+
+Process = Generator[None, None, int]
+Behaviour = Callable[[Call], Process]
+
+
+def succeed(call: Call) -> Process:
+    """A run of two validations."""
+    run = RunFolder(call.folder)
+    for step in (2, 4):
+        yield
+        run.append(step, "val", {"mIoU": step / 10})
+    finish(call.folder)
+    return 0
+
+
+def fail(call: Call) -> Process:
+    yield
+    call.say("Traceback (most recent call last):\n  File x\nValueError: a bad day")
+    return 1
+
+
+def hang(call: Call) -> Process:
+    """Runs until it is stopped."""
+    RunFolder(call.folder)
+    while True:
+        yield
+
+
+def leave(code: int) -> Behaviour:
+    """Ends at once, says and writes nothing."""
+
+    def process(call: Call) -> Process:
+        yield
+        return code
+
+    return process
+
+
+def first(*behaviours: Behaviour) -> Behaviour:
+    """The n-th process of a run behaves as the n-th says; later ones as the last."""
+    return lambda call: behaviours[min(call.attempt, len(behaviours) - 1)](call)
+
+
+def only(word: str, behaviour: Behaviour, others: Behaviour = succeed) -> Behaviour:
+    """Runs with that override behave so, the others otherwise."""
+    return lambda call: behaviour(call) if word in call.words else others(call)
+
+
+class FakeJob:
+    """Goes one step further with every look at it."""
+
+    def __init__(self, call: Call, process: Process) -> None:
+        self.call = call
+        self._process = process
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        if self._code is None and self.call.stops:
+            self._code = -15
+        if self._code is None:
+            try:
+                next(self._process)
+            except StopIteration as end:
+                self._code = end.value
+        return self._code
+
+    def stop(self) -> None:
+        self.call.stops += 1
+
+
+class FakeExecutor:
+    """Makes fake processes.
+
+    Attributes:
+        calls: all that were asked for, in order.
+    """
+
+    def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed) -> None:
+        self.runs_dir = runs_dir
+        self.behaviour = behaviour
+        self.calls: list[Call] = []
+        self.jobs: list[FakeJob] = []
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> FakeJob:
+        module, *words = command
+        folder = self.runs_dir / key_of(words)
+        attempt = sum(call.words == tuple(words) for call in self.calls)
+        call = Call(module, tuple(words), dict(environment), log, folder, attempt)
+        self.calls.append(call)
+        self.jobs.append(FakeJob(call, self.behaviour(call)))
+        return self.jobs[-1]
+
+    def started(self) -> list[tuple[str, ...]]:
+        return [call.words for call in self.calls]
+
+    def running(self) -> list[FakeJob]:
+        return [job for job in self.jobs if job.poll() is None]
+
+
+class FakeView:
+    """Notes what it is told.
+
+    Args:
+        look: called at every update with the works.
+    """
+
+    def __init__(self, look: Callable[[Sequence[Work]], None] | None = None) -> None:
+        self.begun: list[str] = []
+        self.ends: list[tuple[str, str, str]] = []
+        self.refusals: list[tuple[str, str]] = []
+        self._look = look
+
+    def began(self, work: Work) -> None:
+        self.begun.append(work.plan.point.label)
+
+    def ended(self, work: Work, how: str, reason: str) -> None:
+        self.ends.append((work.plan.point.label, how, reason))
+
+    def refused(self, label: str, reason: str) -> None:
+        self.refusals.append((label, reason))
+
+    def update(self, works: Sequence[Work]) -> None:
+        if self._look is not None:
+            self._look(works)
+
+
+def interrupt_when(condition: Callable[[Sequence[Work]], bool]) -> FakeView:
+    """A view that stands for a person who presses Ctrl-C."""
+
+    def look(works: Sequence[Work]) -> None:
+        if condition(works):
+            raise KeyboardInterrupt
+
+    return FakeView(look)
+
+
+@dataclass
+class Desk:
+    """A driver with all that it needs.
+
+    Attributes:
+        storage: of Optuna, opened by this driver.
+        plans: of a list; [] for a search.
+    """
+
+    driver: Driver
+    ledger: Ledger
+    executor: FakeExecutor
+    runs: Runs
+    view: FakeView
+    storage: Any
+    plans: list[Plan] = field(default_factory=list)
+
+    def run(self) -> Desk:
+        self.driver.run()
+        return self
+
+    def states(self) -> dict[str, list[str]]:
+        """States of trials that count, by label of the point."""
+        found: dict[str, list[str]] = {}
+        for trial in self.ledger.trials():
+            found.setdefault(trial.user_attrs["rgbt.label"], []).append(trial.state.name)
+        return found
+
+    def numbers(self, state: str) -> list[int]:
+        return [trial.number for trial in self.ledger.trials() if trial.state.name == state]
+
+
+def memory() -> Any:
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna.storages.InMemoryStorage()
+
+
+def ledger_on(
+    storage: Any, me: Owner | None = None, wanted: Settings | None = None, **study: Any
+) -> Ledger:
+    """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
+    wanted = wanted or settings()
+    began = begin_study("study", storage, wanted.objectives, {}, **study)
+    return Ledger(began, storage, me or Owner.me())
+
+
+def list_desk(
+    runs_dir: Path,
+    points: list[Plan],
+    behaviour: Behaviour = succeed,
+    *,
+    storage: Any = None,
+    view: FakeView | None = None,
+    me: Owner | None = None,
+    **changes: Any,
+) -> Desk:
+    """A driver of a list of points."""
+    wanted = settings(**changes)
+    storage = memory() if storage is None else storage
+    ledger = ledger_on(storage, me, wanted)
+    runs = Runs(runs_dir, NoTracking())
+    source = ListSource(points, ledger, runs, wanted, {})
+    return _desk(ledger, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
+
+
+def search_desk(
+    runs_dir: Path,
+    behaviour: Behaviour = succeed,
+    *,
+    space: Mapping[str, Any] | None = None,
+    storage: Any = None,
+    view: FakeView | None = None,
+    me: Owner | None = None,
+    planner: Any = None,
+    pruner: Any = None,
+    **changes: Any,
+) -> Desk:
+    """A driver of a search over x in 0..1, or over `space`."""
+    from sweeps.samplers import build_sampler
+
+    wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
+    storage = memory() if storage is None else storage
+    sampler = build_sampler("random", 0, {}, len(wanted.objectives))
+    ledger = ledger_on(storage, me, wanted, sampler=sampler, pruner=pruner)
+    runs = Runs(runs_dir, NoTracking())
+    parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
+    view = view or FakeView()
+    source = SearchSource(
+        (), parameters, ledger, planner or FakePlanner(), wanted, view.refused
+    )
+    return _desk(ledger, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
+
+
+def _desk(
+    ledger: Ledger,
+    source: Any,
+    runs: Runs,
+    executor: FakeExecutor,
+    wanted: Settings,
+    view: FakeView | None,
+    storage: Any,
+) -> Desk:
+    view = view or FakeView()
+    metrics = [objective.metric for objective in wanted.objectives]
+    seen: Any = view
+    driver = Driver(ledger, source, runs, executor, wanted, seen, metrics)
+    of_list = list(source.plans.values()) if isinstance(source, ListSource) else []
+    return Desk(driver, ledger, executor, runs, view, storage, of_list)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drivers that look again at once."""
+    monkeypatch.setattr(drivers, "POLL_S", 0.001)
+    monkeypatch.setattr(drivers, "LOOK_S", 0.002)
+    monkeypatch.setattr(sources, "PAUSE_S", 0.002)
+
+
+def until(condition: Callable[[], Any], what: str) -> Any:
+    """What `condition` answers once it is true; fails after `DEADLINE_S`."""
+    end = time.monotonic() + DEADLINE_S
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.01)
+    raise AssertionError(f"waited {DEADLINE_S:g} s in vain for {what}")
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from rgbt.tracking.files import holding
+with holding(Path(sys.argv[1])) as holder:
+    assert holder is None, holder
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@contextmanager
+def held_by_another(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process of its own that trains in `folder`, as far as its lock tells; a line ends it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder / "lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def let_go(process: subprocess.Popen[str]) -> None:
+    """End a process of `held_by_another` in order."""
+    process.communicate("\n")
