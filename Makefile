@@ -1,6 +1,7 @@
 # make demo       install, train GRBM on the embedded data set, print the per-region table
 # make test       install, lint-free default test suite (offline, two cores, minutes)
 # make test-all   the slow tests as well
+# make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
 # make lint       formatting, lint, types
 # make bench      benchmarks, as ratios measured in one run
 
@@ -8,16 +9,23 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all lint bench
+.PHONY: demo test test-all test-servers lint bench
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
 
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest -m "not slow and not benchmark"
+	$(BIN)/python -m pytest -m "not slow and not benchmark and not servers"
 
 test-all: $(VENV)/.ready
-	$(BIN)/python -m pytest -m "not benchmark"
+	$(BIN)/python -m pytest -m "not benchmark and not servers"
+
+test-servers: $(VENV)/.ready
+	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || command -v initdb >/dev/null || { \
+	  echo "PostgreSQL is missing; installing the Debian package"; \
+	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq --no-install-recommends postgresql; \
+	  else sudo apt-get update -qq && sudo apt-get install -y -qq --no-install-recommends postgresql; fi; }
+	$(BIN)/python -m pytest -m servers
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 from pathlib import Path
 
 from rgbt.tracking.folder import MetricLine, metric_line
+
+FULL = 1_000_000
+"""Bytes; a disk with less is full."""
 
 OUT_OF_MEMORY = "the system kills what takes too much memory"
 
@@ -55,7 +59,10 @@ def why(code: int, log: Path, start: int) -> str:
     """
     said = _last_words(log, start)
     if code >= 0:
-        return said or f"it left with exit code {code} and said nothing; see {log}"
+        # What it said went to a file on the disk that may be the reason.
+        is_full = shutil.disk_usage(log.parent).free < FULL
+        unsaid = f"the disk of {log.parent} is full" if is_full else f"see {log}"
+        return said or f"it left with exit code {code} and said nothing; {unsaid}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     hint = f" ({OUT_OF_MEMORY})" if name == "SIGKILL" else ""
     return f"stopped by {name}{hint}"

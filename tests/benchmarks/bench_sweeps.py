@@ -1,0 +1,136 @@
+"""What the sweeper costs and saves: seconds per point, two workers against one, pruning.
+
+All parts train CMX's tiny network on the embedded data, one thread a run, in a folder of their own:
+
+* overhead: wall seconds of a point minus those between the first line of its training and its
+  result, of the sweeper and of the plain command called in a loop;
+* workers: wall seconds of the same grid with one worker and with two;
+* pruning: the same search with and without a median pruner, equal trials and sampler seed: training
+  steps done and the best value.
+
+Run: python -m tests.benchmarks.bench_sweeps [overhead] [workers] [pruning]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from sweeps import attributes as names
+from sweeps.storage import load_study, open_storage, study_names
+
+POINTS = 6
+TRIALS = 16
+SHORT = ("trainer.max_steps=8", "trainer.eval_every=8")
+GRID = ("trainer.max_steps=60", "trainer.eval_every=60")
+SEARCH = ("trainer.max_steps=120", "trainer.eval_every=20")
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def call(*words: str) -> float:
+    """Wall seconds of a command."""
+    began = time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-m", "rgbt.run", *words],
+        env=ENVIRONMENT,
+        check=True,
+        capture_output=True,
+    )
+    return time.perf_counter() - began
+
+
+def inside(run: Path) -> float:
+    """Seconds of training and evaluation of a run."""
+    return float(json.loads((run / "result.json").read_text())["seconds_of_last_process"])
+
+
+def trials_of(runs: Path) -> list:
+    storage = open_storage(None, runs)
+    (name,) = study_names(storage)
+    return [t for t in load_study(name, storage).trials if not t.user_attrs.get(names.DROPPED)]
+
+
+def overhead(place: Path) -> None:
+    words = ("+experiment=cmx", *SHORT, "trainer.threads=1")
+    call(*words, f"runs_dir={place / 'warm'}")
+    plain = []
+    for seed in range(3):
+        wall = call(*words, f"seed={seed}", f"runs_dir={place / 'loop'}")
+        newest = max((place / "loop").glob("*/result.json"), key=lambda path: path.stat().st_mtime)
+        plain.append(wall - inside(newest.parent))
+    seeds = ",".join(map(str, range(POINTS)))
+    sweep = place / "sweep"
+    wall = call("-m", *words, f"seed={seeds}", f"runs_dir={sweep}", "hydra.sweeper.workers=1")
+    each = []
+    for trial in trials_of(sweep):
+        (key,) = trial.user_attrs[names.RUNS]
+        each.append(trial.user_attrs[names.SECONDS] - inside(sweep / key))
+    again = call("-m", *words, f"seed={seeds}", f"runs_dir={sweep}", "hydra.sweeper.workers=1")
+    trained = sum(inside(path.parent) for path in sweep.glob("*/result.json"))
+    print(f"plain command in a loop: {statistics.median(plain):.2f} s beside training, per point")
+    print(
+        f"sweeper: first point {each[0]:.2f} s, then median {statistics.median(each[1:]):.2f} s "
+        f"(max {max(each[1:]):.2f}); whole grid {wall:.1f} s for {trained:.1f} s of training"
+    )
+    print(f"the same command again, everything known: {again:.1f} s for {POINTS} points")
+
+
+def workers(place: Path) -> None:
+    words = ("-m", "+experiment=cmx", *GRID, "seed=0,1,2,3")
+    walls = {}
+    for count in (1, 2):
+        one = f"hydra.sweeper.workers={count}"
+        threads = "hydra.sweeper.threads=1"
+        walls[count] = call(*words, one, threads, f"runs_dir={place / f'workers{count}'}")
+    print(
+        f"4 points, one thread each: 1 worker {walls[1]:.1f} s, 2 workers {walls[2]:.1f} s: "
+        f"{walls[1] / walls[2]:.2f}x"
+    )
+
+
+def pruning(place: Path) -> None:
+    found = {}
+    for name, pruner in (
+        ("none", "null"),
+        ("median", "{kind:median,n_startup_trials:4,n_warmup_steps:20}"),
+    ):
+        runs = place / name
+        wall = call(
+            *("-m", "+experiment=cmx", *SEARCH, f"runs_dir={runs}"),
+            "optimizer.lr=tag(log, interval(0.00003, 0.1))",
+            *(f"hydra.sweeper.trials={TRIALS}", "hydra.sweeper.workers=2"),
+            f"hydra.sweeper.pruner={pruner}",
+        )
+        trials = trials_of(runs)
+        steps = sum(
+            max(trial.intermediate_values, default=0)
+            for trial in trials
+            if trial.state.name in ("COMPLETE", "PRUNED")
+        )
+        best = max(trial.value for trial in trials if trial.state.name == "COMPLETE")
+        pruned = sum(trial.state.name == "PRUNED" for trial in trials)
+        found[name] = steps
+        print(
+            f"pruner {name}: {len(trials)} trials, {pruned} pruned, {steps} steps, "
+            f"best val mIoU {best:.2f}, {wall:.0f} s"
+        )
+    print(f"steps saved: {100 * (1 - found['median'] / found['none']):.0f} %")
+
+
+PARTS = {"overhead": overhead, "workers": workers, "pruning": pruning}
+
+
+def main() -> None:
+    for name in sys.argv[1:] or PARTS:
+        with tempfile.TemporaryDirectory() as place:
+            PARTS[name](Path(place))
+
+
+if __name__ == "__main__":
+    main()

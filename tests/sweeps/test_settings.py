@@ -1,0 +1,131 @@
+"""Settings of a sweep: the file, the checks, what is left for the runs to resolve."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import conf_dir
+from sweeps.settings import EXECUTION, Objective, Settings, read_settings
+
+FILE = conf_dir() / "hydra" / "sweeper" / "study.yaml"
+
+
+@pytest.fixture(scope="module")
+def composed() -> DictConfig:
+    node = OmegaConf.load(FILE)
+    assert isinstance(node, DictConfig)
+    return node
+
+
+def changed(node: DictConfig, **values: Any) -> DictConfig:
+    changed_node = OmegaConf.create({**{str(key): node[key] for key in node}, **values})
+    assert isinstance(changed_node, DictConfig)
+    return changed_node
+
+
+def test_the_file_of_the_sweeper_holds_every_setting_and_no_other(composed: DictConfig) -> None:
+    keys = set(map(str, composed)) - {"_target_"}
+    assert keys == set(Settings.__dataclass_fields__)
+    assert set(EXECUTION) < keys
+    settings = read_settings(composed)
+    assert settings.objectives == (Objective("val/mIoU", "maximize"),)
+    assert (settings.workers, settings.replicates, settings.retries) == (1, 1, 0)
+    assert settings.points == ()
+    assert settings.pruner is None
+
+
+def test_every_setting_of_the_file_is_explained_or_says_itself_what_it_is() -> None:
+    lines = [line for line in FILE.read_text().splitlines() if line[:1].isalpha()]
+    silent = [line.partition(":")[0] for line in lines if "#" not in line]
+    assert silent in ([], ["sampler"])
+
+
+def test_values_are_taken_as_their_types(composed: DictConfig) -> None:
+    settings = read_settings(
+        changed(
+            composed,
+            workers=3,
+            gpus=[0, 1],
+            hours=8,
+            timeout_minutes=1.5,
+            objectives=[{"metric": "test/Var", "direction": "minimize"}],
+            points=[["a=1", "b=[2,3]"], ["a=4"]],
+        )
+    )
+    assert settings.workers == 3
+    assert settings.gpus == (0, 1)
+    assert (settings.hours, settings.timeout_minutes) == (8.0, 1.5)
+    assert settings.objectives == (Objective("test/Var", "minimize"),)
+    assert settings.points == (("a=1", "b=[2,3]"), ("a=4",))
+
+
+def test_interpolations_of_spaces_grids_and_points_are_left_to_the_runs(
+    composed: DictConfig,
+) -> None:
+    space = {"masker.patch_size": {"type": "categorical", "choices": ["${px:8}", "${px:64}"]}}
+    settings = read_settings(
+        changed(composed, space=space, params={"a": "${px:8},2"}, points=[["a=${px:8}"]])
+    )
+    assert settings.space == space
+    assert settings.params == {"a": "${px:8},2"}
+    assert settings.points == (("a=${px:8}",),)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"worker": 2}, "'hydra.sweeper.worker' is not a setting; did you mean 'workers'"),
+        ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"workers": "two"}, "hydra.sweeper.workers"),
+        ({"workers": 1.5}, "hydra.sweeper.workers"),
+        ({"retries": -1}, "retries must be at least 0"),
+        ({"replicates": 0}, "replicates must be at least 1"),
+        ({"threads": 0}, "threads must be at least 1"),
+        ({"trials": 0}, "trials must be at least 1"),
+        ({"hours": 0}, "hours must be positive or null, got 0"),
+        ({"timeout_minutes": -2}, "timeout_minutes must be positive or null, got -2"),
+        ({"gpus": []}, r"gpus=\[\]: expected numbers"),
+        ({"retry": "all"}, "hydra.sweeper.retry"),
+        ({"executor": "ray"}, "hydra.sweeper.executor"),
+        ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),
+        ({"objectives": []}, "objectives: expected at least one"),
+        ({"objectives": [{"metric": "mIoU", "direction": "maximize"}]}, "objective 'mIoU'"),
+        ({"objectives": [{"metric": "val/mIoU", "direction": "up"}]}, "hydra.sweeper.objectives"),
+        (
+            {"objectives": [{"metric": "val/mIoU", "direction": "maximize", "weight": 1}]},
+            "hydra.sweeper.objectives",
+        ),
+        ({"objectives": [{"metric": "val/mIoU"}]}, "hydra.sweeper.objectives"),
+        ({"space": ["a"]}, "'hydra.sweeper.space' must be a mapping"),
+        ({"points": {"a": 1}}, "'hydra.sweeper.points' must be a list"),
+    ],
+)
+def test_a_wrong_setting_is_told_in_one_sentence(
+    composed: DictConfig, values: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=said) as error:
+        read_settings(changed(composed, **values))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["workers", "points"])
+@pytest.mark.xfail(
+    strict=True, reason="read_settings promises InputError for a missing key and raises a KeyError"
+)
+def test_a_missing_setting_is_told(composed: DictConfig, key: str) -> None:
+    left = OmegaConf.create({name: composed[name] for name in composed if name != key})
+    assert isinstance(left, DictConfig)
+    with pytest.raises(InputError, match=key):
+        read_settings(left)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="points: [a=1] is read as four points of one letter each"
+)
+def test_points_that_are_no_lists_are_refused(composed: DictConfig) -> None:
+    with pytest.raises(InputError, match="points"):
+        read_settings(changed(composed, points=["a=1"]))
