@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.command import composing, readable_paths
 from rgbt.config import check_node
+from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
     from sweeps.cell_points import Wanted
@@ -64,6 +65,8 @@ def settings_of(arguments: Arguments) -> Settings:
 
     node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
     assert isinstance(node, DictConfig), "the file is a mapping"
+    # What Optuna's own pages show of a table; nothing is chosen by it.
+    node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
     for key, text in arguments.items():
         if key not in OF_THE_TABLE:
             node[key] = _parsed(key, text)

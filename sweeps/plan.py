@@ -6,13 +6,13 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.command import composing
 from rgbt.config import build, check, compose, run_key
-from rgbt.data.mfnet import MFNet
 from sweeps.points import Point
 
 
@@ -92,7 +92,7 @@ class Planner:
     def _fingerprint(self, config: DictConfig) -> str:
         text = json.dumps(_plain(config.dataset), sort_keys=True)
         if text not in self._fingerprints:
-            dataset: MFNet = build(config.dataset)
+            dataset: Any = build(config.dataset)
             if not any(dataset.list_path(split).is_file() for split in dataset.splits):
                 raise InputError(
                     f"{dataset.root} holds none of the lists {', '.join(dataset.splits.values())} "

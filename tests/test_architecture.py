@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = sorted(path for path in (ROOT / "rgbt").rglob("*.py") if "conf" not in path.parts)
+RGBT = sorted(path for path in (ROOT / "rgbt").rglob("*.py") if "conf" not in path.parts)
+SWEEPS = sorted((ROOT / "sweeps").rglob("*.py"))
+FILES = [*RGBT, *SWEEPS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
 COMMON = {"rgbt.types", "rgbt.checks", "rgbt.geometry", "rgbt.randomness"}
 ISLANDS = {"data", "transforms", "maskers", "models", "losses", "metrics"}
@@ -56,7 +58,33 @@ def is_command(text: str) -> bool:
     return 'if __name__ == "__main__"' in text
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+SWEEPS_MAY = {"checks", "types", "config", "command", "naming", "metrics", "tracking"}
+"""What of rgbt the sweeps may import: they call its commands and read what these leave."""
+
+ROOMS = {
+    "running": {"space"},
+    "space": set(),
+    "report": set(),
+    "table": {"running"},
+    "sheet": {"table", "running", "report"},
+}
+"""Folders of sweeps, and which others each of them knows."""
+
+
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
+    inside = path.relative_to(ROOT / "sweeps")
+    room = inside.parts[0] if len(inside.parts) > 1 else None
+    for name in imports(ast.parse(path.read_text())):
+        package, *rest = name.split(".")
+        assert package not in ("analysis", "tests"), f"{inside} imports {name}"
+        if package == "rgbt" and rest:
+            assert rest[0] in SWEEPS_MAY, f"{inside} imports {name}"
+        if package == "sweeps" and room and rest and rest[0] in ROOMS and rest[0] != room:
+            assert rest[0] in ROOMS[room], f"{inside} imports {name}"
+
+
+@pytest.mark.parametrize("path", RGBT, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_stay_inside_their_island(path: Path) -> None:
     inside = path.relative_to(ROOT / "rgbt")
     place = inside.parts[0]

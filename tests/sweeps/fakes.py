@@ -10,20 +10,22 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
+from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import attributes as names
 from sweeps import driver as drivers
 from sweeps import sources
 from sweeps.driver import Driver
 from sweeps.found import Runs
 from sweeps.ledger import Ledger
-from sweeps.owner import Owner
+from sweeps.owner import STALE_S, Owner
 from sweeps.plan import Plan, PlannedRun
 from sweeps.points import Point
 from sweeps.settings import Objective, Settings
@@ -38,6 +40,9 @@ DEADLINE_S = 60.0
 
 DEAD = Owner("elsewhere", 1, "1")
 """A driver on another machine."""
+
+GONE = Owner(Owner.me().host, 2**22 + 1, "1")
+"""A process of this machine that cannot exist: a number above the kernel's largest."""
 
 
 def settings(**changes: Any) -> Settings:
@@ -92,6 +97,13 @@ class FakePlanner:
 
     def plan(self, point: Point) -> Plan:
         return plan_of(point)
+
+
+class PickyPlanner(FakePlanner):
+    """Takes no point."""
+
+    def plan(self, point: Point) -> Plan:
+        raise InputError("x does not fit.")
 
 
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:
@@ -156,7 +168,6 @@ class Call:
         return found
 
     def say(self, text: str) -> None:
-        self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("a") as file:
             file.write(text + "\n")
 
@@ -181,11 +192,18 @@ def fail(call: Call) -> Process:
     return 1
 
 
-def hang(call: Call) -> Process:
+def hang(call: Call) -> Generator[None, None, NoReturn]:
     """Runs until it is stopped."""
     RunFolder(call.folder)
     while True:
         yield
+
+
+def endless(call: Call) -> Process:
+    """A run that is validated at step 2 and gets no further until it is stopped."""
+    yield
+    RunFolder(call.folder).append(2, "val", {"mIoU": 0.2})
+    return (yield from hang(call))
 
 
 def leave(code: int) -> Behaviour:
@@ -249,6 +267,8 @@ class FakeExecutor:
         attempt = sum(call.words == tuple(words) for call in self.calls)
         call = Call(module, tuple(words), dict(environment), log, folder, attempt)
         self.calls.append(call)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.touch()
         self.jobs.append(FakeJob(call, self.behaviour(call)))
         return self.jobs[-1]
 
@@ -344,6 +364,13 @@ def ledger_on(
     return Ledger(began, storage, me or Owner.me())
 
 
+def silent(storage: Any, number: int, seconds: float = 2 * STALE_S) -> None:
+    """The owner of a trial was not heard of for so long."""
+    study_id = storage.get_study_id_from_name("study")
+    trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
+    storage.set_trial_user_attr(trial_id, names.BEAT, time.time() - seconds)
+
+
 def list_desk(
     runs_dir: Path,
     points: list[Plan],
@@ -385,9 +412,7 @@ def search_desk(
     runs = Runs(runs_dir, NoTracking())
     parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     view = view or FakeView()
-    source = SearchSource(
-        (), parameters, ledger, planner or FakePlanner(), wanted, view.refused
-    )
+    source = SearchSource((), parameters, ledger, planner or FakePlanner(), wanted, view.refused)
     return _desk(ledger, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
 
 

@@ -17,10 +17,7 @@ from sweeps.ledger import Claim, Ledger
 from sweeps.owner import STALE_S, Owner
 from sweeps.samplers import build_sampler
 from sweeps.storage import open_storage
-from tests.sweeps.fakes import DEAD, ledger_on, memory
-
-GONE = Owner(Owner.me().host, 2**22 + 1, "1")
-"""A process of this machine that cannot exist: a number above the kernel's largest."""
+from tests.sweeps.fakes import DEAD, GONE, ledger_on, memory, silent
 
 
 @pytest.fixture
@@ -56,13 +53,6 @@ def taken(ledger: Ledger, total: int | None = None) -> tuple[int, float]:
 
 def orphans(ledger: Ledger, *mine: int) -> list[int]:
     return [each.number for each in ledger.orphans(mine)]
-
-
-def silent(storage: Any, number: int, seconds: float = 2 * STALE_S) -> None:
-    """The owner of a trial was not heard of for so long."""
-    study_id = storage.get_study_id_from_name("study")
-    trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
-    storage.set_trial_user_attr(trial_id, names.BEAT, time.time() - seconds)
 
 
 def test_a_claim_is_a_running_trial_with_all_that_is_known_of_the_point(ledger: Ledger) -> None:
@@ -113,9 +103,9 @@ def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
     return lambda: open_storage(where[kind], tmp_path)
 
 
-@pytest.mark.parametrize("kind", ["journal", "sqlite"])
+@pytest.mark.parametrize(("kind", "keys"), [("journal", "abcdefgh"), ("sqlite", "abc")])
 def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
-    tmp_path: Path, kind: str
+    tmp_path: Path, kind: str, keys: str
 ) -> None:
     opened = opener(tmp_path, kind)
     ledgers = [ledger_on(opened()) for _ in range(2)]
@@ -123,7 +113,7 @@ def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
     at_once = threading.Barrier(2)
 
     def work(index: int) -> None:
-        for key in "abcdefgh":
+        for key in keys:
             at_once.wait()
             if claim(ledgers[index], key) is not None:
                 got[index].append(key)
@@ -133,21 +123,21 @@ def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
         thread.start()
     for thread in threads:
         thread.join()
-    assert sorted(got[0] + got[1]) == list("abcdefgh")
-    assert states(ledgers[0]) == ["RUNNING"] * 8
+    assert sorted(got[0] + got[1]) == list(keys)
+    assert states(ledgers[0]) == ["RUNNING"] * len(keys)
 
 
-@pytest.mark.parametrize("kind", ["journal", "sqlite"])
+@pytest.mark.parametrize(("kind", "total"), [("journal", 20), ("sqlite", 7)])
 def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
-    tmp_path: Path, kind: str
+    tmp_path: Path, kind: str, total: int
 ) -> None:
     opened = opener(tmp_path, kind)
     ledgers = [searching(opened()) for _ in range(3)]
     drawn: list[float] = []
 
     def work(ledger: Ledger) -> None:
-        while len(ledger.trials()) < 20:
-            asked = ledger.ask(20)
+        while len(ledger.trials()) < total:
+            asked = ledger.ask(total)
             if asked is not None:
                 drawn.append(asked.suggest_float("x", 0, 1))
 
@@ -156,8 +146,8 @@ def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
         thread.start()
     for thread in threads:
         thread.join()
-    assert states(ledgers[0]) == ["RUNNING"] * 20, "none was told: running ones must count"
-    assert len(set(drawn)) == len(drawn) == 20
+    assert states(ledgers[0]) == ["RUNNING"] * total, "none was told: running ones count"
+    assert len(set(drawn)) == len(drawn) == total
 
 
 def test_running_trials_of_other_drivers_count_in_the_total() -> None:
@@ -167,6 +157,7 @@ def test_running_trials_of_other_drivers_count_in_the_total() -> None:
     taken(mine)
     assert mine.ask(2) is None
     assert theirs.ask(2) is None
+    assert len(mine.study.trials) == 2, "none was made to be dropped"
     assert mine.ask(3) is not None
 
 

@@ -100,9 +100,7 @@ def test_a_survey_writes_nothing_and_knows_what_is_there(
 ) -> None:
     runs_dir = tmp_path / "runs"
     points = (Point("a", ("seed=1",)), Point("b", ("seed=2",)), Point("c", ("masker=grid",)))
-    wanted = PointList(
-        "table/x", "x", "list", points, Runs(runs_dir, NoTracking()), base, None
-    )
+    wanted = PointList("table/x", "x", "list", points, Runs(runs_dir, NoTracking()), base, None)
     outcomes = survey(wanted, settings())
     assert [outcome.state for outcome in outcomes] == ["waiting", "waiting", "failed"]
     assert "there is no masker 'grid'" in outcomes[2].reason

@@ -123,9 +123,7 @@ def test_a_missing_setting_is_told(composed: DictConfig, key: str) -> None:
         read_settings(left)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="points: [a=1] is read as four points of one letter each"
-)
+@pytest.mark.xfail(strict=True, reason="points: [a=1] is read as four points of one letter each")
 def test_points_that_are_no_lists_are_refused(composed: DictConfig) -> None:
     with pytest.raises(InputError, match="points"):
         read_settings(changed(composed, points=["a=1"]))

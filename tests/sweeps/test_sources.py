@@ -8,19 +8,18 @@ from typing import Any
 
 import pytest
 from optuna.distributions import CategoricalDistribution
+from optuna.trial import TrialState
 
-from rgbt.checks import InputError
 from rgbt.tracking.folder import MetricLine
 from sweeps import attributes as names
 from sweeps.ledger import Claim
-from sweeps.plan import Plan
 from sweeps.points import Evaluation, Point
 from sweeps.settings import Objective
 from sweeps.sources import ListSource, Task, known, reason_of, short
 from tests.sweeps.fakes import (
     DEAD,
     Desk,
-    FakePlanner,
+    PickyPlanner,
     finish,
     ledger_on,
     list_desk,
@@ -29,6 +28,7 @@ from tests.sweeps.fakes import (
     plans,
     quick,
     search_desk,
+    until,
 )
 
 __all__ = ["quick"]
@@ -145,8 +145,8 @@ def test_other_points_in_the_study_are_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.xfail(
     strict=True,
-    reason="ListSource.standing asks for results only where a trial is COMPLETE: a point that failed"
-    " and was then finished by hand is `failed` here and `finished` in survey",
+    reason="ListSource.standing asks for results only where a trial is COMPLETE: a point that "
+    "failed and was then finished by hand is `failed` here and `finished` in survey",
 )
 def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: Path) -> None:
     storage = memory()
@@ -233,8 +233,6 @@ def test_a_duplicate_of_a_finished_point_is_answered_without_a_run(tmp_path: Pat
 def test_a_duplicate_of_a_running_point_is_dropped_and_the_search_goes_on_later(
     tmp_path: Path, quick: None
 ) -> None:
-    from tests.sweeps.fakes import until
-
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     task = taken(desk)
     assert desk.driver.source.next() is None
@@ -251,13 +249,8 @@ def test_a_failed_point_of_a_search_may_be_tried_again_by_the_sampler(tmp_path: 
     assert taken(desk).number == 1
 
 
-class Picky(FakePlanner):
-    def plan(self, point: Point) -> Plan:
-        raise InputError("x does not fit.")
-
-
 def test_a_point_that_cannot_be_composed_fails_and_is_told(tmp_path: Path) -> None:
-    desk = search_desk(tmp_path, planner=Picky(), trials=1)
+    desk = search_desk(tmp_path, planner=PickyPlanner(), trials=1)
     assert desk.driver.source.next() is None
     (trial,) = desk.ledger.trials()
     assert trial.state.name == "FAIL"
@@ -272,6 +265,7 @@ def line(step: int, **values: float) -> MetricLine:
     return MetricLine(step, "val", 0.0, values)
 
 
+@pytest.mark.filterwarnings("error")
 def test_evaluations_are_reported_once_each_in_percent(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, objectives=(Objective("val/mIoU", "maximize"),), trials=1)
     task = taken(desk)
@@ -326,5 +320,5 @@ def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
     ledger = ledger_on(memory())
     number = ledger.claim(Claim("k", {}))
     assert number == 0
-    ledger.study.tell(0, state=__import__("optuna").trial.TrialState.FAIL)
+    ledger.study.tell(0, state=TrialState.FAIL)
     assert reason_of(ledger.trials()[0]) == "no reason was noted"
