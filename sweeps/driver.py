@@ -11,11 +11,13 @@ import json
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rgbt.checks import RunError
 from rgbt.naming import TAGS
@@ -65,6 +67,7 @@ class Driver:
     _looked: float = -math.inf
     _beaten: float = field(default_factory=time.monotonic)
     _away_since: float = 0.0
+    _tries: Counter[str] = field(default_factory=Counter)
 
     def run(self) -> None:
         """Work until nothing is left to do; on Ctrl-C or SIGTERM give back what is not done."""
@@ -99,10 +102,8 @@ class Driver:
         for slot, work in list(self.works.items()):
             if self._advance(work):
                 del self.works[slot]
+        self._beat()
         now = time.monotonic()
-        if now - self._beaten > BEAT_S:
-            self._beaten = now
-            self.ledger.beat([work.number for work in self.works.values()])
         free = self.settings.workers - len(self.works)
         due = now - self._looked > LOOK_S
         if free > 0 and due:
@@ -111,6 +112,13 @@ class Driver:
         if self.works or not due:
             return True
         return not (self._is_over() or self.source.is_exhausted(wait=self.settings.wait))
+
+    def _beat(self) -> None:
+        """Say now and then that this driver is alive."""
+        now = time.monotonic()
+        if now - self._beaten > BEAT_S:
+            self._beaten = now
+            self.ledger.beat([work.number for work in self.works.values()])
 
     def _take_up(self, free: int) -> None:
         """Begin as many points as there are free slots."""
@@ -123,17 +131,20 @@ class Driver:
                 self._looked = time.monotonic()
                 return
             slot = min(set(range(self.settings.workers)) - set(self.works))
-            work = self._begin(task, slot)
+            self.works[slot] = self._begin(task, slot)
             # What is finished elsewhere needs no process and gives the slot back at once.
-            if not self._advance(work):
-                self.works[slot] = work
+            if self._advance(self.works[slot]):
+                del self.works[slot]
+            else:
                 free -= 1
+            self._beat()
 
     def _is_over(self) -> bool:
         """Whether the budget of this call is spent."""
         most, hours = self.settings.max_failures, self.settings.hours
         spent = hours is not None and time.monotonic() - self._began > 3600 * hours
-        return spent or (most is not None and self.failures > most)
+        failures = self.failures + self.source.refused
+        return spent or (most is not None and failures >= most)
 
     def _begin(self, task: Task, slot: int) -> Work:
         start = partial(self._start, slot=slot, tags=task.plan.point.tags)
@@ -170,13 +181,22 @@ class Driver:
                 self.runs.stopped(run.key, str(reason))
             self.view.ended(work, "pruned", str(reason))
         except PointError as error:
-            self.ledger.fail(work.number, str(error), notes)
-            self.failures += 1
-            self.view.ended(work, "failed", str(error))
+            self._failed(work, str(error), notes)
         else:
             self.ledger.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
             self.view.ended(work, "finished", "")
         return True
+
+    def _failed(self, work: Work, reason: str, notes: Mapping[str, Any]) -> None:
+        """Book a failure; a search tries the same point again while `retries` allow."""
+        key = work.plan.key
+        if self.source.again and self._tries[key] < self.settings.retries:
+            self.ledger.release(work.number, f"tried again: {reason}", again=True)
+        else:
+            self.ledger.fail(work.number, reason, notes)
+            self.failures += 1
+        self._tries[key] += 1
+        self.view.ended(work, "failed", reason)
 
     def _give_back(self) -> None:
         """Stop all processes and give the trials back; their runs continue at the next call."""

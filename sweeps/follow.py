@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 from rgbt.tracking.folder import MetricLine, metric_line
@@ -60,7 +61,7 @@ def why(code: int, log: Path, start: int) -> str:
     said = _last_words(log, start)
     if code >= 0:
         # What it said went to a file on the disk that may be the reason.
-        is_full = shutil.disk_usage(log.parent).free < FULL
+        is_full = log.parent.exists() and shutil.disk_usage(log.parent).free < FULL
         unsaid = f"the disk of {log.parent} is full" if is_full else f"see {log}"
         return said or f"it left with exit code {code} and said nothing; {unsaid}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
@@ -76,11 +77,12 @@ def _last_words(log: Path, start: int) -> str:
         file.seek(start)
         text = file.read().decode(errors="replace")
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
-    told = [line.removeprefix("rgbt: ") for line in lines if line.startswith("rgbt: ")]
-    if "Traceback (most recent call last):" in lines:
-        errors = [line for line in lines if re.match(r"[\w.]+(Error|Exception|Interrupt)\b", line)]
-        return errors[-1][:300] if errors else lines[-1][:300]
-    return told[-1][:300] if told else (lines[-1][:300] if lines else "")
+    # Libraries log tracebacks of what they then survive: the last word counts.
+    traced = "Traceback (most recent call last):" in lines
+    error = r"[\w.]+(Error|Exception|Interrupt)\b" if traced else r"(?!)"
+    said = [line for line in lines if line.startswith("rgbt: ") or re.match(error, line)]
+    last = (said or lines or [""])[-1]
+    return last.removeprefix("rgbt: ")[:300]
 
 
 def stop_holder(folder: Path) -> None:
@@ -88,7 +90,8 @@ def stop_holder(folder: Path) -> None:
     lock = folder / "lock"
     found = re.fullmatch(r"process (\d+) on (\S+)", lock.read_text()) if lock.exists() else None
     if found and found.group(2) == os.uname().nodename:
-        os.kill(int(found.group(1)), signal.SIGTERM)
+        with suppress(ProcessLookupError):  # it has ended between our two looks
+            os.kill(int(found.group(1)), signal.SIGTERM)
 
 
 def known_seconds(folder: Path) -> float | None:

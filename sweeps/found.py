@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.terminal import tell
 from sweeps.points import Evaluation
 
+FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
 FETCHED = ".fetched"
 """Folder inside the folder of runs: what was taken from MLflow of runs made elsewhere."""
 
@@ -145,13 +146,19 @@ class Runs:
 
     def stopped(self, key: str, reason: str) -> None:
         """Show in MLflow why a run was stopped before its end."""
-        if not (self.runs_dir / key / "run.json").exists():
-            return
+        folder_of_run = self.runs_dir / key
+        if not (folder_of_run / "run.json").exists() or (folder_of_run / "result.json").exists():
+            return  # not begun, or finished while it was being stopped
         folder = RunFolder(self.runs_dir / key)
         description = folder.description()
         assert description is not None, "run.json exists"
         folder.describe(replace(description, tags={**description.tags, "rgbt.stopped": reason}))
         self._guarded(lambda tracking: tracking.sync(folder, "KILLED"))
+
+    def fetch_again(self, found: Found, evaluation: Evaluation) -> bool:
+        """Look for an evaluation that the other machine has made since; whether it is here now."""
+        self._guarded(lambda tracking: _download(tracking, found, ("evaluations",)))
+        return found.counts_file(evaluation).exists()
 
     def touch(self) -> None:
         """Open the store once, before several processes would make its tables at the same time."""
@@ -197,9 +204,7 @@ def _fetch(tracking: MlflowTracking, wanted: tuple[str, str], copy: Path) -> Fou
         return None
     run_id = runs[0].info.run_id
     copy.mkdir(parents=True, exist_ok=True)
-    for name in ("result.json", "counts_test.npz", "provenance.json", "evaluations"):
-        if _holds(store.client, run_id, name):
-            store.client.download_artifacts(run_id, name, str(copy))
+    _download(tracking, Found(key, copy, run_id), FETCHED_FILES)
     if not (copy / "result.json").exists() or not (copy / "counts_test.npz").exists():
         return None
     # Written last: without it the copy is not whole and is made again.
@@ -213,8 +218,12 @@ def is_there(tracking: MlflowTracking) -> bool:
     return scheme != "sqlite" or Path(path).exists()
 
 
-def _holds(client: Any, run_id: str, name: str) -> bool:
-    return name in {item.path for item in client.list_artifacts(run_id)}
+def _download(tracking: MlflowTracking, found: Found, wanted: Sequence[str]) -> None:
+    client = tracking.store().client
+    there = {item.path for item in client.list_artifacts(found.run_id)}
+    for name in wanted:
+        if name in there:
+            client.download_artifacts(found.run_id, name, str(found.folder))
 
 
 def _set_tags(tracking: MlflowTracking, run_id: str, tags: Mapping[str, str]) -> None:

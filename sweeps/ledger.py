@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sweeps import attributes as names
@@ -115,13 +116,32 @@ class Ledger:
         trial = self.study.ask()
         self.note(trial.number, self._sign())
         if names.KEY in trial.user_attrs:
-            return trial
+            return trial if self._stands_alone(trial) else None
         before = [other for other in self.trials() if other.number < trial.number]
         # Two drivers may have asked for the last one at the same time: the lower number has it.
         if total is not None and len(before) >= total:
             self.drop(trial.number, f"{total} trials were asked for")
             return None
         return trial
+
+    def _stands_alone(self, trial: Trial) -> bool:
+        """Whether a trial from the queue is the only one of its point; it is dropped if not.
+
+        Two drivers may have put what a dead one left into the queue at the same time.
+        """
+        same = self.by_key()[trial.user_attrs[names.KEY]]
+        others = [
+            other.number
+            for other in same
+            if other.number != trial.number
+            and (
+                other.state.name in STANDS
+                or (other.state.name == "WAITING" and other.number < trial.number)
+            )
+        ]
+        if others:
+            self.drop(trial.number, f"the same point as trial {others[0]}")
+        return not others
 
     def note(self, number: int, attributes: Mapping[str, Any]) -> None:
         """Write attributes of a trial that is not finished."""
@@ -132,13 +152,7 @@ class Ledger:
     def beat(self, numbers: Iterable[int]) -> None:
         """Say that this driver still works on these trials."""
         for number in numbers:
-            self._unless_finished(lambda number=number: self.note(number, self._sign()), number)
-
-    def is_mine(self, number: int) -> bool:
-        """Whether the trial still runs and nobody else has taken it over."""
-        trial = self.study.get_trials(deepcopy=False)[number]
-        mine = trial.user_attrs.get(names.OWNER) == str(self.me)
-        return bool(trial.state.name == "RUNNING" and mine)
+            self.unless_finished(number, partial(self.note, number, self._sign()))
 
     def complete(self, number: int, values: Sequence[float], notes: Mapping[str, Any]) -> None:
         """Finish a trial with its values; without effect if another driver has finished it."""
@@ -166,6 +180,8 @@ class Ledger:
                 that a crash in between loses nothing.
         """
         trial = self.study.get_trials(deepcopy=False)[number]
+        if trial.state.name != "RUNNING":  # another driver was first
+            return
         key = trial.user_attrs.get(names.KEY)
         waiting = {other.user_attrs.get(names.KEY) for other in self._waiting()}
         if again and key is not None and key not in waiting:
@@ -216,9 +232,9 @@ class Ledger:
             told = None if values is None else list(values)
             self.study.tell(number, told, state=TrialState[state])
 
-        self._unless_finished(finish, number)
+        self.unless_finished(number, finish)
 
-    def _unless_finished(self, work: Any, number: int) -> None:
+    def unless_finished(self, number: int, work: Callable[[], object]) -> None:
         """`work` on a trial, unless another driver has finished it while this machine slept."""
         try:
             work()

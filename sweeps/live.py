@@ -98,8 +98,10 @@ class View:
         for work in works:
             score = "" if math.isnan(work.score) else f"val mIoU {100 * work.score:.2f}"
             bar = ProgressBar(total=1.0, completed=work.done_share, width=24)
-            label = work.plan.point.label[:LABEL_WIDTH]
-            rows.add_row("  ", label, bar, f"{100 * work.done_share:3.0f} %", work.status, score)
+            label = Text(work.plan.point.label[:LABEL_WIDTH])
+            rows.add_row(
+                "  ", label, bar, f"{100 * work.done_share:3.0f} %", Text(work.status), score
+            )
         self._live.update(Group(Text(self._headline(works)), rows))
 
     def _headline(self, works: Sequence[Work]) -> str:

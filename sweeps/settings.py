@@ -63,6 +63,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         at_least = {"workers": 1, "retries": 0, "replicates": 1, "threads": 1, "trials": 1}
+        at_least |= {"max_failures": 1}
         for name, least in at_least.items():
             value = getattr(self, name)
             if value is not None and value < least:
@@ -91,6 +92,8 @@ EXECUTION = (
 """Keys that say how points are run; the others say which."""
 
 
+EXPLAINED = "conf/hydra/sweeper/study.yaml"
+
 AS_WRITTEN: dict[str, type] = {"space": dict, "params": dict, "points": list}
 """Keys whose interpolations (``${px:64}``) are for the runs and not for the sweep to resolve."""
 
@@ -109,6 +112,9 @@ def read_settings(node: DictConfig) -> Settings:
             raise InputError(
                 f"'hydra.sweeper.{key!s}' is not a setting; {nearest(str(key), known)}."
             )
+    for key in known:
+        if key not in raw:
+            raise InputError(f"'hydra.sweeper.{key}' has no value; see {EXPLAINED}.")
     for key, kind in AS_WRITTEN.items():
         raw[key] = kind() if raw[key] is None else raw[key]
         if not isinstance(raw[key], kind):
@@ -118,5 +124,11 @@ def read_settings(node: DictConfig) -> Settings:
     empty = {key: kind() for key, kind in AS_WRITTEN.items()}
     own = {"_target_": "sweeps.settings.Settings", **values, **empty}
     settings: Settings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
+    for point in raw["points"]:
+        if not isinstance(point, list):
+            raise InputError(
+                f"hydra.sweeper.points: expected a list of lists of overrides such as "
+                f"[[masker.sigma_div=1], [masker.sigma_div=4]], got {point!r} inside."
+            )
     points = tuple(tuple(map(str, point)) for point in raw["points"])
     return replace(settings, space=raw["space"], params=raw["params"], points=points)

@@ -50,6 +50,9 @@ class Source(Protocol):
     again: bool
     """Whether a trial that is given up goes into the queue of the study."""
 
+    refused: int
+    """Points that could not be begun."""
+
     def next(self) -> Task | None:
         """The next task, claimed for this driver; None when there is none at the moment."""
         ...
@@ -88,6 +91,7 @@ class ListSource:
     """
 
     again = False
+    refused = 0
 
     def __init__(
         self,
@@ -108,6 +112,7 @@ class ListSource:
             for key, trials in before.items()
         }
         self._finished: dict[str, Standing] = {}
+        self._looked: set[tuple[str, int]] = set()
 
     def next(self) -> Task | None:
         """See `Source.next`."""
@@ -150,8 +155,18 @@ class ListSource:
         failed = [trial for trial in trials if trial.state.name == "FAIL"]
         counted = [t for t in failed if t.number not in self._forgiven.get(plan.key, ())]
         if len(counted) > self._retries:
-            return Standing("failed", reason_of(counted[-1]))
+            return self._failed(plan, counted[-1])
         return Standing("waiting", past=tuple(trial.number for trial in trials))
+
+    def _failed(self, plan: Plan, trial: FrozenTrial) -> Standing:
+        """A point that failed, unless somebody has finished its runs by hand since."""
+        if (plan.key, trial.number) not in self._looked:
+            self._looked.add((plan.key, trial.number))
+            found = known(plan, self._runs)
+            if found is not None:
+                self._finished[plan.key] = Standing("finished", found=found)
+                return self._finished[plan.key]
+        return Standing("failed", reason_of(trial))
 
 
 def known(plan: Plan, runs: Runs) -> tuple[Found, ...] | None:
@@ -203,6 +218,7 @@ class SearchSource:
         self._settings = settings
         self._on_fail = on_fail
         self._not_before = 0.0
+        self.refused = 0
 
     def next(self) -> Task | None:
         """See `Source.next`."""
@@ -216,6 +232,7 @@ class SearchSource:
             plan = self._planner.plan(point)
         except InputError as error:
             self._ledger.fail(trial.number, str(error), {names.LABEL: point.label})
+            self.refused += 1
             self._on_fail(point.label, str(error))
             return None
         same = self._ledger.by_key().get(plan.key, [])
@@ -282,8 +299,9 @@ class SearchSource:
             value = line.values.get(metric)
             if value is None or line.step in reported:
                 return ""
+            percent = in_percent(metric, value)
+            self._ledger.unless_finished(trial.number, lambda: trial.report(percent, line.step))
             reported.add(line.step)
-            trial.report(in_percent(metric, value), line.step)
             if self._settings.pruner is not None and trial.should_prune():
                 return f"pruned at step {line.step}"
             return ""

@@ -20,6 +20,13 @@ Opened = TypeVar("Opened")
 
 JOURNAL = "studies.journal"
 ATTEMPTS = 8
+FIXED = {
+    names.METRICS: "other objectives",
+    names.KIND: "points of another kind",
+    names.SIGNATURE: "another space or other overrides",
+}
+"""Attributes of a study that must not change, and how that is told."""
+
 PAUSE_S = 0.7
 
 
@@ -136,9 +143,8 @@ def begin_study(
     metrics = [objective.metric for objective in objectives]
     wanted = {names.METRICS: metrics, **attributes}
     known = study.user_attrs
-    for fixed in (names.METRICS, names.SIGNATURE):
+    for fixed, what in FIXED.items():
         if fixed in known and known[fixed] != wanted.get(fixed):
-            what = "other objectives" if fixed == names.METRICS else "another space or budget"
             raise InputError(
                 f"there is a study '{name}' with {what} already; give this one another name: "
                 "hydra.sweeper.study=..."
@@ -154,7 +160,8 @@ def begin_study(
 
 def existing_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
     """The study called `name`; None where it, or the file of the storage, does not exist."""
-    path = runs_dir / JOURNAL if storage is None else Path(storage.removeprefix("sqlite:///"))
+    named = Path(str(storage).removeprefix("sqlite:///")).expanduser()
+    path = runs_dir / JOURNAL if storage is None else named
     if "://" not in str(storage or "").removeprefix("sqlite:///") and not path.exists():
         return None
     opened = open_storage(storage, runs_dir)

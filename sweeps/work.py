@@ -81,13 +81,16 @@ class Work:
         self._follower = Follower(Path())
         self._found: tuple[Found, ...] = ()
         self._end_as: Exception | None = None
+        self._unreported: list[MetricLine] = []
+        self._prune = ""
         self._steps = self._go()
 
     @property
     def done_share(self) -> float:
         """Steps done of all steps of the point, 0..1."""
         run = self.plan.runs[min(self._index, len(self.plan.runs) - 1)]
-        return (self._index + min(1.0, self._follower.step / run.steps)) / len(self.plan.runs)
+        done = self._index + min(1.0, self._follower.step / run.steps)
+        return min(1.0, done / len(self.plan.runs))
 
     @property
     def seconds(self) -> float:
@@ -104,9 +107,11 @@ class Work:
         # A driver asks again where the storage could not be told how it ended.
         if self._end_as is not None:
             raise self._end_as
+        self._tell()
         try:
             next(self._steps)
         except StopIteration:
+            self._tell()
             return self._found
         except (PointError, Pruned) as end:
             self._end_as = end
@@ -114,7 +119,15 @@ class Work:
             self._end_as = PointError(str(error))
         if self._end_as is not None:
             raise self._end_as
+        self._tell()
         return None
+
+    def _tell(self) -> None:
+        """Report what is new; not by the generator, which an error of the storage would end."""
+        while self._unreported and not self._prune:
+            assert self._report is not None, "lines are kept for a report alone"
+            self._prune = self._report(self._unreported[0])
+            del self._unreported[0]
 
     def stop(self) -> None:
         """End the process of this work, if there is one; it continues from its checkpoint later."""
@@ -159,16 +172,18 @@ class Work:
                 continue
             begin = log.stat().st_size if log.exists() else 0
             self.status = "training"
-            self._job = self._around.start(("rgbt.run", *run.overrides), log)
-            code = yield from self._until(self._job.poll)
+            code = yield from self._run(("rgbt.run", *run.overrides), log)
             if code == 0:
                 return
-            if not is_held(folder / "lock"):
+            finished = (folder / "result.json").exists()
+            if not finished and not is_held(folder / "lock"):
                 raise PointError(why(code, log, begin))
 
     def _evaluate(self, found: Found, evaluation: Evaluation) -> Iterator[None]:
         out = found.counts_file(evaluation)
         if out.exists():
+            return
+        if found.run_id and self._around.runs.fetch_again(found, evaluation):
             return
         if found.run_id:
             raise PointError(
@@ -183,11 +198,18 @@ class Work:
             *(f"run={found.folder}", f"modality={evaluation.modality}"),
             *(f"regions={evaluation.regions}", f"out={out}"),
         )
-        self._job = self._around.start(command, log)
-        code = yield from self._until(self._job.poll)
+        code = yield from self._run(command, log)
         if code != 0 or not out.exists():
             raise PointError(why(code, log, begin))
         self._around.runs.send(found)
+
+    def _run(self, command: Sequence[str], log: Path) -> Generator[None, None, int]:
+        """Run a command to its exit code."""
+        try:
+            self._job = self._around.start(command, log)
+        except OSError as error:
+            raise PointError(f"its process could not be started ({error})") from error
+        return (yield from self._until(self._job.poll))
 
     def _until(self, poll: Callable[[], int | None]) -> Generator[None, None, int]:
         """Wait for an exit code, following the run meanwhile."""
@@ -195,12 +217,12 @@ class Work:
         began = time.monotonic()
         while True:
             code = poll()
-            prune = self._follow()
+            self._follow()
             if code is not None:
                 return code
-            if prune:
+            if self._prune:
                 yield from self._end(poll)
-                raise Pruned(prune)
+                raise Pruned(self._prune)
             if limit is not None and time.monotonic() - began > limit:
                 yield from self._end(poll)
                 raise PointError(f"stopped after {limit / 60:g} minutes (timeout_minutes)")
@@ -213,16 +235,13 @@ class Work:
         while poll() is None:
             yield
 
-    def _follow(self) -> str:
-        """Look at new metric lines; why the point shall be pruned, or ""."""
-        for line in self._follower.new_lines():
-            if line.kind != "val":
-                continue
-            self.score = line.values.get("mIoU", math.nan)
-            reason = self._report(line) if self._report and self._index == 0 else ""
-            if reason:
-                return reason
-        return ""
+    def _follow(self) -> None:
+        """Look at new metric lines; those of the first run are reported by `advance`."""
+        lines = [line for line in self._follower.new_lines() if line.kind == "val"]
+        if lines:
+            self.score = lines[-1].values.get("mIoU", math.nan)
+        if self._report is not None and self._index == 0:
+            self._unreported += lines
 
     def _log(self, run: PlannedRun) -> Path:
         return self._around.runs.runs_dir / LOGS / f"{run.key}.log"

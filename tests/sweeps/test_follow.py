@@ -113,11 +113,6 @@ def test_a_signal_is_named(tmp_path: Path, code: int, said: str) -> None:
     assert why(code, *log_of(tmp_path, "rgbt: a remark\n")) == said
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="_last_words prefers any traceback to our sentence, also one that was logged long before"
-    " the end (MLflow logs those of its retries)",
-)
 def test_our_sentence_at_the_end_is_the_reason_though_a_library_logged_a_traceback(
     tmp_path: Path,
 ) -> None:
@@ -147,11 +142,6 @@ def test_a_holder_on_another_machine_is_left_alone(tmp_path: Path) -> None:
         process.kill()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="stop_holder: the holder may end between the look at its lock and the signal; the "
-    "ProcessLookupError takes the whole driver down",
-)
 def test_a_holder_that_is_gone_already_needs_no_stop(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", "pass"])
     process.wait()

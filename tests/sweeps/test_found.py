@@ -130,11 +130,6 @@ def test_a_stopped_run_says_why(runs: Runs) -> None:
     assert not (runs.runs_dir / "nothing began").exists()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a run that finished while it was being stopped is marked as stopped, and as KILLED in "
-    "MLflow, where other machines then do not find it",
-)
 def test_a_run_that_finished_while_it_was_stopped_is_not_shown_as_stopped(runs: Runs) -> None:
     finish(runs.runs_dir / "a")
     runs.stopped("a", "pruned at step 2")
@@ -272,11 +267,6 @@ def test_unfinished_runs_and_half_fetched_ones_are_not_taken(machines: Machines)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="what was fetched once is never looked at again: evaluations that the other machine has "
-    "made since are missing for ever, and the cell says that they can only be made there",
-)
 def test_evaluations_made_elsewhere_later_are_fetched(machines: Machines) -> None:
     made = machines.send("e")
     here, there = machines.runs("here"), machines.runs("there")
@@ -288,4 +278,5 @@ def test_evaluations_made_elsewhere_later_are_fetched(machines: Machines) -> Non
     there.send(Found("e", made.path))
     found = here.find("e", DATASET)
     assert found is not None
-    assert found.counts_file(ring).exists()
+    assert here.fetch_again(found, ring)
+    assert found.counts(ring).counts.tolist() == counts(right=7).counts.tolist()

@@ -300,11 +300,6 @@ def test_a_crash_between_queueing_an_orphan_and_dropping_it_queues_it_once() -> 
     assert states(b) == ["WAITING"]
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="Ledger.release does not look whether the trial still runs: it queues a copy of a trial "
-    "that another driver has released, and taken up, in the meantime",
-)
 @pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
 def test_an_orphan_that_another_driver_released_and_took_up_is_not_queued_again(
     finished: bool,
@@ -322,9 +317,6 @@ def test_an_orphan_that_another_driver_released_and_took_up_is_not_queued_again(
     assert states(b) == ["COMPLETE" if finished else "RUNNING"]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="as above: a trial that is finished is released as if it still ran"
-)
 def test_giving_back_a_trial_that_another_driver_has_finished_changes_nothing() -> None:
     storage = memory()
     mine, other = searching(storage, DEAD), searching(storage)

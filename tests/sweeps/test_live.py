@@ -129,11 +129,6 @@ def test_durations_are_read_by_people(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="labels are added to the table as markup: a label that holds a list of names loses it, "
-    "and one with a path in brackets raises MarkupError, which ends the driver",
-)
 @pytest.mark.parametrize("label", ["fresh=[decoder]", "files=[/data/a]"])
 def test_a_label_with_brackets_is_shown_as_it_is(console: Make, label: str) -> None:
     console(True)

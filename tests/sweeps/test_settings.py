@@ -113,9 +113,6 @@ def test_a_wrong_setting_is_told_in_one_sentence(
 
 
 @pytest.mark.parametrize("key", ["workers", "points"])
-@pytest.mark.xfail(
-    strict=True, reason="read_settings promises InputError for a missing key and raises a KeyError"
-)
 def test_a_missing_setting_is_told(composed: DictConfig, key: str) -> None:
     left = OmegaConf.create({name: composed[name] for name in composed if name != key})
     assert isinstance(left, DictConfig)
@@ -123,7 +120,6 @@ def test_a_missing_setting_is_told(composed: DictConfig, key: str) -> None:
         read_settings(left)
 
 
-@pytest.mark.xfail(strict=True, reason="points: [a=1] is read as four points of one letter each")
 def test_points_that_are_no_lists_are_refused(composed: DictConfig) -> None:
     with pytest.raises(InputError, match="points"):
         read_settings(changed(composed, points=["a=1"]))

@@ -143,11 +143,6 @@ def test_other_points_in_the_study_are_left_alone(tmp_path: Path) -> None:
     assert is_exhausted(desk)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="ListSource.standing asks for results only where a trial is COMPLETE: a point that "
-    "failed and was then finished by hand is `failed` here and `finished` in survey",
-)
 def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: Path) -> None:
     storage = memory()
     before = list_desk(tmp_path, plans(1), storage=storage)

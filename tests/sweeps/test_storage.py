@@ -139,11 +139,6 @@ def test_a_study_with_other_objectives_or_another_space_is_refused(tmp_path: Pat
         begin_study("study", storage, UP, {names.KIND: "list"})
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a list has no signature, so begin_study lets a search into a study of points: its "
-    "trials then count in `trials`",
-)
 def test_a_search_under_the_name_of_a_list_is_refused(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     begin_study("study", storage, UP, {names.KIND: "list"})
@@ -175,9 +170,6 @@ def test_looking_for_a_study_finds_it_in_every_kind_of_storage(tmp_path: Path) -
         assert existing_study("another", named, tmp_path) is None
 
 
-@pytest.mark.xfail(
-    strict=True, reason="existing_study does not read ~ as open_storage does, and finds nothing"
-)
 def test_a_journal_in_the_home_folder_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

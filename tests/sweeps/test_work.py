@@ -96,7 +96,6 @@ def test_a_run_is_started_followed_and_found(tmp_path: Path) -> None:
     assert bench.work.is_stopped()
 
 
-@pytest.mark.xfail(strict=True, reason="done_share is 2 when all is done, and 0..1 is promised")
 def test_all_is_done_of_a_point_that_is_finished(tmp_path: Path) -> None:
     bench = Bench(tmp_path, single()[0])
     bench.run()
@@ -263,12 +262,6 @@ def test_a_process_that_finds_its_run_taken_leaves_it_to_that_one(tmp_path: Path
     assert len(bench.executor.calls) == 1
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="Work._train takes a bad exit code for a failure though result.json is there: the other "
-    "driver's process finished between our refusal by the lock and our look at it, or the run was "
-    "finished and only its tracker failed",
-)
 def test_a_run_whose_result_is_there_did_not_fail_whatever_its_process_says(
     tmp_path: Path,
 ) -> None:
@@ -395,11 +388,6 @@ def test_a_seed_that_fails_fails_the_point_and_what_is_done_is_kept(tmp_path: Pa
     assert again.executor.started() == [("x=1", "seed=1")]
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="an exception of the report (the storage is away, the trial was taken over) ends the "
-    "generator: the next look takes the point for finished with no runs, while its process runs on",
-)
 def test_a_report_that_could_not_be_sent_does_not_finish_the_point(tmp_path: Path) -> None:
     told: list[int] = []
 
