@@ -120,9 +120,16 @@ class Runs:
         if not (folder / "result.json").exists():
             return self._remote(key, dataset)
         found = Found(key, folder)
-        if found.dataset != dataset:
+        try:
+            made_on = found.dataset
+        except (ValueError, KeyError) as error:
             raise RunError(
-                f"{folder} was made on other files of the data set ({found.dataset[:8]}, now "
+                f"{folder / 'result.json'} cannot be read ({error}); remove the folder to train it "
+                "again."
+            ) from error
+        if made_on != dataset:
+            raise RunError(
+                f"{folder} was made on other files of the data set ({made_on[:8]}, now "
                 f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
             )
         return found

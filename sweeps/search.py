@@ -58,6 +58,11 @@ def search(wanted: Search, settings: Settings) -> None:
         raise InputError(
             "a search needs a budget: hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both."
         )
+    if settings.retry == "failed":
+        raise InputError(
+            "retry=failed is for grids and tables; a search goes on with other points: give it "
+            "more trials, or retries=1 to try each failed point again at once."
+        )
     sampler, pruner = _sampler_and_pruner(settings)
     if settings.dry_run:
         _preview(wanted, settings)

@@ -72,6 +72,11 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise InputError(f"{name} must be positive or null, got {value:g}.")
+        if self.executor == "submitit" and self.threads is not None:
+            raise InputError(
+                "threads are those of workers on this machine; with executor=submitit give "
+                "submitit={cpus_per_task: ...}."
+            )
         if self.gpus is not None and not self.gpus:
             raise InputError("gpus=[]: expected numbers of GPUs such as [0,1], or null.")
         if self.submitit and self.executor != "submitit":

@@ -46,24 +46,37 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
     from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    url = str(runs_dir / JOURNAL) if storage is None else storage
+    url = _checked(storage, runs_dir)
     if url.endswith(".journal"):
         path = Path(url).expanduser().resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
         return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
-    if "://" not in url:
+    return _patiently(lambda: _database(_with_driver(url)), url)
+
+
+def _checked(storage: str | None, runs_dir: Path) -> str:
+    """The address of the storage.
+
+    Raises:
+        InputError: it is none of the forms of `open_storage`, or its folder does not exist.
+    """
+    url = str(runs_dir / JOURNAL) if storage is None else storage
+    if "://" not in url and not url.endswith(".journal"):
         raise InputError(
             f"storage={without_passwords(url)}: expected a file that ends in .journal, "
             "sqlite:///FILE or postgresql://USER@HOST/NAME."
         )
-    return _patiently(lambda: _database(_with_driver(url)), url)
+    if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).parent.is_dir():
+        raise InputError(f"storage={url}: its folder does not exist; make it first.")
+    return url
 
 
-def _database(url: str) -> optuna.storages.RDBStorage:
+def _database(url: str, *, make: bool = True) -> optuna.storages.RDBStorage:
     import optuna
 
     # A firewall may cut a connection that is idle while a run trains for hours.
-    return optuna.storages.RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
+    kept_alive = {"pool_pre_ping": True}
+    return optuna.storages.RDBStorage(url, engine_kwargs=kept_alive, skip_table_creation=not make)
 
 
 def _with_driver(url: str) -> str:
@@ -159,13 +172,29 @@ def begin_study(
 
 
 def existing_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
-    """The study called `name`; None where it, or the file of the storage, does not exist."""
-    named = Path(str(storage).removeprefix("sqlite:///")).expanduser()
-    path = runs_dir / JOURNAL if storage is None else named
-    if "://" not in str(storage or "").removeprefix("sqlite:///") and not path.exists():
+    """The study called `name`; None where it does not exist. Nothing is made.
+
+    Raises:
+        InputError: the storage cannot be reached, or its address is of no known form.
+    """
+    import optuna
+
+    url = _checked(storage, runs_dir)
+    path = Path(url.removeprefix("sqlite:///")).expanduser()
+    if "://" not in str(path) and not url.startswith("postgres") and not path.exists():
         return None
-    opened = open_storage(storage, runs_dir)
-    return load_study(name, opened) if name in study_names(opened) else None
+    if url.endswith(".journal"):
+        opened = open_storage(storage, runs_dir)
+        return load_study(name, opened) if name in study_names(opened) else None
+    try:
+        database = _database(_with_driver(url), make=False)
+        return load_study(name, database) if name in study_names(database) else None
+    except optuna.exceptions.StorageInternalError as error:
+        if "connection" in str(error.__cause__).lower():
+            raise InputError(
+                f"storage={without_passwords(url)} cannot be reached: {error}"
+            ) from error
+        return None  # a database without Optuna's tables holds no study
 
 
 def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:

@@ -188,7 +188,8 @@ class Work:
         if found.run_id:
             raise PointError(
                 f"run {found.key} was made on another machine: its further evaluations "
-                f"({evaluation.modality}, {evaluation.regions}) can only be made there"
+                f"({evaluation.modality}, {evaluation.regions}) can only be made there; to train "
+                f"it here, delete MLflow run {found.run_id} and {found.folder}"
             )
         log = self._around.runs.runs_dir / LOGS / f"{found.key}.log"
         begin = log.stat().st_size if log.exists() else 0
