@@ -13,10 +13,10 @@ from rgbt.config import check_node
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
-    from sweeps.cell_points import Wanted
-    from sweeps.found import Runs
-    from sweeps.lists import PointList
+    from sweeps.running.found import Runs
+    from sweeps.running.lists import PointList
     from sweeps.settings import Settings
+    from sweeps.table.cell_points import Wanted
 
 Arguments = Mapping[str, str]
 """Values by key, as typed."""
@@ -115,9 +115,9 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
         InputError: no such table, scale or metric; no seeds.
     """
     from rgbt.config import conf_dir
-    from sweeps.cell_points import Wanted, seeds_of
-    from sweeps.scoring import check_metrics
-    from sweeps.table import load_table
+    from sweeps.table.cell_points import Wanted, seeds_of
+    from sweeps.table.scoring import check_metrics
+    from sweeps.table.table import load_table
 
     scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
     check_choice("scale", arguments["scale"], scales)
@@ -131,7 +131,7 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
 def runs_of(place: Place) -> Runs:
     """Where finished runs are found, as the overrides of the tracker say."""
     from rgbt.config import build, compose
-    from sweeps.found import Runs
+    from sweeps.running.found import Runs
 
     with composing(place.base):
         config = compose(place.base)
@@ -141,7 +141,7 @@ def runs_of(place: Place) -> Runs:
 
 def point_list(wanted: Wanted, place: Place, runs: Runs) -> PointList:
     """The runs of a table, as the driver takes them."""
-    from sweeps.lists import PointList
+    from sweeps.running.lists import PointList
 
     return PointList(
         study=f"table/{wanted.name}",

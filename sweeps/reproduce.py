@@ -10,8 +10,8 @@ import sys
 from rgbt.checks import InputError
 from rgbt.command import plain_command
 from sweeps.asked import Arguments, Place, place_of, point_list, runs_of, settings_of, wanted_of
-from sweeps.cell_points import Wanted
 from sweeps.settings import Settings
+from sweeps.table.cell_points import Wanted
 
 OWN = {
     "table": None,
@@ -67,8 +67,8 @@ def _preview(wanted: Wanted, place: Place, settings: Settings) -> int:
     from rich.text import Text
 
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.lists import survey
-    from sweeps.preview import cells_grid, summary
+    from sweeps.running.lists import survey
+    from sweeps.sheet.preview import cells_grid, summary
 
     outcomes = survey(point_list(wanted, place, runs_of(place)), settings)
     if outcomes:
@@ -81,9 +81,9 @@ def _preview_all(
     arguments: Arguments, extra: tuple[str, ...], place: Place, settings: Settings
 ) -> int:
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.lists import survey
-    from sweeps.preview import tables_grid
-    from sweeps.table import table_names
+    from sweeps.running.lists import survey
+    from sweeps.sheet.preview import tables_grid
+    from sweeps.table.table import table_names
 
     if not settings.dry_run:
         raise InputError("table=all is for dry_run=true; run one table at a time.")
@@ -95,8 +95,8 @@ def _preview_all(
 
 
 def _reproduce(wanted: Wanted, place: Place, settings: Settings) -> int:
-    from sweeps.lists import work_off
-    from sweeps.table_results import finish
+    from sweeps.running.lists import work_off
+    from sweeps.sheet.results import finish
 
     runs = runs_of(place)
     points = point_list(wanted, place, runs)
@@ -107,8 +107,8 @@ def _reproduce(wanted: Wanted, place: Place, settings: Settings) -> int:
 def entry() -> None:
     """The command; its first word may be ``new``."""
     if sys.argv[1:2] == ["new"]:
-        from sweeps.new import OWN as OF_NEW
-        from sweeps.new import new
+        from sweeps.table.new import OWN as OF_NEW
+        from sweeps.table.new import new
 
         del sys.argv[1]
         plain_command(OF_NEW, new)()

@@ -13,18 +13,18 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
-from sweeps.driver import Driver
-from sweeps.found import Runs
-from sweeps.ledger import Ledger
-from sweeps.lists import make_executor
-from sweeps.live import View
-from sweeps.owner import Owner
-from sweeps.plan import Planner
-from sweeps.samplers import build_pruner, build_sampler
+from sweeps.running.driver import Driver
+from sweeps.running.found import Runs
+from sweeps.running.ledger import Ledger
+from sweeps.running.lists import make_executor
+from sweeps.running.live import View
+from sweeps.running.owner import Owner
+from sweeps.running.plan import Planner
+from sweeps.running.sources import SearchSource
+from sweeps.running.storage import begin_study, existing_study, open_storage
 from sweeps.settings import Settings
-from sweeps.sources import SearchSource
-from sweeps.space import Parameter, signature
-from sweeps.storage import begin_study, existing_study, open_storage
+from sweeps.space.samplers import build_pruner, build_sampler
+from sweeps.space.space import Parameter, signature
 from sweeps.study import dashboard_command, report, show_places, study_folder
 
 

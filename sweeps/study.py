@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 from rgbt.checks import InputError
 from rgbt.command import composing, plain_command, readable_paths
 from rgbt.tracking.provenance import without_passwords
-from sweeps.storage import JOURNAL, load_study, open_storage, study_names
+from sweeps.running.storage import JOURNAL, load_study, open_storage, study_names
 
 if TYPE_CHECKING:
     import optuna
 
     from rgbt.tracking.mlflow_store import Link, Tracking
     from rgbt.tracking.tables import Grid
-    from sweeps.study_data import Importances, StudyData
-    from sweeps.study_figures import Picture
+    from sweeps.report.data import Importances, StudyData
+    from sweeps.report.figures import Picture
 
 OWN = {"name": "", "storage": "", "runs_dir": "runs", "out": ""}
 
@@ -72,10 +72,10 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
 
     from rgbt.tracking.files import write_atomic
     from rgbt.tracking.terminal import show
-    from sweeps.records import record
-    from sweeps.study_data import importances, read
-    from sweeps.study_figures import draw
-    from sweeps.study_tables import tables, terminal_table, trials_csv
+    from sweeps.report.data import importances, read
+    from sweeps.report.figures import draw
+    from sweeps.report.records import record
+    from sweeps.report.tables import tables, terminal_table, trials_csv
 
     data = read(study)
     shares = importances(data)
@@ -103,7 +103,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
 
 def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str:
     """The report in Markdown, without figures: MLflow's descriptions cannot show them."""
-    from sweeps.study_tables import markdown_table
+    from sweeps.report.tables import markdown_table
 
     way = ["highest" if up else "lowest" for up in data.maximize]
     wanted = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
@@ -132,8 +132,8 @@ def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
 
 def metrics(data: StudyData) -> dict[str, float]:
     """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
-    from sweeps.study_data import pruning
-    from sweeps.study_tables import WORDS
+    from sweeps.report.data import pruning
+    from sweeps.report.tables import WORDS
 
     found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
     for index, metric in enumerate(data.metrics):

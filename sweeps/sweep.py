@@ -14,15 +14,15 @@ from rgbt.checks import InputError, RunError
 from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
-from sweeps.found import Runs, open_runs
-from sweeps.grid import GridPoint, Swept, distributions, grid_points, list_points, split
-from sweeps.lists import Outcome, PointList, estimated_seconds, survey, work_off
-from sweeps.live import duration
 from sweeps.points import Point
+from sweeps.running.found import Runs, open_runs
+from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey, work_off
+from sweeps.running.live import duration
+from sweeps.running.sources import short
 from sweeps.search import Search, search
 from sweeps.settings import Settings, read_settings
-from sweeps.sources import short
-from sweeps.space_merge import merge_space
+from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
+from sweeps.space.merge import merge_space
 
 PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking", "trainer.threads")
 """Overrides that may differ between two calls of the same sweep."""

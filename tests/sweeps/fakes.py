@@ -20,19 +20,19 @@ from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
-from sweeps import driver as drivers
-from sweeps import sources
-from sweeps.driver import Driver
-from sweeps.found import Runs
-from sweeps.ledger import Ledger
-from sweeps.owner import STALE_S, Owner
-from sweeps.plan import Plan, PlannedRun
 from sweeps.points import Point
+from sweeps.running import driver as drivers
+from sweeps.running import sources
+from sweeps.running.driver import Driver
+from sweeps.running.found import Runs
+from sweeps.running.ledger import Ledger
+from sweeps.running.owner import STALE_S, Owner
+from sweeps.running.plan import Plan, PlannedRun
+from sweeps.running.sources import ListSource, SearchSource
+from sweeps.running.storage import begin_study
+from sweeps.running.work import Work
 from sweeps.settings import Objective, Settings
-from sweeps.sources import ListSource, SearchSource
-from sweeps.space import parse_space
-from sweeps.storage import begin_study
-from sweeps.work import Work
+from sweeps.space.space import parse_space
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
@@ -403,7 +403,7 @@ def search_desk(
     **changes: Any,
 ) -> Desk:
     """A driver of a search over x in 0..1, or over `space`."""
-    from sweeps.samplers import build_sampler
+    from sweeps.space.samplers import build_sampler
 
     wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
     storage = memory() if storage is None else storage

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from sweeps.lists import Outcome
 from sweeps.points import Evaluation, Point
-from sweeps.scoring import Scored, score
-from sweeps.table import Column, Row, Table
+from sweeps.running.lists import Outcome
+from sweeps.table.scoring import Scored, score
+from sweeps.table.table import Column, Row, Table
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
@@ -40,7 +40,7 @@ def right(share: int) -> Counts:
 
 @dataclass(frozen=True)
 class FakeFound:
-    """Stands for `sweeps.found.Found`."""
+    """Stands for `sweeps.running.found.Found`."""
 
     key: str
     made: Mapping[Evaluation | None, Counts]

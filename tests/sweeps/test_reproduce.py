@@ -9,13 +9,14 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps import lists, table_results
 from sweeps.asked import OF_THE_TABLE, settings_of
-from sweeps.lists import Outcome, PointList
 from sweeps.points import Point
-from sweeps.preview import duration
 from sweeps.reproduce import OWN, entry
+from sweeps.running import lists
+from sweeps.running.lists import Outcome, PointList
 from sweeps.settings import EXECUTION, Settings
+from sweeps.sheet import results as table_results
+from sweeps.sheet.preview import duration
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeFound, right
 

@@ -32,7 +32,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         calls.append({"tracking": tracking, **told})
         return [("this run", "http://127.0.0.1:5000/#/run")]
 
-    monkeypatch.setitem(sys.modules, "sweeps.records", SimpleNamespace(record=record))
+    monkeypatch.setitem(sys.modules, "sweeps.report.records", SimpleNamespace(record=record))
     return calls
 
 

@@ -1,0 +1,1 @@
+"""Who runs what: points in a study, drivers, processes, results found again."""

@@ -1,0 +1,124 @@
+"""How a command becomes a process: here, in a worker that is already warm.
+
+Importing torch and MLflow takes longer than a small run's first step. A fork server imports them
+once and forks a fresh process for every run: no state is carried from run to run, and the code is
+the one that was there when the driver began, also if somebody edits it meanwhile.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import runpy
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+PRELOADED = (
+    *(
+        "sweeps.running.executors",
+        "torch",
+        "rgbt.training",
+        "rgbt.evaluate",
+        "rgbt.stored",
+        "hydra",
+    ),
+    *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
+)
+GRACE_S = 20.0
+"""What a process that is asked to stop may take before it is killed."""
+
+
+class Job(Protocol):
+    """A process that was started."""
+
+    def poll(self) -> int | None:
+        """Its exit code, negative for a signal; None while it runs."""
+        ...
+
+    def stop(self) -> None:
+        """Ask it to stop; where it does not, later calls of `poll` kill it."""
+        ...
+
+
+class Executor(Protocol):
+    """Starts commands; it does not wait for them."""
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
+        """Start ``python -m <command>``.
+
+        Args:
+            command: module and its arguments, e.g. ("rgbt.run", "+experiment=grbm").
+            environment: variables set beside those of this process.
+            log: file that takes stdout and stderr, appended to.
+        """
+        ...
+
+
+class LocalExecutor:
+    """Processes on this machine, forked from one that has imported torch."""
+
+    def __init__(self) -> None:
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(list(PRELOADED))
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
+        """See `Executor.start`."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        process = self._context.Process(
+            target=_run_module, args=(tuple(command), dict(environment), str(log), str(Path.cwd()))
+        )
+        # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
+        process.start()
+        return LocalJob(process)
+
+
+class LocalJob:
+    """See `Job`. The process leads a process group, so that its workers go with it."""
+
+    def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
+        self._process = process
+        self._kill_at = float("inf")
+
+    def poll(self) -> int | None:
+        """See `Job.poll`."""
+        if self._process.exitcode is None and time.monotonic() > self._kill_at:
+            self._signal(signal.SIGKILL)
+        return self._process.exitcode
+
+    def stop(self) -> None:
+        """See `Job.stop`."""
+        self._kill_at = min(self._kill_at, time.monotonic() + GRACE_S)
+        self._signal(signal.SIGTERM)
+
+    def _signal(self, number: signal.Signals) -> None:
+        assert self._process.pid is not None, "a started process has a number"
+        try:
+            os.killpg(self._process.pid, number)
+        except ProcessLookupError:  # not yet the leader of its group, or gone already
+            if self._process.exitcode is None:
+                os.kill(self._process.pid, number)
+
+
+def _run_module(
+    command: Sequence[str], environment: Mapping[str, str], log: str, folder: str
+) -> None:
+    """In the new process: become ``python -m <command>``."""
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.update(environment)
+    if "OMP_NUM_THREADS" in environment:  # too late for the library, which is loaded already
+        import torch
+
+        torch.set_num_threads(int(environment["OMP_NUM_THREADS"]))
+    os.chdir(folder)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    module, *arguments = command
+    sys.argv = [module, *arguments]
+    sys.orig_argv = [sys.executable, "-m", *command]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)

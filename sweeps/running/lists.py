@@ -1,0 +1,182 @@
+"""Points known beforehand: what is missing of a grid or a table is run, what there is is found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError
+from sweeps import attributes as names
+from sweeps.points import Point
+from sweeps.running.driver import Driver
+from sweeps.running.executors import Executor, LocalExecutor
+from sweeps.running.follow import known_seconds
+from sweeps.running.found import Found, Runs
+from sweeps.running.ledger import Ledger
+from sweeps.running.live import View
+from sweeps.running.owner import Owner
+from sweeps.running.plan import Plan, Planner
+from sweeps.running.sources import ListSource, Standing, State, known
+from sweeps.running.storage import begin_study, existing_study, open_storage
+from sweeps.settings import Settings
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a point.
+
+    Attributes:
+        point: the point.
+        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
+        reason: why it failed, or "".
+        found: its finished runs.
+        keys: of its runs; () where its configuration is wrong.
+    """
+
+    point: Point
+    state: State
+    reason: str = ""
+    found: tuple[Found, ...] = ()
+    keys: tuple[str, ...] = ()
+
+    @property
+    def seconds(self) -> float | None:
+        """How long its runs took, as far as they know."""
+        each = [known_seconds(found.folder) for found in self.found]
+        return None if not each or None in each else sum(s for s in each if s is not None)
+
+
+@dataclass(frozen=True)
+class PointList:
+    """A named list of points.
+
+    Attributes:
+        study: name of the study.
+        title: what a person reads above the progress.
+        kind: "grid" or "list".
+        points: the points.
+        runs: where finished runs are found; the points' overrides name the same folder.
+        base: overrides that all have.
+        distributions: of the parameters of a grid, by name.
+    """
+
+    study: str
+    title: str
+    kind: str
+    points: tuple[Point, ...]
+    runs: Runs
+    base: tuple[str, ...] = ()
+    distributions: Mapping[str, Any] | None = None
+
+
+def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
+    """What is known of the points; nothing is run and nothing written."""
+    prepared = _Prepared(wanted)
+    study = existing_study(wanted.study, settings.storage, prepared.runs.runs_dir)
+    by_key: dict[str, list[FrozenTrial]] = {}
+    for trial in study.get_trials(deepcopy=False) if study is not None else ():
+        if not trial.user_attrs.get(names.DROPPED):
+            by_key.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
+    return prepared.outcomes(lambda plan: _seen(plan, by_key.get(plan.key, []), prepared.runs))
+
+
+def _seen(plan: Plan, trials: Sequence[FrozenTrial], runs: Runs) -> Standing:
+    found = known(plan, runs)
+    if found is not None:
+        return Standing("finished", found=found)
+    states = [trial.state.name for trial in trials]
+    if "RUNNING" in states:
+        return Standing("running")
+    if states and states[-1] == "FAIL":
+        return Standing("failed", str(trials[-1].user_attrs.get(names.REASON, "")))
+    return Standing("waiting")
+
+
+def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
+    """Run what is missing of the points; failures are isolated and told in the outcomes.
+
+    Returns:
+        one outcome per point, in their order.
+
+    Raises:
+        InputError: the storage or the executor cannot be used.
+    """
+    prepared = _Prepared(wanted)
+    runs = prepared.runs
+    storage = open_storage(settings.storage, runs.runs_dir)
+    runs.touch()
+    study = begin_study(wanted.study, storage, settings.objectives, {names.KIND: wanted.kind})
+    ledger = Ledger(study, storage, Owner.me())
+    plans = list(prepared.plans.values())
+    source = ListSource(plans, ledger, runs, settings, dict(wanted.distributions or {}))
+
+    def done() -> int:
+        by_key = ledger.by_key()
+        states = [source.standing(plan, by_key).state for plan in source.plans.values()]
+        return sum(state in ("finished", "failed") for state in states)
+
+    view = View(wanted.title, len(source.plans), settings.workers, done)
+    driver = Driver(
+        ledger=ledger,
+        source=source,
+        runs=runs,
+        executor=make_executor(settings, runs.runs_dir),
+        settings=settings,
+        view=view,
+        metrics=[objective.metric for objective in settings.objectives],
+    )
+    with view:
+        driver.run()
+    by_key = ledger.by_key()
+    return prepared.outcomes(lambda plan: source.standing(plan, by_key))
+
+
+class _Prepared:
+    """Points planned; those with a wrong configuration are known to fail."""
+
+    def __init__(self, wanted: PointList) -> None:
+        planner = Planner(wanted.base)
+        self.runs = wanted.runs
+        self.points = wanted.points
+        self.plans: dict[int, Plan] = {}
+        self.wrong: dict[int, str] = {}
+        for index, point in enumerate(wanted.points):
+            try:
+                self.plans[index] = planner.plan(point)
+            except InputError as error:
+                self.wrong[index] = str(error)
+
+    def outcomes(self, standing: Any) -> list[Outcome]:
+        """One outcome per point, in order."""
+        found = []
+        for index, point in enumerate(self.points):
+            if index in self.wrong:
+                found.append(Outcome(point, "failed", self.wrong[index]))
+                continue
+            plan = self.plans[index]
+            seen = standing(plan)
+            keys = tuple(run.key for run in plan.runs)
+            found.append(Outcome(point, seen.state, seen.reason, seen.found, keys))
+        return found
+
+
+def make_executor(settings: Settings, runs_dir: Path) -> Executor:
+    """What `executor` and its options name."""
+    if settings.executor == "local":
+        return LocalExecutor()
+    from sweeps.running.submitit_executor import SubmititExecutor
+
+    return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
+
+
+def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:
+    """How long the points that are not finished will take; None where no run tells."""
+    known_ones = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
+    missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
+    return missing * median(known_ones) / workers if known_ones else None

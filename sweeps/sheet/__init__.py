@@ -1,0 +1,1 @@
+"""A scored table for people: terminal, Markdown, CSV, LaTeX, figure."""

@@ -1,0 +1,73 @@
+"""What `dry_run=true` shows of a table: its cells, what is known of them, the time left."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from rgbt.tracking.tables import ABSENT, Grid
+from sweeps.running.lists import Outcome, estimated_seconds
+from sweeps.running.sources import State
+from sweeps.table.cell_points import Wanted
+
+STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
+
+
+def cells_grid(wanted: Wanted, outcomes: Sequence[Outcome]) -> Grid:
+    """One line per run: state, seconds or the reason why it failed, command."""
+    rows = [
+        (
+            outcome.point.label,
+            outcome.state,
+            ABSENT if outcome.seconds is None else f"{outcome.seconds:.0f}",
+            " ".join(outcome.keys) or ABSENT,
+            outcome.reason,
+        )
+        for outcome in outcomes
+    ]
+    title = f"{wanted.name}, scale={wanted.scale}: runs of the cells"
+    return Grid(title, ("cell", "state", "seconds", "run", "reason"), tuple(rows))
+
+
+def tables_grid(surveyed: Sequence[tuple[Wanted, Sequence[Outcome]]], workers: int) -> Grid:
+    """One line per table: rows, runs by state, estimated time."""
+    rows = []
+    for wanted, outcomes in surveyed:
+        runnable = sum(wanted.table.runnable(row) for row in wanted.table.rows)
+        states = Counter(outcome.state for outcome in outcomes)
+        counts = (str(states[state]) for state in STATES)
+        time = duration(estimated_seconds(outcomes, workers)) if outcomes else ABSENT
+        rows.append((wanted.name, f"{runnable} of {len(wanted.table.rows)}", *counts, time))
+    header = ("table", "rows to run", *STATES, "time left")
+    return Grid("Runs of all tables", header, tuple(rows))
+
+
+def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[str]:
+    """Sentences below the cells: how many, how long, what cannot be run."""
+    states = Counter(outcome.state for outcome in outcomes)
+    counted = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
+    lines = [f"{len(outcomes)} runs: {counted or 'none'}."]
+    left = len(outcomes) - states["finished"]
+    if left:
+        seconds = estimated_seconds(outcomes, workers)
+        known = duration(seconds) if seconds is not None else "known once a run is finished"
+        lines.append(f"Time left with workers={workers}: {known}.")
+    if wanted.table.needs is not None:
+        lines.append(f"The table cannot be run yet; it needs {wanted.table.needs}.")
+    for row in wanted.table.rows:
+        if row.needs is not None:
+            lines.append(f"Row '{row.label}' cannot be run yet; it needs {row.needs}.")
+    for column in wanted.table.columns:
+        if column.needs is not None:
+            lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
+    return lines
+
+
+def duration(seconds: float | None) -> str:
+    """E.g. "2 h 05 min", "3 min", "40 s"; "unknown" before any run is finished."""
+    if seconds is None:
+        return "unknown"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -1,0 +1,92 @@
+"""A computed table as lines of text with footnotes, before it becomes any kind of file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sweeps.sheet.lines import Builder
+from sweeps.sheet.texts import Footnotes, Line, Text
+from sweeps.table.scoring import Scored
+
+DEMO = (
+    "scale=demo: data and network are small; compare the order of the rows with the paper, not the "
+    "values."
+)
+ORDER = (
+    "rho: Spearman's rank correlation between our means and the published values over n rows; "
+    "+1: the same order."
+)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What is shown.
+
+    Attributes:
+        title: number and caption.
+        header: above the fields of a line; the column of labels has none.
+        lines: those of a row follow each other.
+        notes: footnotes, 1 first.
+        remarks: sentences below the table that no mark refers to.
+    """
+
+    title: Text
+    header: tuple[Text, ...]
+    lines: tuple[Line, ...]
+    notes: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    def remarks_with(self, legend: str) -> list[str]:
+        """The remarks, with the legend of the marks if there are any."""
+        marked = any(text.rank for line in self.lines for text in line.fields)
+        return [*self.remarks, *([legend] if marked else [])]
+
+
+def sheet_of(scored: Scored, extra: Sequence[str] = ()) -> Sheet:
+    """Lay a table out.
+
+    Args:
+        scored: the table.
+        extra: overrides that the user added to every row.
+    """
+    table, notes = scored.table, Footnotes()
+    builder = Builder(scored, notes)
+    title = Text(f"{table.paper}, {table.number}: {table.caption}")
+    title_notes = notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
+    columns = [
+        Text(column.name, notes=notes(column.needs and f"Not computed: {column.needs}"))
+        for column in table.columns
+    ]
+    lines = [line for row in table.rows for line in builder.row(row)] + builder.order()
+    return Sheet(
+        title=Text(title.text, notes=title_notes),
+        header=builder.header(columns),
+        lines=tuple(lines),
+        notes=tuple(notes.sentences),
+        remarks=tuple(_remarks(scored, extra)),
+    )
+
+
+def _remarks(scored: Scored, extra: Sequence[str]) -> list[str]:
+    """Sentences below the table."""
+    table = scored.table
+    printed = any(row.values for row in table.rows)
+    remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
+    if scored.seeds:
+        many = len(scored.seeds) > 1
+        seeds = ", ".join(map(str, scored.seeds))
+        spread = "mean ± standard deviation (n - 1) over" if many else "of"
+        remarks.append(f"Ours: scale={scored.scale}, {spread} seed{'s' * many} {seeds}.")
+    if any(order.rows for order in scored.orders.values()):
+        remarks.append(ORDER)
+    if scored.seeds and scored.scale == "demo" and printed:
+        remarks.append(DEMO)
+    if extra:
+        remarks.append(f"Every row of ours was run with {' '.join(extra)}.")
+    if len(scored.commits) > 1:
+        named = Counter(scored.commits).most_common()
+        commits = ", ".join(f"{commit} ({count})" for commit, count in named)
+        remarks.append(f"Runs of ours come from several git commits: {commits}.")
+    return remarks

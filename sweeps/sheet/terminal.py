@@ -1,0 +1,96 @@
+"""A computed table for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rich.text import Text as RichText
+
+from sweeps.sheet.lines import WITH_SD
+from sweeps.sheet.sheet import Sheet
+from sweeps.sheet.texts import Text
+
+STYLES = ("", "bold", "underline")
+SIGNS = ("", "*", "_")
+"""By rank: how the best and the second best are shown, with and without styles."""
+
+GAP = 2
+"""Spaces between two columns in the terminal."""
+
+WIDE = WITH_SD + 2
+"""Columns, those of words and seeds counted, above which names are broken into several lines."""
+
+LEGENDS = ("Bold: best, underlined: second best.", "*: best, _: second best.")
+
+
+def terminal(sheet: Sheet, *, plain: bool = False) -> RichText:
+    """The table for `rgbt.tracking.terminal.show`; as wide as it needs to be, never cut.
+
+    Args:
+        sheet: the table.
+        plain: mark the best with signs, where neither bold nor underline would be shown.
+    """
+    header = [(Text(), *line) for line in _stacked(sheet.header)]
+    body = [(line.label, *line.fields) for line in sheet.lines]
+    columns = list(zip(*header, *body, strict=True))
+    tails = [max(len(_tail(text)) for text in column) for column in columns]
+    fields = [
+        [_rich(text, tail, plain=plain) for text, tail in zip(row, tails, strict=True)]
+        for row in (*header, *body)
+    ]
+    widths = [max(field.cell_len for field in column) for column in zip(*fields, strict=True)]
+    numeric = [any(text.text for text in column[: len(header)]) for column in columns]
+    lines = [_aligned(row, widths, numeric) for row in fields]
+    for line, row in zip(sheet.lines, lines[len(header) :], strict=True):
+        row.stylize("dim" if line.kind in ("sd", "difference") else "")
+    rule = RichText("─" * (sum(widths) + GAP * (len(widths) - 1)))
+    title = RichText(f"{sheet.title.text}{_bracketed(sheet.title)}", "bold")
+    below = [f"[{index}] {note}" for index, note in enumerate(sheet.notes, start=1)]
+    below += sheet.remarks_with(LEGENDS[plain])
+    top, rest = lines[: len(header)], lines[len(header) :]
+    return RichText("\n").join([title, *top, rule, *rest, rule, *map(RichText, below)])
+
+
+def _stacked(header: Sequence[Text]) -> list[tuple[Text, ...]]:
+    """The header in one line; of a wide table in several, names broken at underscores."""
+    if len(header) <= WIDE:
+        return [tuple(header)]
+    broken = [text.text.split("_") for text in header]
+    height = max(map(len, broken))
+    filled = [[""] * (height - len(words)) + words for words in broken]
+    lines = [
+        [replace(text, text=words[i], notes=()) for text, words in zip(header, filled, strict=True)]
+        for i in range(height)
+    ]
+    lines[-1] = [
+        replace(text, notes=whole.notes) for text, whole in zip(lines[-1], header, strict=True)
+    ]
+    return [tuple(line) for line in lines]
+
+
+def _aligned(row: Sequence[RichText], widths: Sequence[int], numeric: Sequence[bool]) -> RichText:
+    """One line: numbers to the right, words to the left."""
+    line = RichText()
+    for index, (text, width, right) in enumerate(zip(row, widths, numeric, strict=True)):
+        text.align("right" if right else "left", width)
+        line.append(" " * GAP if index else "").append_text(text)
+    line.rstrip()
+    return line
+
+
+def _rich(text: Text, tail_width: int, *, plain: bool) -> RichText:
+    """A field whose tail takes `tail_width` characters, so that numbers stand below each other."""
+    sign = SIGNS[text.rank] if plain else ""
+    tail = _tail(text).ljust(tail_width)
+    # Styled in parts: the padding beside a number is not underlined.
+    return RichText().append(f"{sign}{text.text}", STYLES[text.rank]).append(tail)
+
+
+def _tail(text: Text) -> str:
+    """What stands behind the number: spread and footnotes."""
+    return text.whole.removeprefix(text.text) + _bracketed(text)
+
+
+def _bracketed(text: Text) -> str:
+    return "".join(f"[{index}]" for index in text.notes)

@@ -1,0 +1,166 @@
+"""Who chooses the next point of a search, and which trials are not worth going on with.
+
+Options are those of Optuna's constructors, as far as a file can say them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, check_choice, nearest
+
+if TYPE_CHECKING:
+    from optuna.pruners import BasePruner
+
+    from sweeps.space.per_trial import PerTrialSampler
+
+SAMPLERS = {
+    "tpe": "TPESampler",
+    "random": "RandomSampler",
+    "gp": "GPSampler",
+    "nsga2": "NSGAIISampler",
+    "cmaes": "CmaEsSampler",
+}
+"""Samplers whose memory is the storage: the others (QMC, grid, brute force) count for themselves,
+which neither several drivers nor a search that is resumed can share. nsga2 crosses earlier points
+and may propose one of them again."""
+
+PRUNERS = {
+    "none": "NopPruner",
+    "median": "MedianPruner",
+    "percentile": "PercentilePruner",
+    "successive_halving": "SuccessiveHalvingPruner",
+    "hyperband": "HyperbandPruner",
+    "patient": "PatientPruner",
+}
+"""Pruners of a curve over steps of the optimizer. `patient` stops a trial that has not risen for
+`patience` reports, whatever the other trials do."""
+
+PLAIN: dict[str, Any] = {
+    "int": int,
+    "float": float,
+    "bool": bool,
+    "int | None": int | None,
+    "float | None": float | None,
+    "bool | None": bool | None,
+    "str | int": str | int,
+}
+"""Annotations of options that a file can say."""
+
+NOT_OPTIONS = (
+    "seed",
+    *("consider_prior", "prior_weight", "consider_magic_clip", "consider_endpoints"),
+    *("sigma0", "inc_popsize"),
+)
+"""The seed has its own key; Optuna 6 drops the others."""
+
+
+def build_sampler(
+    kind: str, seed: int, options: Mapping[str, Any], objectives: int = 1
+) -> PerTrialSampler:
+    """The sampler of a search.
+
+    Args:
+        kind: one of `SAMPLERS`.
+        seed: one worker with the same seed proposes the same points, see `PerTrialSampler`.
+        options: of Optuna's constructor, e.g. ``{"n_startup_trials": 5}``.
+        objectives: how many numbers the search follows.
+
+    Raises:
+        InputError: unknown kind or option, an option of a wrong type or value, a missing package,
+            or a sampler that cannot follow so many objectives.
+    """
+    import optuna
+
+    from sweeps.space.per_trial import PerTrialSampler
+
+    check_choice("sampler.kind", kind, SAMPLERS)
+    if kind == "cmaes":
+        _check_cmaes(objectives)
+    make = getattr(optuna.samplers, SAMPLERS[kind])
+    checked = _options("sampler", kind, make, options)
+
+    def seeded(trial_seed: int) -> optuna.samplers.BaseSampler:
+        sampler: optuna.samplers.BaseSampler = make(**checked, seed=trial_seed)
+        return sampler
+
+    _told("sampler", kind, partial(seeded, 0))
+    return PerTrialSampler(seeded, seed)
+
+
+def build_pruner(kind: str, options: Mapping[str, Any], objectives: int = 1) -> BasePruner:
+    """The pruner of a search; trials report at their validation steps.
+
+    Args:
+        kind: one of `PRUNERS`.
+        options: of Optuna's constructor. Those that count steps (``n_warmup_steps``,
+            ``min_resource``) count steps of the optimizer, not validations.
+        objectives: how many numbers the search follows.
+
+    Raises:
+        InputError: unknown kind or option, an option of a wrong type or value or without one, or
+            more than one objective.
+    """
+    import optuna
+
+    check_choice("pruner.kind", kind, PRUNERS)
+    if kind != "none" and objectives > 1:
+        raise InputError(
+            f"pruner.kind={kind} compares trials by one number, and this search has {objectives} "
+            "objectives; take hydra.sweeper.pruner=null or one objective."
+        )
+    make = getattr(optuna.pruners, PRUNERS[kind])
+    fixed = {"wrapped_pruner": None} if kind == "patient" else {}
+    checked = _options("pruner", kind, make, options)
+    pruner: BasePruner = _told("pruner", kind, partial(make, **fixed, **checked))
+    return pruner
+
+
+def _check_cmaes(objectives: int) -> None:
+    if importlib.util.find_spec("cmaes") is None:
+        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
+    if objectives > 1:
+        raise InputError(
+            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
+            "take tpe, gp or nsga2."
+        )
+
+
+def _options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """`given`, checked against the signature of `make`."""
+    import pydantic
+
+    parameters = inspect.signature(make).parameters
+    words = {name: _annotation(one) for name, one in parameters.items() if name not in NOT_OPTIONS}
+    known = {name: PLAIN[word] for name, word in words.items() if word in PLAIN}
+    for name in known:
+        if parameters[name].default is inspect.Parameter.empty and name not in given:
+            raise InputError(f"{what}.kind={kind} needs a value of '{name}'; give {what}.{name}.")
+    for name, value in given.items():
+        if name not in known:
+            hint = nearest(name, known) if known else "it has none"
+            raise InputError(f"{what}.{name} is not an option of kind {kind}; {hint}.")
+        try:
+            pydantic.TypeAdapter(known[name]).validate_python(value, strict=True)
+        except pydantic.ValidationError as error:
+            wanted = words[name].replace("None", "null")
+            raise InputError(f"{what}.{name}: expected {wanted}, got {value!r}.") from error
+    return dict(given)
+
+
+def _annotation(parameter: inspect.Parameter) -> str:
+    annotation = parameter.annotation
+    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
+
+
+def _told(what: str, kind: str, make: partial[Any]) -> Any:
+    """What `make` makes; values that Optuna itself refuses are the user's mistake."""
+    try:
+        return make()
+    except ValueError as error:
+        reason = str(error).rstrip(".")
+        raise InputError(f"{what}.kind={kind} does not take these options: {reason}.") from error

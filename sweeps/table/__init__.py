@@ -1,0 +1,1 @@
+"""Tables as files, their cells as points, and what is scored of the runs."""

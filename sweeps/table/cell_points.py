@@ -1,0 +1,102 @@
+"""The runs that a table needs, as points: one per row and seed, rows that are the same run once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError
+from sweeps.points import Evaluation, Point
+from sweeps.table.cells import evaluation_of, is_counted
+from sweeps.table.table import Table
+
+if TYPE_CHECKING:
+    from sweeps.running.lists import Outcome
+
+DEFAULT_SCALE = "demo"
+"""What a run is without ``scale=...``."""
+
+TAG = "rgbt.table/"
+"""Beginning of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
+
+BETWEEN = " | "
+TAG_LENGTH = 5000
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A table that is asked for.
+
+    Attributes:
+        name: of the table.
+        table: its file.
+        scale: "demo" or "paper".
+        seeds: of every row.
+        extra: overrides that win over those of the rows.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    extra: tuple[str, ...] = ()
+
+    def overrides(self, label: str, seed: int) -> tuple[str, ...]:
+        """Overrides of the run of row `label` with that seed."""
+        (row,) = (row for row in self.table.rows if row.label == label)
+        experiment, *others = self.table.overrides(row, self.scale)
+        scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
+        return (experiment, *scale, *others, *self.extra, f"seed={seed}")
+
+    def places(self) -> list[tuple[str, int]]:
+        """(label, seed) of every cell that can be run; all rows of a seed before the next seed."""
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        return [(row.label, seed) for seed in self.seeds for row in rows]
+
+    def points(self) -> list[Point]:
+        """What is to be run; rows with equal overrides share a point."""
+        sharing: dict[tuple[str, ...], list[str]] = {}
+        for label, seed in self.places():
+            sharing.setdefault(self.overrides(label, seed), []).append(label)
+        evaluations = self.evaluations()
+        return [
+            Point(
+                label=f"{_short(labels)} {overrides[-1]}",
+                overrides=overrides,
+                tags={TAG + self.name: BETWEEN.join(labels)[:TAG_LENGTH]},
+                evaluations=evaluations,
+            )
+            for overrides, labels in sharing.items()
+        ]
+
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        """What every run is evaluated with beside its own evaluation."""
+        counted = filter(is_counted, self.table.columns)
+        asked = (evaluation_of(column, self.table) for column in counted)
+        return tuple(dict.fromkeys(each for each in asked if each is not None))
+
+    def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
+        """The outcome of every cell."""
+        by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
+        return {place: by_overrides[self.overrides(*place)] for place in self.places()}
+
+
+def seeds_of(text: str) -> tuple[int, ...]:
+    """Seeds of ``seeds=3`` (these are 0, 1, 2) or of ``seeds=0,4,7``.
+
+    Raises:
+        InputError: something else.
+    """
+    words = text.strip("[]()").split(",")
+    numbers = tuple(int(word) for word in words if word.strip().isdecimal())
+    if len(numbers) != len(words) or len(set(numbers)) != len(numbers) or numbers == (0,):
+        raise InputError(
+            f"seeds={text}: expected how many (3 for the seeds 0, 1, 2) or a list of different "
+            "ones (0,4,7)."
+        )
+    return tuple(range(numbers[0])) if len(numbers) == 1 else numbers
+
+
+def _short(labels: Sequence[str]) -> str:
+    return labels[0] if len(labels) == 1 else f"{labels[0]} (and {len(labels) - 1} more)"

@@ -1,0 +1,153 @@
+"""Our values of a table: of every run, then mean and spread over seeds."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from sweeps.points import Evaluation
+from sweeps.table.metric_values import value
+
+if TYPE_CHECKING:
+    from sweeps.running.lists import Outcome
+    from sweeps.table.table import Column, Row, Table
+
+NO_VALUE = "no value"
+"""Mark of a cell whose run is there but does not hold what the column asks for."""
+
+Place = tuple[str, str]
+"""(label of the row, name of the column)."""
+
+Value = float | str
+"""A score, or why there is none."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Our value of one row and column.
+
+    Attributes:
+        mean: over seeds, percent (Var: squared percent points); NaN without any.
+        sd: standard deviation over seeds with n - 1; NaN for fewer than two.
+        seeds: number of seeds that went into it.
+        reason: why seeds are missing, or "".
+        mark: the same in a word, e.g. "failed".
+        keys: of the runs.
+    """
+
+    mean: float
+    sd: float
+    seeds: int
+    reason: str = ""
+    mark: str = ""
+    keys: tuple[str, ...] = ()
+
+
+def metric_of(column: Column, row: Row) -> str:
+    """The column's metric with placeholders such as ``{class}`` filled from the row's settings."""
+    return str(column.metric).format_map(row.settings)
+
+
+def evaluation_of(column: Column, table: Table) -> Evaluation | None:
+    """What the column is counted from; None: the evaluation that every run makes itself."""
+    asked = Evaluation(column.modality, table.regions)
+    return None if asked == Evaluation() else asked
+
+
+def is_counted(column: Column) -> bool:
+    """Whether the column is read from counts: neither the difference of others nor missing."""
+    return column.metric is not None
+
+
+def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[Place, Cell]:
+    """The cells of one row; columns that cannot be computed have none.
+
+    Args:
+        table: the table.
+        row: one of its rows.
+        outcomes: what became of the row's runs, by seed.
+    """
+    by_seed = {seed: _values(table, row, outcome) for seed, outcome in outcomes.items()}
+    keys = tuple(run.key for outcome in outcomes.values() for run in outcome.found)
+    cells = {}
+    for column in table.columns:
+        found = {seed: values[column.name] for seed, values in by_seed.items() if values}
+        if column.needs is None and found:
+            marks = {seed: _mark(outcomes[seed], value) for seed, value in found.items()}
+            cells[row.label, column.name] = _cell(found, marks, keys)
+    return cells
+
+
+def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
+    """Every column's value of one run."""
+    counts: dict[Evaluation | None, Counts | str] = {}
+    values: dict[str, Value] = {}
+    for column in filter(is_counted, table.columns):
+        evaluation = evaluation_of(column, table)
+        if evaluation not in counts:
+            counts[evaluation] = _counts(outcome, evaluation)
+        values[column.name] = _value(metric_of(column, row), counts[evaluation], table)
+    for column in table.columns:
+        if column.minus is not None:
+            values[column.name] = _less(*(values.get(name, NO_VALUE) for name in column.minus))
+        elif column.needs is not None:
+            values[column.name] = column.needs
+    return values
+
+
+def _counts(outcome: Outcome, evaluation: Evaluation | None) -> Counts | str:
+    if outcome.state != "finished" or not outcome.found:
+        return outcome.reason or outcome.state
+    try:
+        return outcome.found[0].counts(evaluation)
+    except (InputError, OSError) as error:
+        return str(error)
+
+
+def _value(metric: str, counts: Counts | str, table: Table) -> Value:
+    if isinstance(counts, str):
+        return counts
+    try:
+        found = value(metric, counts, table.absent)
+    except InputError as error:
+        return str(error)
+    return f"'{metric}' has nothing to score" if math.isnan(found) else found
+
+
+def _less(first: Value, second: Value) -> Value:
+    """`first` less `second`; where one is missing, why."""
+    if isinstance(first, str):
+        return first
+    return second if isinstance(second, str) else first - second
+
+
+def _mark(outcome: Outcome, found: Value) -> str:
+    if not isinstance(found, str):
+        return ""
+    return NO_VALUE if outcome.state == "finished" else outcome.state
+
+
+def _cell(found: Mapping[int, Value], marks: Mapping[int, str], keys: tuple[str, ...]) -> Cell:
+    values = [each for each in found.values() if not isinstance(each, str)]
+    reasons: dict[str, list[int]] = {}
+    for seed, each in found.items():
+        if isinstance(each, str):
+            reasons.setdefault(each, []).append(seed)
+    told = [f"{_seeds(seeds)}: {reason}" for reason, seeds in reasons.items()]
+    return Cell(
+        mean=statistics.fmean(values) if values else math.nan,
+        sd=statistics.stdev(values) if len(values) > 1 else math.nan,
+        seeds=len(values),
+        reason="; ".join(told),
+        mark=next((mark for mark in marks.values() if mark), ""),
+        keys=keys,
+    )
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"

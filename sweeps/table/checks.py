@@ -1,0 +1,81 @@
+"""What the types of a table file do not say: names that must exist, and names that must differ."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError, check_choice
+from rgbt.config import conf_dir
+
+if TYPE_CHECKING:
+    from sweeps.table.table import Column, Factor, Row, Table
+
+
+def check_table(table: Table, place: str) -> None:
+    """Refuse a table whose parts do not fit.
+
+    Args:
+        table: with the right types.
+        place: its file, for messages.
+
+    Raises:
+        InputError: an experiment, scale or regions that the configuration does not know; a column
+            that no column has; a label or name that stands twice; an `x` without an axis.
+    """
+    names = [column.name for column in table.columns]
+    _check_distinct(names, f"{place}, columns")
+    _check_distinct([row.label for row in table.rows], f"{place}, rows")
+    if table.regions != "as trained":
+        check_choice(f"{place}, regions", table.regions, _files("metric"))
+    _check_scales(table.at, place)
+    for column in table.columns:
+        _check_column(column, names, f"{place}, column '{column.name}'")
+    for row in table.rows:
+        _check_row(row, table, f"{place}, row '{row.label}'")
+
+
+def _check_distinct(names: list[str], place: str) -> None:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise InputError(f"{place}: '{name}' stands twice; give each its own name.")
+
+
+def _check_scales(at: Iterable[str], place: str) -> None:
+    for scale in at:
+        check_choice(f"{place}, at", scale, _files("scale"))
+
+
+def _files(group: str) -> list[str]:
+    return [file.stem for file in (conf_dir() / group).glob("*.yaml")]
+
+
+def _check_column(column: Column, names: list[str], place: str) -> None:
+    given = [key for key in ("metric", "minus", "needs") if getattr(column, key) is not None]
+    if len(given) != 1:
+        got = " and ".join(given) or "none"
+        raise InputError(f"{place}: expected one of metric, minus and needs, got {got}.")
+    for other in column.minus or ():
+        check_choice(f"{place}, minus", other, names)
+
+
+def _check_row(row: Row, table: Table, place: str) -> None:
+    names = [column.name for column in table.columns]
+    if row.experiment is not None:
+        check_choice(f"{place}, experiment", row.experiment, _files("experiment"))
+    _check_scales(row.at, place)
+    for name in (*row.values, *row.doubtful):
+        check_choice(f"{place}, column", name, names)
+    for column in table.columns:
+        for key in re.findall(r"{(\w+)}", column.metric or ""):
+            check_choice(f"{place}, '{key}' of metric {column.metric}", key, row.settings)
+    if row.x is not None:
+        _check_x(row.x, table.factor, place)
+
+
+def _check_x(x: float, factor: Factor | None, place: str) -> None:
+    if factor is None:
+        raise InputError(f"{place}: 'x' has no effect without 'factor' of the table; add one.")
+    if factor.axis == "log" and x <= 0:
+        raise InputError(f"{place}: 'x' must be > 0 on a log axis, got {x:g}.")

@@ -1,0 +1,156 @@
+"""A table computed: mean and spread over seeds, beside the printed values.
+
+Rows that cannot be run, and columns that cannot be computed, have no cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sweeps.table.cells import Cell, Place, is_counted, metric_of, row_cells
+from sweeps.table.metric_values import parse
+
+if TYPE_CHECKING:
+    from sweeps.running.lists import Outcome
+    from sweeps.table.table import Column, Row, Table
+
+MIN_ROWS = 3
+"""Rows below which two orders are not compared: two rows agree or not by chance."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """Whether the rows stand in the printed order: Spearman's rank correlation.
+
+    Attributes:
+        rho: -1..1; NaN for fewer than `MIN_ROWS` rows, or where all values are equal.
+        rows: number of rows with a value of ours and a printed one.
+    """
+
+    rho: float
+    rows: int
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A table with our values.
+
+    Attributes:
+        name: e.g. "spatialseg/table3".
+        table: the file.
+        scale: "demo" or "paper".
+        seeds: that were asked for.
+        cells: by place; only rows that were run.
+        orders: by name of the column.
+        ranks_ours: 1 best, 2 second best of the column among our means.
+        ranks_published: the same among the printed values.
+        commits: git commit -> number of runs made by it.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    cells: Mapping[Place, Cell]
+    orders: Mapping[str, Order]
+    ranks_ours: Mapping[Place, int]
+    ranks_published: Mapping[Place, int]
+    commits: Mapping[str, int]
+
+    def difference(self, row: Row, column: Column) -> float:
+        """Ours less the printed value; NaN where one of them is missing."""
+        cell = self.cells.get((row.label, column.name))
+        printed = published(row, column)
+        return math.nan if cell is None or printed is None else cell.mean - printed
+
+
+def published(row: Row, column: Column) -> float | None:
+    """The printed value, or None where there is none or a dash."""
+    found = row.values.get(column.name)
+    return None if found is None else float(found)
+
+
+def check_metrics(table: Table, rows: Iterable[Row]) -> None:
+    """Refuse a misspelt metric before anything is run.
+
+    Raises:
+        InputError: naming the metric and the nearest known one.
+    """
+    asked = {metric_of(column, row) for row in rows for column in filter(is_counted, table.columns)}
+    for metric in sorted(asked):
+        parse(metric)
+
+
+def score(
+    name: str, table: Table, runs: Mapping[tuple[str, int], Outcome], *, scale: str
+) -> Scored:
+    """Compute every cell of the rows that were run.
+
+    Args:
+        name: of the table.
+        table: its file.
+        runs: (label of the row, seed) -> what became of the run.
+        scale: "demo" or "paper".
+    """
+    seeds = sorted({seed for _, seed in runs})
+    ran = {label for label, _ in runs}
+    cells: dict[Place, Cell] = {}
+    for row in table.rows:
+        if row.label in ran:
+            outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
+            cells |= row_cells(table, row, outcomes)
+    found = {run.key: run.commit for outcome in runs.values() for run in outcome.found}
+    return Scored(
+        name=name,
+        table=table,
+        scale=scale,
+        seeds=tuple(seeds),
+        cells=cells,
+        orders={column.name: _order(table, column, cells) for column in table.columns},
+        ranks_ours=_ranks(table, {place: cell.mean for place, cell in cells.items()}),
+        ranks_published=_ranks(table, _printed(table)),
+        commits=Counter(commit for commit in found.values() if commit is not None),
+    )
+
+
+def _printed(table: Table) -> dict[Place, float]:
+    pairs = (((row.label, c.name), published(row, c)) for row in table.rows for c in table.columns)
+    return {place: found for place, found in pairs if found is not None}
+
+
+def _ranks(table: Table, values: Mapping[Place, float]) -> dict[Place, int]:
+    """1 and 2 for the best and second best of every column.
+
+    Values that are shown alike share a rank. Where all are alike none is the best.
+    """
+    ranks: dict[Place, int] = {}
+    for column in table.columns:
+        shown = {
+            place: round(found, 2)
+            for place, found in values.items()
+            if place[1] == column.name and not math.isnan(found)
+        }
+        if column.best == "none" or len(set(shown.values())) < 2:
+            continue
+        best = sorted(set(shown.values()), reverse=column.best == "highest")[:2]
+        ranks |= {place: best.index(each) + 1 for place, each in shown.items() if each in best}
+    return ranks
+
+
+def _order(table: Table, column: Column, cells: Mapping[Place, Cell]) -> Order:
+    pairs = []
+    for row in table.rows:
+        cell, printed = cells.get((row.label, column.name)), published(row, column)
+        if cell is not None and printed is not None and not math.isnan(cell.mean):
+            pairs.append((cell.mean, printed))
+    constant = any(len(set(side)) < 2 for side in zip(*pairs, strict=True))
+    if len(pairs) < MIN_ROWS or constant:
+        return Order(math.nan, len(pairs))
+    from scipy.stats import spearmanr
+
+    ours, theirs = zip(*pairs, strict=True)
+    return Order(float(spearmanr(ours, theirs).statistic), len(pairs))

@@ -1,0 +1,280 @@
+"""What a study has found, as data and as tables: values by hand."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import optuna
+import pytest
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.trial import TrialState, create_trial
+from rich.console import Console
+
+from sweeps import attributes
+from sweeps.report.data import importances, pruning, read, short_names
+from sweeps.report.tables import (
+    counts_grid,
+    failed_grid,
+    importance_grid,
+    markdown_table,
+    tables,
+    terminal_table,
+    trials_csv,
+    trials_grid,
+)
+
+ALPHA = FloatDistribution(0, 1)
+
+
+def new_study(*directions: str, kind: str = "search", metrics: Sequence[str] = ()) -> optuna.Study:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(study_name="s", directions=list(directions))
+    study.set_user_attr(attributes.KIND, kind)
+    if metrics:
+        study.set_user_attr(attributes.METRICS, list(metrics))
+    return study
+
+
+def add(
+    study: optuna.Study,
+    values: Sequence[float] | None = None,
+    *,
+    state: str = "COMPLETE",
+    params: Mapping[str, Any] | None = None,
+    distributions: Mapping[str, BaseDistribution] | None = None,
+    reported: Mapping[int, float] | None = None,
+    **attrs: Any,
+) -> None:
+    params = params or {}
+    study.add_trial(
+        create_trial(
+            state=TrialState[state],
+            values=None if values is None else list(values),
+            params=dict(params),
+            distributions=dict(distributions or dict.fromkeys(params, ALPHA)),
+            intermediate_values=dict(reported or {}),
+            user_attrs={f"rgbt.{name}": value for name, value in attrs.items()},
+        )
+    )
+
+
+def test_dropped_trials_are_not_counted() -> None:
+    study = new_study("maximize")
+    add(study, [1.0])
+    add(study, state="FAIL", dropped=True, reason="the same point as trial 0")
+    add(study, state="FAIL", reason="exit code 1")
+    add(study, state="PRUNED")
+    add(study, state="RUNNING")
+    grid = counts_grid(read(study))
+    assert grid.header == ("trials", "complete", "pruned", "failed", "running", "waiting")
+    assert grid.rows == (("4", "1", "1", "1", "1", "0"),)
+
+
+def test_best_trials_come_in_the_direction_of_the_objective_with_val_and_test_side_by_side() -> (
+    None
+):
+    study = new_study("minimize", metrics=["val/Var"])
+    results = {"val/Var": 8.0, "test/Var": 9.5, "val/mIoU": 50.0, "test/mIoU": 48.25}
+    add(study, [8.0], params={"masker.alpha": 0.123456}, results=results, seconds=61.6, runs=["a1"])
+    add(study, [12.0], params={"masker.alpha": 0.5})
+    add(study, [4.0], params={"masker.alpha": 0.25})
+    grid = trials_grid(read(study))
+    assert grid.title == "Best trials: lowest val/Var"
+    assert grid.header == (
+        *("trial", "alpha", "val/Var", "test/Var", "val/mIoU", "test/mIoU", "seconds", "runs"),
+    )
+    assert [row[0] for row in grid.rows] == ["2", "0", "1"]
+    assert grid.rows[1] == ("0", "0.1235", "8.00", "9.50", "50.00", "48.25", "62", "a1")
+    assert grid.rows[0][3:] == ("-", "-", "-", "-", "-")
+
+
+def test_only_ten_best_are_shown() -> None:
+    study = new_study("maximize")
+    for value in range(12):
+        add(study, [float(value)], params={"x": 0.5})
+    assert [row[0] for row in trials_grid(read(study)).rows] == [str(n) for n in range(11, 1, -1)]
+
+
+def test_pareto_front_of_five_points() -> None:
+    # mIoU up, Var down. (50, 9) is beaten by (55, 8); (54, 10) by (55, 8): three remain.
+    study = new_study("maximize", "minimize", metrics=["val/mIoU", "val/Var"])
+    add(study, state="FAIL", dropped=True)  # so that numbers are not places in a list
+    for values in ((50.0, 9.0), (55.0, 8.0), (60.0, 12.0), (54.0, 10.0), (40.0, 2.0)):
+        add(study, values, params={"x": 0.5})
+    data = read(study)
+    assert [trial.number for trial in data.front] == [3, 2, 5]
+    grid = trials_grid(data)
+    assert grid.title == "Pareto front: 3 of 5 complete trials"
+    assert [row[2:4] for row in grid.rows] == [
+        ("60.00", "12.00"),
+        ("55.00", "8.00"),
+        ("40.00", "2.00"),
+    ]
+
+
+def test_conditional_parameters_are_absent_and_infinite_objectives_left_out() -> None:
+    study = new_study("maximize")
+    both = {"masker": CategoricalDistribution(["grbm", "none"]), "sigma": ALPHA}
+    add(study, [1.0], params={"masker": "grbm", "sigma": 0.5}, distributions=both)
+    add(study, [2.0], params={"masker": "none"}, distributions={"masker": both["masker"]})
+    add(study, [math.inf], params={"masker": "none"}, distributions={"masker": both["masker"]})
+    rows = trials_grid(read(study)).rows
+    assert [row[:3] for row in rows] == [("1", "none", "-"), ("0", "grbm", "0.5")]
+
+
+def test_points_of_a_table_are_shown_in_order_by_label() -> None:
+    study = new_study("maximize", kind="list", metrics=["val/mIoU"])
+    add(study, [51.0], label="Ny/4 seed=1", key="k1", runs=["k1"])
+    add(study, state="FAIL", label="Ny/2 seed=1", key="k2", reason="exit code 1")
+    add(study, [52.0], label="Ny/2 seed=1", key="k2", runs=["k2"])
+    add(study, state="RUNNING", label="Ny seed=1", key="k3")
+    data = read(study)
+    grid = trials_grid(data)
+    assert grid.header[:4] == ("trial", "point", "state", "val/mIoU")
+    assert [row[:4] for row in grid.rows] == [
+        ("0", "Ny/4 seed=1", "complete", "51.00"),
+        ("2", "Ny/2 seed=1", "complete", "52.00"),
+        ("3", "Ny seed=1", "running", "-"),
+    ]
+    assert failed_grid(data).title == "Failed trials (1 more were tried again)"
+    assert [grid.title for grid in tables(data, importances(data))] == ["Study s (list)", "Points"]
+    assert importances(data).remark == ""
+
+
+def test_failed_trials_have_reason_point_and_runs() -> None:
+    study = new_study("maximize")
+    add(study, state="FAIL", params={"a.x": 0.5}, reason="killed by\nsignal 9", runs=["r1", "r2"])
+    add(study, state="FAIL", params={"a.x": 1.0}, reason="w" * 200, seconds=3.2)
+    rows = failed_grid(read(study)).rows
+    assert rows[0] == ("killed by signal 9", "0", "x=0.5", "r1 r2", "-")
+    assert rows[1] == ("w" * 119 + "…", "1", "x=1", "-", "3")
+
+
+def test_brackets_and_bars_of_a_reason_are_shown_as_they_are() -> None:
+    study = new_study("maximize")
+    add(study, state="FAIL", label="l", reason="[red] a | b [/x]")
+    grid = failed_grid(read(study))
+    assert "[red] a \\| b [/x] | 0" in markdown_table(grid)
+    console = Console(width=200, file=io.StringIO(), record=True)
+    console.print(terminal_table(grid))
+    assert "[red] a | b [/x]" in console.export_text()
+
+
+def test_csv_has_all_trials_with_full_numbers() -> None:
+    study = new_study("maximize", metrics=["val/mIoU"])
+    add(study, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
+    add(
+        study, state="PRUNED", params={"a.x": 0.2}, reported={10: 1.0, 20: 2.0}, reason="at 20, low"
+    )
+    first, second = csv.DictReader(io.StringIO(trials_csv(read(study))))
+    assert float(first["val/mIoU"]) == 100 / 3
+    assert first["test/mIoU"] == "31.0"
+    assert (first["state"], first["runs"], first["label"]) == ("complete", "r", "x=0.1")
+    assert (second["state"], second["last_step"]) == ("pruned", "20")
+    assert (second["reason"], second["val/mIoU"], second["a.x"]) == ("at 20, low", "", "0.2")
+
+
+def test_share_of_steps_saved_by_pruning() -> None:
+    # Complete: 100 steps each; pruned after 20 and 50: of 400 steps 80 + 50 are saved.
+    study = new_study("maximize")
+    for last, state in ((100, "COMPLETE"), (100, "COMPLETE"), (20, "PRUNED"), (50, "PRUNED")):
+        values = [1.0] if state == "COMPLETE" else None
+        add(study, values, state=state, reported={10: 0.5, last: 1.0})
+    add(study, state="PRUNED")  # reported nothing: not told
+    saved = pruning(read(study))
+    assert saved is not None
+    assert saved.trials == 2
+    assert saved.share == pytest.approx(130 / 400)
+    assert counts_grid(read(study)).rows[0][-1] == "32%"
+
+
+def test_a_pruned_trial_of_three_seeds_saves_the_other_two_as_well() -> None:
+    study = new_study("maximize")
+    add(study, [1.0], reported={100: 1.0}, runs=["a", "b", "c"])
+    add(study, state="PRUNED", reported={40: 1.0}, runs=["d", "e", "f"])
+    saved = pruning(read(study))
+    assert saved is not None
+    assert saved.share == pytest.approx(260 / 600)
+
+
+def test_steps_saved_cannot_be_told_without_reports_of_complete_trials() -> None:
+    study = new_study("maximize")
+    add(study, [1.0])
+    add(study, state="PRUNED", reported={10: 1.0})
+    assert pruning(read(study)) is None
+    assert len(counts_grid(read(study)).header) == 6
+
+
+def dominated(count: int = 40) -> optuna.Study:
+    """`big` decides the first objective, `small` the second; `same` never changes."""
+    study = new_study("maximize", "minimize", metrics=["up", "down"])
+    for index in range(count):
+        big, small = index / count, (index * 7 % count) / count
+        params = {"small": small, "big": big, "same": 0.5}
+        add(study, [10 * big + 0.01 * small, 5 * small + 0.001 * big], params=params)
+    return study
+
+
+def test_the_parameter_that_decides_is_the_most_important() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = importances(read(dominated()))
+    assert list(found.shares) == ["big", "small"]
+    assert found.shares["big"][0] > 0.8
+    assert found.shares["small"][1] > 0.8
+    for index in (0, 1):
+        assert sum(shares[index] for shares in found.shares.values()) == pytest.approx(1.0)
+    assert (
+        found.remark == "same: one value only, left out. rough: 40 complete trials, 50 are advised."
+    )
+    grid = importance_grid(read(dominated()), found)
+    assert grid.header == ("parameter", "for up, %", "for down, %")
+    assert grid.rows[0][0] == "big"
+
+
+def test_the_direction_of_the_objective_counts() -> None:
+    # x decides below 0.2 alone, where values are lowest: seen when minimised, not when maximised.
+    def study(direction: str) -> optuna.Study:
+        made = new_study(direction)
+        for index in range(60):
+            x, y = (index * 13 % 60) / 60, (index * 29 % 60) / 60
+            add(made, [y if x > 0.2 else -5 + x], params={"x": x, "y": y})
+        return made
+
+    low, high = importances(read(study("minimize"))), importances(read(study("maximize")))
+    assert low.shares["x"][0] > low.shares["y"][0]
+    assert high.shares["y"][0] > high.shares["x"][0]
+
+
+@pytest.mark.parametrize(
+    ("count", "params", "values", "reason"),
+    [
+        (9, {"x": None}, None, "they need 10 complete trials, and there are 9."),
+        (12, {"x": 0.5}, None, "no parameter took two values."),
+        (12, {}, None, "no parameter took two values."),
+        (12, {"x": None}, 3.0, "objective 1: the same value in all trials. rough: 12"),
+    ],
+)
+def test_importances_say_why_there_are_none(
+    count: int, params: Mapping[str, float | None], values: float | None, reason: str
+) -> None:
+    study = new_study("maximize")
+    for index in range(count):
+        given = {name: index / 20 if value is None else value for name, value in params.items()}
+        add(study, [float(index) if values is None else values], params=given)
+    found = importances(read(study))
+    assert found.shares == {}
+    assert found.remark.startswith(reason)
+
+
+def test_short_names_keep_what_tells_them_apart() -> None:
+    assert short_names(["optimizer.lr", "head.lr", "masker.alpha"]) == {
+        "optimizer.lr": "optimizer.lr",
+        "head.lr": "head.lr",
+        "masker.alpha": "alpha",
+    }

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import csv
+import io
+import re
+from typing import Any
+
+from rich.text import Text as RichText
+
+from sweeps.sheet.files import latex, markdown, tidy_csv
+from sweeps.sheet.sheet import DEMO, sheet_of
+from sweeps.sheet.terminal import terminal
+from sweeps.table.scoring import Scored, score
+from sweeps.table.table import Column, Row
+from tests.sweeps.tabled import Made, failed, outcome, right, table
+
+ROWS = {"a_1": ((40, 50, 60), 48.0), "b": ((60, 70, 80), 47.5), "theirs": ((), 50.0)}
+WIDE = tuple(Column(name=f"name_{n}", metric="pixel_accuracy") for n in range(13))
+STACKED = WIDE[:4]
+
+
+def wide(columns: tuple[Column, ...], **others: Any) -> Scored:
+    rows = (Row(label="a", experiment="crm", values={"name_0": 48.0, "name_1": 49.25}),)
+    runs = {("a", seed): outcome(str(seed), right(share)) for seed, share in enumerate((40, 60))}
+    return score("own/wide", table(rows, columns, **others), runs, scale="paper")
+
+
+def lines(scored: Scored, *, plain: bool = True) -> list[str]:
+    return str(terminal(sheet_of(scored), plain=plain)).splitlines()
+
+
+def test_few_columns_stand_beside_each_other() -> None:
+    shown = lines(Made(ROWS).scored())
+    assert shown[0] == "own, TABLE I: Rows"
+    assert shown[1].split() == ["seeds", "acc", "published", "difference"]
+    assert shown[3].split() == ["a_1", "3", "_50.00", "±", "10.00", "_48.0", "+2.00"]
+    assert shown[4].split() == ["b", "3", "*70.00", "±", "10.00", "47.5", "+22.50"]
+    assert shown[5].split() == ["theirs", "-", "*50.0", "-"]
+
+
+def test_the_order_of_rows_and_the_remarks_stand_below() -> None:
+    shown = lines(Made({"a": ((1,), 1.0), "b": ((2,), 3.0), "c": ((3,), 2.0)}).scored())
+    assert re.fullmatch(r"order of rows: rho +\+0.50", shown[6])
+    assert re.fullmatch(r"n +3", shown[7])
+    assert shown[9:11] == ["Published: somewhere; percent.", "Ours: scale=demo, of seed 0."]
+    assert DEMO in shown
+
+
+def test_more_columns_have_a_line_each_for_ours_published_and_difference() -> None:
+    shown = lines(wide(STACKED))
+    assert shown[3].split() == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
+    assert shown[4].split() == ["published", "48.00", "49.25", "-", "-"]
+    assert shown[5].split() == ["difference", "+2.00", "+0.75", "-", "-"]
+    assert DEMO not in shown  # scale=paper
+
+
+def test_wide_tables_break_names_and_put_sd_below() -> None:
+    shown = lines(wide(WIDE))
+    assert shown[1].split() == ["name"] * 13
+    assert shown[2].split() == ["seeds", *map(str, range(13))]
+    assert shown[4].split() == ["a", "ours", "2", *["50.00"] * 13]
+    assert shown[5].split() == ["±", "sd", *["14.14"] * 13]
+    many = tuple(Column(name=f"c{n}", metric="pixel_accuracy") for n in range(60))
+    assert lines(wide(many))[3].split() == ["a", "ours", "2", *["50.00"] * 60]
+
+
+def test_numbers_stand_below_each_other_behind_footnotes_too() -> None:
+    runs = {
+        ("a", 0): outcome("k", right(40)),
+        ("a", 1): failed("gone"),
+        ("b", 0): outcome("l", right(5)),
+    }
+    rows = (Row(label="a", experiment="crm"), Row(label="b", experiment="crm"))
+    shown = lines(score("t", table(rows), runs, scale="demo"))
+    assert shown[3].index(".00") == shown[4].index(".00")
+    assert "*40.00[1]" in shown[3]
+
+
+def test_bold_and_underline_where_they_are_shown() -> None:
+    text = terminal(sheet_of(Made(ROWS).scored()), plain=False)
+    styled = {text.plain[span.start : span.end]: span.style for span in text.spans}
+    assert isinstance(text, RichText)
+    assert styled["70.00"] == "bold"
+    assert styled["48.0"] == "underline"
+    assert "Bold: best, underlined: second best." in text.plain
+
+
+def test_footnotes_are_numbered_in_reading_order_and_shared() -> None:
+    columns = (*STACKED[:3], Column(name="TC", needs="flow"))
+    rows = (
+        Row(label="a", experiment="crm", remarks=("of a",)),
+        Row(label="b", experiment="crm", needs="a part"),
+        Row(label="c", values={"name_0": 3.0}, doubtful=("name_0",), remarks=("doubtful",)),
+        Row(label="d", values={"name_1": 3.0}, doubtful=("name_1",)),
+    )
+    made = table(rows, columns, remarks=("of the table",))
+    sheet = sheet_of(score("t", made, {("a", 0): failed("broke.")}, scale="demo"))
+    assert sheet.notes == (
+        "of the table",
+        "Not computed: flow",
+        "of a",
+        "seed 0: broke.",
+        "Cannot be run yet: a part",
+        "doubtful",
+        "The printed value does not agree with the others of its row.",
+    )
+    shown = str(terminal(sheet, plain=True)).splitlines()
+    assert shown[0].endswith("[1]")
+    assert shown[3].split() == ["a[3]", "ours", "0", *["failed[4]"] * 3, "-"]
+    assert shown[4].startswith("b[5]")
+    assert shown[5].split() == ["c", "published", "3[6]", "-", "-", "-"]
+    assert "[4] seed 0: broke." in shown
+
+
+def test_a_table_that_cannot_be_run_says_so() -> None:
+    made = table((Row(label="a", values={"acc": 3.0}),), needs="flow")
+    sheet = sheet_of(score("t", made, {}, scale="demo"))
+    assert sheet.notes == ("Cannot be run yet: flow",)
+    assert not any("Ours" in remark or remark == DEMO for remark in sheet.remarks)
+
+
+def test_rows_of_the_same_runs_and_several_commits_are_told() -> None:
+    rows = (Row(label="a", experiment="crm"), Row(label="b", experiment="crm"))
+    first, second = outcome("k0", right(4), "aaa"), outcome("k1", right(4), "bbb")
+    runs = {(label, seed): run for label in "ab" for seed, run in enumerate((first, second))}
+    sheet = sheet_of(score("t", table(rows), runs, scale="demo"), ["x=1"])
+    assert sheet.notes == ("At scale=demo the same runs as row 'a'.",)
+    assert sheet.lines[1].label.notes == (1,)
+    assert "Runs of ours come from several git commits: aaa (1), bbb (1)." in sheet.remarks
+    assert "Every row of ours was run with x=1." in sheet.remarks
+
+
+def test_markdown_read_back() -> None:
+    text = markdown(sheet_of(Made(ROWS).scored()))
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:7]
+    ]
+    assert rows[0] == ["", "seeds", "acc", "published", "difference"]
+    assert rows[2] == ["a_1", "3", "<u>50.00 ± 10.00</u>", "<u>48.0</u>", "+2.00"]
+    assert rows[3][2] == "**70.00 ± 10.00**"
+    assert "- Bold: best, underlined: second best." in text
+
+
+def test_latex() -> None:
+    text = latex(sheet_of(Made(ROWS).scored()))
+    assert r"\begin{tabular}{lrrrr}" in text
+    assert r"a\_1 & 3 & \underline{50.00 $\pm$ 10.00} & \underline{48.0} & +2.00 \\" in text
+    assert r"\textbf{70.00 $\pm$ 10.00}" in text
+    stacked = latex(sheet_of(wide(STACKED, caption=r"50% of A_b \ {c}")))
+    assert r"50\% of A\_b \textbackslash{} \{c\}" in stacked
+    assert "difference" not in stacked
+    for each in (text, stacked):
+        body = [line for line in each.splitlines() if line.endswith(r"\\")]
+        assert len({line.count(" & ") for line in body}) == 1
+
+
+def test_csv_read_back() -> None:
+    rows = (
+        Row(label="a, b", experiment="crm", values={"acc": 48.0}),
+        Row(label="later", needs="flow", values={"acc": 4.0}),
+    )
+    runs = {("a, b", 0): outcome("k0", right(40)), ("a, b", 1): outcome("k1", right(45))}
+    text = tidy_csv(score("own/t", table(rows), runs, scale="demo"))
+    first, second = csv.DictReader(io.StringIO(text))
+    assert first == {
+        **{"table": "own/t", "row": "a, b", "column": "acc", "mean": "42.5", "sd": "3.535534"},
+        **{"n": "2", "published": "48.0", "difference": "-5.5", "reason": "", "runs": "k0 k1"},
+    }
+    assert second["mean"] == second["runs"] == ""
+    assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "flow")

@@ -1,0 +1,133 @@
+"""Grids and lists: Hydra's points in Hydra's order, and ranges told apart from values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import optuna
+import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import create_config_search_path
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from rgbt.checks import InputError
+from rgbt.config import conf_dir
+from sweeps.space.grid import distributions, grid_points, list_points, split
+
+LOADER = ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_dir())))
+
+
+def hydras_points(overrides: Sequence[str]) -> list[set[str]]:
+    parsed = OverridesParser.create(LOADER).parse_overrides(list(overrides))
+    (batch,) = BasicSweeper.split_arguments(parsed, None)
+    return [set(point) for point in batch]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["+experiment=grbm", "masker.sigma_div=1,2,4", "seed=0,1,2"],
+        ["seed=range(1,4)", "+experiment=grbm,crm", "optimizer.lr=choice(1e-4,0.5)"],
+        ["a=range(0.5,2,0.5)", "b=sort(3,1,2)", "c=str(choice(1,2))"],
+        ["metric=glob(ring*)", "model.fresh=[a,b],[c]", "name='a, b',c d"],
+        ["seed=0,1", "x=1", "seed=5,6", "x=2,3"],
+        ["seed=0,1", "x=1", "seed=5"],
+        ["x=null,true,'true',${seed}"],
+        ["seed=3"],
+    ],
+    ids=" ".join,
+)
+def test_points_are_hydras_in_hydras_order(overrides: list[str]) -> None:
+    fixed, swept, intervals = split(overrides, LOADER)
+    points = grid_points(fixed, swept)
+    assert [set(point.overrides) for point in points] == hydras_points(overrides)
+    assert intervals == {}
+
+
+def test_a_point_has_what_differs_and_what_was_typed() -> None:
+    fixed, swept, _ = split(["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1", "~x"], LOADER)
+    assert fixed == ("+experiment=grbm", "~x")
+    assert swept == {"masker.sigma_div": ["1", "2"], "seed": ["0", "1"]}
+    first, second, third, _ = grid_points(fixed, swept)
+    assert first.overrides == ("+experiment=grbm", "~x", "masker.sigma_div=1", "seed=0")
+    assert first.params == {"masker.sigma_div": 1, "seed": 0}
+    assert (second.params["seed"], third.params) == (1, {"masker.sigma_div": 2, "seed": 0})
+
+
+def test_groups_are_globbed_from_the_configuration() -> None:
+    assert split(["metric=glob(ring*)"], LOADER)[1] == {"metric": ["ring5", "ring9"]}
+
+
+def test_intervals_are_entries_of_a_space() -> None:
+    fixed, swept, intervals = split(
+        ["a=interval(0.5,4)", "b=tag(log,interval(1,8))", "c=int(interval(1,8))", "seed=0,1"],
+        LOADER,
+    )
+    assert (fixed, swept) == ((), {"seed": ["0", "1"]})
+    assert intervals == {
+        "a": {"type": "float", "low": 0.5, "high": 4.0, "log": False},
+        "b": {"type": "float", "low": 1.0, "high": 8.0, "log": True},
+        "c": {"type": "int", "low": 1, "high": 8, "log": False},
+    }
+    assert isinstance(intervals["c"]["low"], int)
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("seed=range(3,1)", "'seed=range(3,1)' has no values"),
+        ("model=glob(nothing*)", "has no values"),
+        ("a=tag(lgo,interval(1,2))", "tag 'lgo' means nothing; did you mean 'log'?"),
+        ("a=tag(log,choice(1,2))", "tags are for interval() alone"),
+    ],
+)
+def test_sweeps_that_mean_nothing_are_refused(override: str, sentence: str) -> None:
+    with pytest.raises(InputError) as told:
+        split([override], LOADER)
+    assert sentence in str(told.value)
+
+
+def test_lists_go_in_pairs() -> None:
+    points = list_points(
+        [["masker.sigma_div=1", "masker.patch_size=8"], ["masker.sigma_div=4"]],
+        ["+experiment=grbm", "seed=1"],
+    )
+    assert [point.params for point in points] == [
+        {"masker.sigma_div": 1, "masker.patch_size": 8},
+        {"masker.sigma_div": 4},
+    ]
+    assert points[1].overrides == ("+experiment=grbm", "seed=1", "masker.sigma_div=4")
+
+
+def test_a_points_own_override_replaces_the_fixed_one() -> None:
+    (point,) = list_points([["experiment=crm"]], ["+experiment=grbm", "seed=1"])
+    assert point.overrides == ("seed=1", "experiment=crm")
+
+
+@pytest.mark.parametrize(
+    ("point", "sentence"),
+    [(["seed=0,1"], "'seed=0,1' has several values"), ([], "needs at least one override")],
+)
+def test_a_point_of_a_list_is_one_point(point: list[str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        list_points([["seed=3"], point], [])
+
+
+def test_optuna_can_draw_a_grid() -> None:
+    _, swept, _ = split(["n=1,2", "f=1,2.5", "b=true,false", "l=[1,2],[3]", "m=x,null"], LOADER)
+    points = grid_points((), swept)
+    found = distributions(points)
+    assert found == {
+        "n": optuna.distributions.IntDistribution(1, 2),
+        "f": optuna.distributions.FloatDistribution(1.0, 2.5),
+        "b": optuna.distributions.CategoricalDistribution((True, False)),
+        "l": optuna.distributions.CategoricalDistribution(("[1,2]", "[3]")),
+        "m": optuna.distributions.CategoricalDistribution(("x", None)),
+    }
+    study = optuna.create_study()
+    for point in points:
+        study.add_trial(
+            optuna.create_trial(params=dict(point.params), distributions=found, value=0)
+        )
+    assert [trial.params for trial in study.trials] == [point.params for point in points]

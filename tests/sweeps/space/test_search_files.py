@@ -1,0 +1,95 @@
+"""Every file of conf/search is a search that its experiment can run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import hydra
+import pytest
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError
+from rgbt.config import check, conf_dir, flatten, register_resolvers
+from sweeps.settings import read_settings
+from sweeps.space.samplers import build_pruner, build_sampler
+from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, plain_space
+from tests.models.golden import compose
+
+FILES = sorted(path.stem for path in (conf_dir() / "search").glob("*.yaml"))
+UNBUILT = {"temporal"}
+"""Searches whose parameters do not exist yet."""
+
+
+def composed(*overrides: str) -> DictConfig:
+    """With the node of the sweeper, which a job does not see."""
+    register_resolvers()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("config", list(overrides), return_hydra_config=True)
+
+
+def space_of(name: str) -> dict[str, Any]:
+    return plain_space(composed(f"+search={name}").hydra.sweeper.space)
+
+
+def ends(parameter: Parameter) -> tuple[Choice, ...]:
+    return parameter.choices or (parameter.low, parameter.high)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None:
+    config = composed(f"+search={name}")
+    sweeper = config.hydra.sweeper
+    assert config.hydra.runtime.choices["hydra/sweeper"] == "study"
+    assert config.hydra.mode.name == "MULTIRUN"
+    assert config.name == config.hydra.runtime.choices.experiment
+    settings = read_settings(sweeper)
+    assert settings.trials
+    assert settings.space
+    sampler = dict(settings.sampler)
+    objectives = len(settings.objectives)
+    build_sampler(sampler.pop("kind"), sampler.pop("seed"), sampler, objectives)
+    pruner = {"kind": "none"} if settings.pruner is None else dict(settings.pruner)
+    build_pruner(pruner.pop("kind"), pruner, objectives)
+
+
+@pytest.mark.parametrize("name", sorted(set(FILES) - UNBUILT))
+def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
+    known = flatten(compose(f"+search={name}"))
+    parameters = parse_space(space_of(name))
+    assert {parameter.key for parameter in parameters} <= set(known)
+    for place in (0, -1):
+        chosen = {one.key: ends(one)[place] for one in parameters}
+        config = compose(f"+search={name}", *as_overrides(chosen))
+        check(config)
+        values = flatten(config)
+        for key, value in chosen.items():
+            assert str(value).startswith("${px:") or values[key] == value
+
+
+@pytest.mark.parametrize("name", sorted(UNBUILT))
+def test_what_does_not_exist_yet_is_said_and_its_data_are_sound(name: str) -> None:
+    space = space_of(name)
+    with pytest.raises(InputError, match="cannot be searched yet, it needs the scheme of"):
+        parse_space(space)
+    data = {key: {k: v for k, v in entry.items() if k != "needs"} for key, entry in space.items()}
+    assert [(one.low, one.high) for one in parse_space(data)] == [(0.5, 2.0), (0.5, 2.0)]
+
+
+def test_ranges_hold_the_published_values() -> None:
+    """SpatialSeg, Tables III, IV, V, and the weights of both releases."""
+    sigma, patch, alpha = parse_space(space_of("grbm"))
+    assert (sigma.low, sigma.high, sigma.log) == (0.5, 32, True)
+    assert patch.choices == tuple(f"${{px:{size}}}" for size in (8, 16, 32, 64))
+    assert (alpha.low, alpha.high) == (0, 3)
+    published = {one.key: one.choices for one in parse_space(space_of("grbm_discrete"))}
+    assert published["masker.sigma_div"] == (1, 2, 4, 8, 16, 32)
+    assert published["loss.spatial.alpha"] == (0, 1, 1.5, 2, 2.5, 3)
+    released = flatten(compose("+experiment=crm"))
+    for parameter in parse_space(space_of("loss")):
+        assert parameter.low < released[parameter.key] < parameter.high
+
+
+def test_another_experiment_can_be_chosen() -> None:
+    config = compose("+search=grbm", "experiment=grbm_released")
+    assert (config.name, config.masker.sampler) == ("grbm_released", "gaussian_count")
+    assert compose("+search=grbm", "masker=crm").masker.sampler == "uniform"

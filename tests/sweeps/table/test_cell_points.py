@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import pytest
+
+from rgbt.checks import InputError
+from sweeps.points import Evaluation
+from sweeps.running.lists import Outcome
+from sweeps.table.cell_points import Wanted, seeds_of
+from sweeps.table.table import Column, Row
+from tests.sweeps.tabled import table
+
+COLUMNS = (
+    Column(name="mIoU", metric="mIoU"),
+    Column(name="night", metric="mIoU", modality="thermal"),
+    Column(name="cold", metric="Var", modality="thermal"),
+    Column(name="less", minus=("night", "mIoU")),
+    Column(name="TC", needs="flow"),
+)
+ROWS = (
+    Row(label="small", experiment="crm", at={"paper": ("model=mask2former_swin_s",)}),
+    Row(label="large", experiment="crm", at={"paper": ("model=mask2former_swin_b",)}),
+    Row(label="other", experiment="grbm", overrides=("masker.sigma_div=2",)),
+    Row(label="later", experiment="grbm", needs="flow"),
+    Row(label="theirs", values={"mIoU": 3.0}),
+)
+
+
+def wanted(scale: str = "demo", **others: object) -> Wanted:
+    at = {"paper": ("recipe.batch_size=5",)}
+    return Wanted("own/t", table(ROWS, COLUMNS, at=at, **others), scale, (0, 2), ("a.b=1",))
+
+
+def test_a_point_per_run_with_the_rows_that_share_it() -> None:
+    points = wanted().points()
+    assert [point.label for point in points] == [
+        "small (and 1 more) seed=0",
+        "other seed=0",
+        "small (and 1 more) seed=2",
+        "other seed=2",
+    ]
+    assert points[0].overrides == ("+experiment=crm", "a.b=1", "seed=0")
+    assert points[1].overrides == ("+experiment=grbm", "masker.sigma_div=2", "a.b=1", "seed=0")
+    assert points[0].tags == {"rgbt.table/own/t": "small | large"}
+    assert points[0].seeds == ()
+    assert points[0].evaluations == (Evaluation("thermal", "as trained"),)
+
+
+def test_at_paper_scale_the_rows_differ_and_the_users_overrides_win() -> None:
+    points = wanted("paper").points()
+    assert len(points) == 6
+    assert points[1].overrides == (
+        *("+experiment=crm", "scale=paper", "recipe.batch_size=5", "model=mask2former_swin_b"),
+        *("a.b=1", "seed=0"),
+    )
+
+
+def test_regions_of_the_table_are_evaluated_for_every_modality() -> None:
+    assert wanted(regions="ring9").points()[0].evaluations == (
+        Evaluation("default", "ring9"),
+        Evaluation("thermal", "ring9"),
+    )
+
+
+def test_outcomes_go_back_to_their_cells() -> None:
+    asked = wanted()
+    outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]
+    runs = asked.runs(outcomes)
+    assert {place: run.reason for place, run in runs.items()} == {
+        ("small", 0): "small (and 1 more) seed=0",
+        ("large", 0): "small (and 1 more) seed=0",
+        ("other", 0): "other seed=0",
+        ("small", 2): "small (and 1 more) seed=2",
+        ("large", 2): "small (and 1 more) seed=2",
+        ("other", 2): "other seed=2",
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7)), ("[5,0]", (5, 0))]
+)
+def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
+    assert seeds_of(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
+def test_no_seeds(text: str) -> None:
+    with pytest.raises(InputError, match="how many"):
+        seeds_of(text)

@@ -1,0 +1,86 @@
+"""The printed numbers of our tables against the transcription that lies beside the checkout."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from sweeps.table.table import load_table, table_names
+
+SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
+FOLDER = SHARED / "published"
+PAPERS = ("crm", "multihead", "spatialseg", "temporal")
+
+OURS = {name: load_table(name) for name in table_names(Path("none"))}
+
+pytestmark = pytest.mark.skipif(
+    not all((FOLDER / f"{paper}.yaml").is_file() for paper in PAPERS),
+    reason="reference material is not here",
+)
+
+
+@pytest.fixture(scope="module")
+def published() -> dict[str, Any]:
+    """Tables that hold numbers, by the name of ours."""
+    found: dict[str, Any] = {}
+    for paper in PAPERS:
+        tables = yaml.safe_load((FOLDER / f"{paper}.yaml").read_text(encoding="utf-8"))["tables"]
+        found |= {f"{paper}/{key}": table for key, table in tables.items() if table["rows"]}
+    return found
+
+
+def numbers(value: Any) -> Iterator[float | None]:
+    """Numbers of a row's values in their order; a cell may hold several."""
+    if isinstance(value, dict):
+        for child in value.values():
+            yield from numbers(child)
+    else:
+        yield value
+
+
+def count_and_sum(values: list[float | None]) -> tuple[int, int, float]:
+    """Cells, cells with a number, sum of the numbers."""
+    known = [value for value in values if value is not None]
+    return len(values), len(known), math.fsum(known)
+
+
+def test_every_table_with_numbers_is_here(published: dict[str, Any]) -> None:
+    assert sorted(published) == sorted(OURS)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_numbers_arrive_unchanged(name: str, published: dict[str, Any]) -> None:
+    ours, theirs = OURS[name], published[name]["rows"]
+    assert [row.label for row in ours.rows] == [row["label"] for row in theirs]
+    for row, other in zip(ours.rows, theirs, strict=True):
+        expected = list(numbers(other["values"]))
+        assert count_and_sum(list(row.values.values())) == count_and_sum(expected), row.label
+        assert list(row.values.values()) == expected, row.label
+        assert (row.origin, row.proposed) == (other["origin"], other["proposed"]), row.label
+
+
+def test_the_four_papers_together(published: dict[str, Any]) -> None:
+    """161 rows, 1480 cells, 19 of them without a number."""
+    rows = [row for name in published for row in OURS[name].rows]
+    cells, known, total = count_and_sum([v for row in rows for v in row.values.values()])
+    theirs = [row["values"] for table in published.values() for row in table["rows"]]
+    assert (len(rows), cells, cells - known) == (161, 1480, 19)
+    assert total == pytest.approx(count_and_sum(list(numbers(dict(enumerate(theirs)))))[2])
+
+
+def test_columns_stand_in_the_printed_order(published: dict[str, Any]) -> None:
+    for name, table in published.items():
+        ours = OURS[name]
+        names = [column.name for column in ours.columns]
+        flat = [
+            f"{key}_{part}" if part else key
+            for key, cell in table["rows"][0]["values"].items()
+            for part in (cell if isinstance(cell, dict) else [""])
+        ]
+        assert names == flat, name

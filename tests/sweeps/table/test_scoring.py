@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from rgbt.checks import InputError
+from sweeps.points import Evaluation
+from sweeps.table.scoring import check_metrics, published, score
+from sweeps.table.table import Column, Row
+from tests.sweeps.tabled import Made, counts_of, failed, outcome, right, table
+
+ACC = Column(name="acc", metric="pixel_accuracy")
+RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
+LESS = Column(name="less", minus=("rgb", "acc"))
+
+
+def test_mean_sd_and_difference_by_hand() -> None:
+    scored = Made({"a": ((40, 50, 60), 48.0)}).scored()
+    cell = scored.cells["a", "acc"]
+    (row,), (column,) = scored.table.rows, scored.table.columns
+    assert (cell.mean, cell.sd, cell.seeds) == (50.0, 10.0, 3)
+    assert cell.keys == ("a0", "a1", "a2")
+    assert scored.difference(row, column) == 2.0
+    assert (scored.seeds, cell.reason) == ((0, 1, 2), "")
+
+
+def test_one_seed_has_no_sd() -> None:
+    assert math.isnan(Made({"a": ((40,), None)}).scored().cells["a", "acc"].sd)
+
+
+def test_best_and_second_best_by_direction() -> None:
+    rows = {"a": ((40,), 9.0), "b": ((60,), 8.0), "c": ((50,), 7.0)}
+    scored = Made(rows).scored()
+    assert scored.ranks_ours == {("b", "acc"): 1, ("c", "acc"): 2}
+    assert scored.ranks_published == {("a", "acc"): 1, ("b", "acc"): 2}
+    lowest = Column(name="acc", metric="pixel_accuracy", best="lowest")
+    assert Made(rows, {"columns": (lowest,)}).scored().ranks_ours == {
+        ("a", "acc"): 1,
+        ("c", "acc"): 2,
+    }
+    nobody = Column(name="acc", metric="pixel_accuracy", best="none")
+    assert Made(rows, {"columns": (nobody,)}).scored().ranks_ours == {}
+
+
+def test_ties_share_a_rank_and_equal_columns_have_none() -> None:
+    tied = Made({"a": ((60,), 5.0), "b": ((60,), 5.0), "c": ((50,), 5.0)}).scored()
+    assert tied.ranks_ours == {("a", "acc"): 1, ("b", "acc"): 1, ("c", "acc"): 2}
+    assert tied.ranks_published == {}
+
+
+def test_rank_correlation() -> None:
+    # ranks of ours 1 2 3 4, printed 1 3 2 4: rho = 1 - 6 * 2 / (4 * 15) = 0.8
+    rows = {"a": ((1,), 10.0), "b": ((2,), 30.0), "c": ((3,), 20.0), "d": ((4,), 40.0)}
+    order = Made(rows | {"e": ((5,), None)}).scored().orders["acc"]
+    assert order.rho == pytest.approx(0.8)
+    assert order.rows == 4
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        {"a": ((1,), 10.0), "b": ((2,), 30.0)},
+        {"a": ((1,), 10.0), "b": ((1,), 30.0), "c": ((1,), 20.0)},
+        {"a": ((1,), None)},
+    ],
+)
+def test_no_rank_correlation_of_few_or_equal_rows(rows: dict) -> None:
+    order = Made(rows).scored().orders["acc"]
+    assert math.isnan(order.rho)
+    assert order.rows == sum(printed is not None for _, printed in rows.values())
+
+
+def test_minus_is_taken_per_seed_and_modalities_have_their_counts() -> None:
+    runs = {
+        ("a", seed): outcome(str(seed), {None: right(acc), Evaluation("rgb"): right(rgb)})
+        for seed, (acc, rgb) in enumerate([(50, 40), (70, 50)])
+    }
+    scored = score("t", table((Row(label="a"),), (ACC, RGB, LESS)), runs, scale="demo")
+    assert scored.cells["a", "rgb"].mean == 45.0
+    less = scored.cells["a", "less"]
+    assert less.mean == -15.0
+    assert less.sd == pytest.approx(math.sqrt(50))  # -10 and -20; not from the two columns' sds
+
+
+def test_regions_of_the_table_and_placeholders() -> None:
+    column = Column(name="R2", metric="class/{class}/region/2")
+    rows = (
+        Row(label="Road", settings={"class": "road"}),
+        Row(label="Car", settings={"class": "car"}),
+    )
+    run = outcome("k", {Evaluation("default", "ring9"): counts_of()})
+    runs = {("Road", 0): run, ("Car", 0): run}
+    scored = score("t", table(rows, (column,), regions="ring9"), runs, scale="demo")
+    assert scored.cells["Road", "R2"].mean == pytest.approx(75.0)
+    assert scored.cells["Car", "R2"].mean == pytest.approx(80.0)
+
+
+def test_a_failed_seed_keeps_its_reason_and_leaves_the_others() -> None:
+    runs = {
+        ("a", 0): outcome("k", right(40)),
+        ("a", 1): failed("out of memory"),
+        ("a", 2): failed("out of memory"),
+    }
+    cell = score("t", table((Row(label="a"),)), runs, scale="demo").cells["a", "acc"]
+    assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
+    assert cell.reason == "seeds 1, 2: out of memory"
+
+
+def test_what_cannot_be_scored_says_why() -> None:
+    column = Column(name="x", metric="class/bus")
+    runs = {("a", 0): outcome("k", right(40))}
+    cell = score("t", table((Row(label="a"),), (ACC, column)), runs, scale="demo").cells["a", "x"]
+    assert math.isnan(cell.mean)
+    assert cell.mark == "no value"
+    assert "no class 'bus'" in cell.reason
+
+
+def test_rows_not_run_and_columns_not_computed_have_no_cells() -> None:
+    later = Column(name="TC", needs="flow")
+    rows = (Row(label="a"), Row(label="theirs", values={"acc": 3.0, "TC": None}))
+    runs = {("a", 0): outcome("k", right(40))}
+    scored = score("t", table(rows, (ACC, later)), runs, scale="demo")
+    assert set(scored.cells) == {("a", "acc")}
+    assert published(rows[1], later) is None
+    assert math.isnan(scored.difference(rows[1], ACC))
+
+
+def test_commits_are_counted_by_run() -> None:
+    runs = {
+        ("a", 0): outcome("k0", right(1), "aaa"),
+        ("a", 1): outcome("k1", right(2), "bbb"),
+        ("b", 0): outcome("k0", right(1), "aaa"),
+        ("b", 1): outcome("k2", right(1), None),
+    }
+    rows = (Row(label="a"), Row(label="b"))
+    assert score("t", table(rows), runs, scale="demo").commits == {"aaa": 1, "bbb": 1}
+
+
+def test_misspelt_metric_is_refused_before_anything_runs() -> None:
+    bad = table((Row(label="a"),), (Column(name="x", metric="mIou"),))
+    with pytest.raises(InputError, match="did you mean 'mIoU'"):
+        check_metrics(bad, bad.rows)
+    check_metrics(table((Row(label="a"),), (ACC, RGB, LESS)), [Row(label="a")])
