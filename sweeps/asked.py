@@ -24,6 +24,9 @@ Arguments = Mapping[str, str]
 OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out")
 """Arguments that are no settings of execution."""
 
+WEIGHTS = "weights."
+"""weights.mask2former_swin_b=FILE: for the rows that name this network."""
+
 WORDS = ("storage", "retry", "executor")
 """Settings that are text."""
 
@@ -125,7 +128,22 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"
     check_metrics(table, (row for row in table.rows if table.runnable(row)))
-    return Wanted(name, table, arguments["scale"], seeds_of(arguments["seeds"]), extra)
+    seeds = seeds_of(arguments["seeds"])
+    weights = dict(_weights(word) for word in extra if word.startswith(WEIGHTS))
+    others = tuple(word for word in extra if not word.startswith(WEIGHTS))
+    wanted = Wanted(name, table, arguments["scale"], seeds, others, weights)
+    for model in weights:
+        if model not in wanted.models():
+            raise InputError(
+                f"{WEIGHTS}{model}: no row of {name} names that network at "
+                f"scale={wanted.scale}; {nearest(model, wanted.models())}."
+            )
+    return wanted
+
+
+def _weights(word: str) -> tuple[str, str]:
+    model, _, file = word.removeprefix(WEIGHTS).partition("=")
+    return model, file
 
 
 def runs_of(place: Place) -> Runs:

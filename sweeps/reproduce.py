@@ -49,6 +49,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     timeout_minutes, max_failures, executor, submitit as in conf/hydra/sweeper/study.yaml
     out       folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder of runs
     overrides of every row: dataset.root=/data/MFNet tracking.uri=http://host:5000
+    weights.mask2former_swin_b=FILE: weights of the rows with that network, one for each of them
 
     A table of your own:
     python -m sweeps.reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4

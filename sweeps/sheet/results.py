@@ -39,7 +39,7 @@ def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tra
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
     scored = score(wanted.name, wanted.table, wanted.runs(outcomes), scale=wanted.scale)
-    sheet = sheet_of(scored, wanted.extra)
+    sheet = sheet_of(scored, wanted.typed())
     show(terminal(sheet, plain=not sys.stdout.isatty()))
     failed = _tell_what_is_missing(scored, outcomes)
     try:

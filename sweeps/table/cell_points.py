@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
+from rgbt.command import readable_paths
 from sweeps.points import Evaluation, Point
 from sweeps.table.cells import evaluation_of, is_counted
 from sweeps.table.table import Table
@@ -34,6 +35,7 @@ class Wanted:
         scale: "demo" or "paper".
         seeds: of every row.
         extra: overrides that win over those of the rows.
+        weights: files of weights by the name of the network, for tables of several backbones.
     """
 
     name: str
@@ -41,13 +43,15 @@ class Wanted:
     scale: str
     seeds: tuple[int, ...]
     extra: tuple[str, ...] = ()
+    weights: Mapping[str, str] = field(default_factory=dict)
 
     def overrides(self, label: str, seed: int) -> tuple[str, ...]:
         """Overrides of the run of row `label` with that seed."""
         (row,) = (row for row in self.table.rows if row.label == label)
         experiment, *others = self.table.overrides(row, self.scale)
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
-        return (experiment, *scale, *others, *self.extra, f"seed={seed}")
+        weights = _weights_of(others, self.weights)
+        return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
     def places(self) -> list[tuple[str, int]]:
         """(label, seed) of every cell that can be run; all rows of a seed before the next seed."""
@@ -80,6 +84,26 @@ class Wanted:
         """The outcome of every cell."""
         by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
         return {place: by_overrides[self.overrides(*place)] for place in self.places()}
+
+    def typed(self) -> tuple[str, ...]:
+        """What was asked for beside the table itself, as it was typed."""
+        return (*self.extra, *(f"weights.{model}={file}" for model, file in self.weights.items()))
+
+    def models(self) -> set[str]:
+        """Networks that the rows name."""
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        named = (_model_of(self.table.overrides(row, self.scale)) for row in rows)
+        return {name for name in named if name is not None}
+
+
+def _model_of(overrides: Sequence[str]) -> str | None:
+    named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
+    return named[-1] if named else None
+
+
+def _weights_of(overrides: Sequence[str], weights: Mapping[str, str]) -> tuple[str, ...]:
+    file = weights.get(_model_of(overrides) or "")
+    return () if file is None else tuple(readable_paths([f"model.weights={file}"]))
 
 
 def seeds_of(text: str) -> tuple[int, ...]:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rgbt.checks import InputError
+from sweeps.asked import wanted_of
 from sweeps.points import Evaluation
 from sweeps.running.lists import Outcome
 from sweeps.table.cell_points import Wanted, seeds_of
@@ -86,3 +87,17 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
 def test_no_seeds(text: str) -> None:
     with pytest.raises(InputError, match="how many"):
         seeds_of(text)
+
+
+def test_rows_of_different_networks_take_weights_of_their_own() -> None:
+    arguments = {"scale": "paper", "seeds": "1"}
+    given = ("weights.mask2former_swin_t=/w/t=1.pth", "weights.mask2former_swin_b=b.pth", "x=1")
+    wanted = wanted_of("spatialseg/table7", arguments, given)
+    assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
+        *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
+    )
+    assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
+    assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
+    assert wanted.typed() == ("x=1", *given[:2])
+    with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
+        wanted_of("spatialseg/table7", arguments, ("weights.mask2former_swinb=x",))
