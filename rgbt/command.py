@@ -20,7 +20,7 @@ from types import FrameType
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
@@ -202,6 +202,11 @@ def _composed_without(full_key: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
+    sweeper = conf_dir() / "hydra" / "sweeper" / "study.yaml"
+    if full_key.startswith("hydra.sweeper.") and full_key.count(".") == 2:
+        settings = [str(key) for key in OmegaConf.load(sweeper) if key != "_target_"]
+        last = full_key.rpartition(".")[2]
+        return f"'{full_key}' is not a setting of a sweep; {nearest(last, settings)}."
     config = _composed_without(full_key, overrides)
     *parents, last = full_key.split(".")
     node: object = config
@@ -230,7 +235,9 @@ def plain_command(
             usage = " ".join(f"{k}=..." if v is None else f"[{k}={v}]" for k, v in own.items())
             sys.stdout.write(f"{(main.__doc__ or '').strip()}\n\nusage: {usage} [overrides]\n")
             sys.exit(0)
-        sys.exit(_report(lambda: main(*_split(own, arguments))))
+        with _terminable():
+            code = _report(lambda: main(*_split(own, arguments)))
+        sys.exit(code)
 
     return entry
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.command import composing, readable_paths
-from rgbt.config import check_node
+from rgbt.config import NODES, TOP_LEVEL, check_node
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
@@ -24,8 +25,11 @@ Arguments = Mapping[str, str]
 OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out")
 """Arguments that are no settings of execution."""
 
+NAME = r"[\w\-. :/]+"
 WEIGHTS = "weights."
 """weights.mask2former_swin_b=FILE: for the rows that name this network."""
+
+KEYS = (*NODES, *TOP_LEVEL, "debug")
 
 WORDS = ("storage", "retry", "executor")
 """Settings that are text."""
@@ -52,7 +56,7 @@ class Place:
 
     def folder(self, wanted: Wanted) -> Path:
         """Where the files go."""
-        return self.out or self.runs_dir / "tables" / f"{wanted.name}_{wanted.scale}"
+        return self.out or self.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
 
 
 def settings_of(arguments: Arguments) -> Settings:
@@ -103,12 +107,25 @@ def place_of(arguments: Arguments, overrides: Sequence[str]) -> tuple[Place, tup
         if key in ("seed", "experiment"):
             other = "seeds=3" if key == "seed" else "another table"
             raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
+        if key == "metric" or key.startswith("metric."):
+            raise InputError(
+                f"'{word}': the columns of the table say what is counted; set its `regions` in a "
+                "table of your own."
+            )
+        if _is_misspelt(word, arguments):
+            raise InputError(f"'{word}': {key} is no key; {nearest(key, [*arguments, *KEYS])}.")
         if word.startswith("-"):
             raise InputError(f"'{word}' is no key=value; {nearest(word, arguments)}.")
     tracker = tuple(word for word in overrides if word.lstrip("+~").startswith("tracking"))
     rest = tuple(word for word in overrides if word not in tracker)
     out = Path(arguments["out"]) if arguments["out"] else None
     return Place(Path(arguments["runs_dir"]), out, tracker), rest
+
+
+def _is_misspelt(word: str, arguments: Arguments) -> bool:
+    """Whether a word without a dot is neither a node nor a plain key of a configuration."""
+    key = word.lstrip("+~").partition("=")[0]
+    return not set(key) & set("./@") and key not in KEYS and key not in arguments
 
 
 def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted:
@@ -128,6 +145,11 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"
     check_metrics(table, (row for row in table.rows if table.runnable(row)))
+    if not re.fullmatch(NAME, name):
+        raise InputError(
+            f"table={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone; "
+            "rename the file."
+        )
     seeds = seeds_of(arguments["seeds"])
     weights = dict(_weights(word) for word in extra if word.startswith(WEIGHTS))
     others = tuple(word for word in extra if not word.startswith(WEIGHTS))

@@ -13,18 +13,19 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
+from sweeps.points import Point
 from sweeps.running.driver import Driver
 from sweeps.running.found import Runs
 from sweeps.running.ledger import Ledger
 from sweeps.running.lists import make_executor
 from sweeps.running.live import View
 from sweeps.running.owner import Owner
-from sweeps.running.plan import Planner
+from sweeps.running.plan import Plan, Planner
 from sweeps.running.sources import SearchSource
 from sweeps.running.storage import begin_study, existing_study, open_storage
 from sweeps.settings import Settings
 from sweeps.space.samplers import build_pruner, build_sampler
-from sweeps.space.space import Parameter, signature
+from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_places, study_folder
 
 
@@ -67,12 +68,16 @@ def search(wanted: Search, settings: Settings) -> None:
     if settings.dry_run:
         _preview(wanted, settings)
         return
+    probe = _probe(wanted)
     storage = open_storage(settings.storage, wanted.runs.runs_dir)
     wanted.runs.touch()
     attributes = {
         names.KIND: "search",
         names.SIGNATURE: signature(
-            wanted.parameters, settings.objectives, settings.replicates, list(wanted.identity)
+            wanted.parameters,
+            settings.objectives,
+            settings.replicates,
+            [*wanted.identity, probe.runs[0].dataset],
         ),
     }
     study = begin_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
@@ -85,6 +90,22 @@ def search(wanted: Search, settings: Settings) -> None:
     runs_dir = wanted.runs.runs_dir
     links = report(study, study_folder(runs_dir, wanted.study), wanted.runs.tracking)
     show_places([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
+
+
+def _probe(wanted: Search) -> Plan:
+    """One point of the space, so that what is wrong with all of them is told before the first.
+
+    Raises:
+        InputError: the point cannot be composed, or its data set is not there.
+    """
+    from optuna.trial import FixedTrial
+
+    lowest = {
+        parameter.key: parameter.choices[0] if parameter.choices else parameter.low
+        for parameter in wanted.parameters
+    }
+    chosen = as_overrides(suggest(FixedTrial(lowest), wanted.parameters))
+    return Planner().plan(Point(label="probe", overrides=(*wanted.fixed, *chosen)))
 
 
 def _drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
@@ -144,7 +165,7 @@ def _preview(wanted: Search, settings: Settings) -> None:
         sys.stdout.write(f"  {parameter}\n")
     for objective in settings.objectives:
         sys.stdout.write(f"  {objective.direction} {objective.metric}\n")
-    sys.stdout.write(f"  python -m rgbt.run {shlex.join(wanted.fixed)} ...\n")
+    sys.stdout.write(f"  python -m rgbt.run {without_passwords(shlex.join(wanted.fixed))} ...\n")
     if settings.trials is not None:
         left = max(0, settings.trials - len(counted))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")

@@ -9,6 +9,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
 from rgbt.config import build
+from rgbt.metrics import names as scores
+
+SCORES = (
+    *(scores.MIOU, scores.VAR, scores.MACC, scores.MPRECISION, scores.MF1),
+    *(scores.PIXEL_ACCURACY, scores.region(1), scores.class_iou("car")),
+)
+"""Scores of a run, with one region and one class as examples."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,11 @@ class Objective:
                 f"objective '{self.metric}': expected val/<score> or test/<score>, such as "
                 "val/mIoU or val/Var."
             )
+        score = self.metric.partition("/")[2]
+        part, _, inner = score.partition("/")
+        whole = inner if part in (scores.DAY, scores.NIGHT) else score
+        if whole not in SCORES and part not in ("region", "class"):
+            raise InputError(f"objective '{self.metric}': {nearest(score, SCORES)}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,7 @@ from sweeps.search import Search, search
 from sweeps.settings import Settings, read_settings
 from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
 from sweeps.space.merge import merge_space
+from sweeps.space.space import as_overrides
 
 PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking", "trainer.threads")
 """Overrides that may differ between two calls of the same sweep."""
@@ -41,7 +42,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         RunError: points failed; all others were run.
     """
     settings = read_settings(config.hydra.sweeper)
-    typed = [*(f"{key}={value}" for key, value in settings.params.items()), *arguments]
+    typed = [*_params(settings), *arguments]
     fixed, swept, intervals = split(typed, loader)
     base = tuple(_forwarded(config))
     runs = open_runs(config)
@@ -49,14 +50,40 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         parameters = merge_space(settings.space, fixed, swept, intervals)
         taken = {parameter.key for parameter in parameters}
         shared = (*base, *(word for word in fixed if word.partition("=")[0] not in taken))
-        identity = (shared, parameters, settings.objectives, settings.replicates)
+        if settings.points:
+            raise InputError("points and a search do not go together; give each its own command.")
+        identity = (sorted(shared), parameters, settings.objectives, settings.replicates)
         name = settings.study or _name(config, [p.key for p in parameters], identity)
-        search(Search(name, shared, parameters, runs, _plain(shared)), settings)
+        search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
         return
+    _refuse_what_is_for_searches(settings)
     points = _points(settings, fixed, swept)
+    if len(points) == 1:
+        tell("no list of values was given (such as seed=0,1,2): this is one point.")
     name = settings.study or _name(config, list(points[0].params), [p.overrides for p in points])
     kind = "list" if settings.points else "grid"
     _grid(_point_list(name, kind, points, (runs, base)), settings)
+
+
+def _params(settings: Settings) -> list[str]:
+    """`params` as overrides: text as it would be typed, other values as Hydra reads them."""
+    typed = {key: value for key, value in settings.params.items() if isinstance(value, str)}
+    others = {key: value for key, value in settings.params.items() if key not in typed}
+    return [*(f"{key}={value}" for key, value in typed.items()), *as_overrides(others)]
+
+
+def _refuse_what_is_for_searches(settings: Settings) -> None:
+    given = {
+        "trials": settings.trials is not None,
+        "hours": settings.hours is not None,
+        "pruner": settings.pruner is not None,
+        "replicates": settings.replicates > 1,
+    }
+    for key in (key for key, is_given in given.items() if is_given):
+        raise InputError(
+            f"hydra.sweeper.{key} is for searches, and nothing is searched here; give a range "
+            "(optimizer.lr=interval(0.001,0.01) or +search=...), or leave it away."
+        )
 
 
 def _points(settings: Settings, fixed: Sequence[str], swept: Swept) -> list[GridPoint]:
@@ -139,7 +166,7 @@ def _plain(value: Any) -> Any:
         key = value.partition("=")[0].lstrip("+")
         return None if key in PLACES or key.startswith("tracking.") else value
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain for plain in map(_plain, value) if plain is not None]
     return value
 
 

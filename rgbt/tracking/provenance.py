@@ -40,8 +40,13 @@ def provenance() -> dict[str, Any]:
 
 
 def without_passwords(text: str) -> str:
-    """`text` with the password of every ``scheme://user:password@host`` replaced by ``***``."""
-    return re.sub(r"(://[^/\s:@]+):[^/\s@]+@", r"\1:***@", text)
+    """`text` with the passwords of addresses replaced by ``***``.
+
+    These are ``scheme://user:password@host``, whatever the password holds but spaces, and
+    ``?password=...``.
+    """
+    text = re.sub(r"(://[^/\s:@]+):(?!\d+/)[^\s'\"]+@", r"\1:***@", text)
+    return re.sub(r"([?&]password=)[^&\s'\"]+", r"\1***", text)
 
 
 def _code(file: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pkgutil
 import runpy
 import signal
 import sys
@@ -17,17 +18,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
+import rgbt
+
 PRELOADED = (
-    *(
-        "sweeps.running.executors",
-        "torch",
-        "rgbt.training",
-        "rgbt.evaluate",
-        "rgbt.stored",
-        "hydra",
-    ),
+    *("sweeps.running.executors", "torch", "hydra"),
     *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
 )
+COMMANDS = ("rgbt.run", "rgbt.evaluate")
+"""Run as programs, and a few lines each: not imported before."""
+
 GRACE_S = 20.0
 """What a process that is asked to stop may take before it is killed."""
 
@@ -63,7 +62,7 @@ class LocalExecutor:
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(list(PRELOADED))
+        self._context.set_forkserver_preload([*PRELOADED, *own_modules()])
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
         """See `Executor.start`."""
@@ -74,6 +73,13 @@ class LocalExecutor:
         # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
         process.start()
         return LocalJob(process)
+
+
+def own_modules() -> list[str]:
+    """Every module of rgbt but the commands themselves, so that later edits reach no run."""
+    found = pkgutil.walk_packages(rgbt.__path__, "rgbt.")
+    names = [module.name for module in found if not module.name.endswith("__main__")]
+    return [name for name in names if name not in COMMANDS]
 
 
 class LocalJob:

@@ -85,13 +85,13 @@ def _last_words(log: Path, start: int) -> str:
     return last.removeprefix("rgbt: ")[:300]
 
 
-def stop_holder(folder: Path) -> None:
-    """Send SIGTERM to the process that trains in `folder`, if it is on this machine."""
+def stop_holder(folder: Path, number: signal.Signals) -> None:
+    """Send a signal to the process that trains in `folder`, if it is on this machine."""
     lock = folder / "lock"
     found = re.fullmatch(r"process (\d+) on (\S+)", lock.read_text()) if lock.exists() else None
     if found and found.group(2) == os.uname().nodename:
         with suppress(ProcessLookupError):  # it has ended between our two looks
-            os.kill(int(found.group(1)), signal.SIGTERM)
+            os.kill(int(found.group(1)), number)
 
 
 def known_seconds(folder: Path) -> float | None:

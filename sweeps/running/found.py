@@ -10,12 +10,13 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from rgbt.checks import RunError
+from rgbt.checks import InputError, RunError
 from rgbt.config import build
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import shown
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.terminal import tell
 from sweeps.points import Evaluation
 
@@ -78,6 +79,17 @@ class Found:
             InputError: the file is missing or not readable.
         """
         return Counts.load(self.counts_file(evaluation))
+
+    def has(self, evaluation: Evaluation) -> bool:
+        """Whether the evaluation is there, of this result and not of an earlier training."""
+        path, result = self.counts_file(evaluation), self.folder / "result.json"
+        if not path.exists() or path.stat().st_mtime < result.stat().st_mtime:
+            return False
+        try:
+            counts = Counts.load(path)
+        except InputError:  # not readable: it is made again
+            return False
+        return counts.dataset == self.dataset and counts.split == "test"
 
     def counts_file(self, evaluation: Evaluation | None = None) -> Path:
         """Where the counts lie, whether they are there yet or not."""
@@ -165,7 +177,7 @@ class Runs:
     def fetch_again(self, found: Found, evaluation: Evaluation) -> bool:
         """Look for an evaluation that the other machine has made since; whether it is here now."""
         self._guarded(lambda tracking: _download(tracking, found, ("evaluations",)))
-        return found.counts_file(evaluation).exists()
+        return found.has(evaluation)
 
     def touch(self) -> None:
         """Open the store once, before several processes would make its tables at the same time."""
@@ -176,7 +188,8 @@ class Runs:
         known = copy / "run_id"
         if known.exists():
             found = Found(key, copy, known.read_text())
-            return found if found.dataset == dataset else None
+            if found.dataset == dataset:
+                return found
         fetched: Found | None = self._guarded(lambda t: _fetch(t, (key, dataset), copy))
         return fetched
 
@@ -188,7 +201,8 @@ class Runs:
             return work(self.tracking)
         except Exception as error:  # The border to a store that may fail in any way.
             self._is_away = True
-            reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+            said = without_passwords(str(error)).splitlines() or [type(error).__name__]
+            reason = said[0][:120]
             tell(
                 f"MLflow cannot be used ({reason}); runs are looked for in {self.runs_dir} alone, "
                 "and `python -m rgbt.tracking.sync` sends them later."

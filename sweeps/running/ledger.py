@@ -87,14 +87,14 @@ class Ledger:
             names.TOKEN: token,
             **self._sign(),
         }
-        self.study.add_trial(
-            create_trial(
-                state=TrialState.RUNNING,
-                params=dict(wanted.params),
-                distributions=dict(wanted.distributions),
-                user_attrs=attributes,
-            )
-        )
+        params, asked = dict(wanted.params), dict(wanted.distributions)
+        running = partial(create_trial, state=TrialState.RUNNING, user_attrs=attributes)
+        try:
+            self.study.add_trial(running(params=params, distributions=asked))
+        except ValueError:
+            # A grid that is gone on with by other values: a database keeps to the first choices of
+            # a parameter. The point is run all the same; only figures over parameters lack it.
+            self.study.add_trial(running())
         same = self.by_key()[wanted.key]
         (number,) = [trial.number for trial in same if trial.user_attrs.get(names.TOKEN) == token]
         standing = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -151,6 +151,21 @@ class _Prepared:
                 self.plans[index] = planner.plan(point)
             except InputError as error:
                 self.wrong[index] = str(error)
+        if self.wrong and not self.plans:
+            # What no point can be composed with is a mistake of the call and not of a cell.
+            raise InputError(next(iter(self.wrong.values())))
+        self._share_tags()
+
+    def _share_tags(self) -> None:
+        """Points that are the same run in other words (1 and 1.0) get the tags of all of them."""
+        tags: dict[str, dict[str, list[str]]] = {}
+        for plan in self.plans.values():
+            for name, value in plan.point.tags.items():
+                values = tags.setdefault(plan.key, {}).setdefault(name, [])
+                values += [] if value in values else [value]
+        for index, plan in self.plans.items():
+            shared = {name: " | ".join(each) for name, each in tags.get(plan.key, {}).items()}
+            self.plans[index] = replace(plan, point=replace(plan.point, tags=shared))
 
     def outcomes(self, standing: Any) -> list[Outcome]:
         """One outcome per point, in order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.points import Point
 from sweeps.running.found import Found, Runs, in_percent
@@ -123,7 +125,7 @@ class ListSource:
                 continue
             attributes = {
                 names.LABEL: plan.point.label,
-                names.OVERRIDES: list(plan.point.overrides),
+                names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],
                 names.RUNS: [run.key for run in plan.runs],
             }
             params = {k: v for k, v in plan.point.params.items() if k in self._distributions}
@@ -177,7 +179,7 @@ def known(plan: Plan, runs: Runs) -> tuple[Found, ...] | None:
             one = runs.find(run.key, run.dataset)
         except RunError:  # told when the point is worked on
             return None
-        if one is None or not all(one.counts_file(e).exists() for e in plan.point.evaluations):
+        if one is None or not all(map(one.has, plan.point.evaluations)):
             return None
         found.append(one)
     return tuple(found)
@@ -241,7 +243,7 @@ class SearchSource:
         notes = {
             names.KEY: plan.key,
             names.LABEL: point.label,
-            names.OVERRIDES: list(point.overrides),
+            names.OVERRIDES: [without_passwords(word) for word in point.overrides],
             names.RUNS: [run.key for run in plan.runs],
         }
         self._ledger.note(trial.number, notes)
@@ -312,6 +314,7 @@ class SearchSource:
 def short(override: str) -> str:
     """An override for people: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
     key, _, value = override.lstrip("+").partition("=")
+    value = re.sub(r"\$\{px:(\d+)\}", r"\1px", value)
     with suppress(ValueError):
         value = f"{float(value):.4g}"
     return f"{key.rpartition('.')[2]}={value}"

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Opened = TypeVar("Opened")
 
 JOURNAL = "studies.journal"
+SCHEMES = ("sqlite", "postgresql", "postgres")
 ATTEMPTS = 8
 FIXED = {
     names.METRICS: "other objectives",
@@ -61,7 +62,8 @@ def _checked(storage: str | None, runs_dir: Path) -> str:
         InputError: it is none of the forms of `open_storage`, or its folder does not exist.
     """
     url = str(runs_dir / JOURNAL) if storage is None else storage
-    if "://" not in url and not url.endswith(".journal"):
+    scheme = url.partition("://")[0].partition("+")[0]
+    if not url.endswith(".journal") and ("://" not in url or scheme not in SCHEMES):
         raise InputError(
             f"storage={without_passwords(url)}: expected a file that ends in .journal, "
             "sqlite:///FILE or postgresql://USER@HOST/NAME."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from rgbt.checks import RunError
 from rgbt.tracking.files import is_held
 from rgbt.tracking.folder import MetricLine
 from sweeps.points import Evaluation
-from sweeps.running.executors import Job
+from sweeps.running.executors import GRACE_S, Job
 from sweeps.running.follow import Follower, stop_holder, why
 from sweeps.running.found import Found, Runs
 from sweeps.running.plan import Plan, PlannedRun
@@ -153,7 +154,7 @@ class Work:
                 )
             runs.tag(found, self.plan.point.tags)
             for evaluation in self.plan.point.evaluations:
-                yield from self._evaluate(found, evaluation)
+                yield from self._evaluate(run, found, evaluation)
             self._found = (*self._found, found)
         self._index = len(self.plan.runs)
 
@@ -179,9 +180,9 @@ class Work:
             if not finished and not is_held(folder / "lock"):
                 raise PointError(why(code, log, begin))
 
-    def _evaluate(self, found: Found, evaluation: Evaluation) -> Iterator[None]:
+    def _evaluate(self, run: PlannedRun, found: Found, evaluation: Evaluation) -> Iterator[None]:
         out = found.counts_file(evaluation)
-        if out.exists():
+        if found.has(evaluation):
             return
         if found.run_id and self._around.runs.fetch_again(found, evaluation):
             return
@@ -198,9 +199,11 @@ class Work:
             "rgbt.evaluate",
             *(f"run={found.folder}", f"modality={evaluation.modality}"),
             *(f"regions={evaluation.regions}", f"out={out}"),
+            # The run may have been made where the data lie elsewhere.
+            *(word for word in run.overrides if word.startswith("dataset.root=")),
         )
         code = yield from self._run(command, log)
-        if code != 0 or not out.exists():
+        if code != 0 or not found.has(evaluation):
             raise PointError(why(code, log, begin))
         self._around.runs.send(found)
 
@@ -231,9 +234,12 @@ class Work:
 
     def _end(self, poll: Callable[[], int | None]) -> Iterator[None]:
         if self._held is not None:
-            stop_holder(self._held)
+            stop_holder(self._held, signal.SIGTERM)
         self.stop()
+        kill_at = time.monotonic() + GRACE_S
         while poll() is None:
+            if self._held is not None and time.monotonic() > kill_at:
+                stop_holder(self._held, signal.SIGKILL)
             yield
 
     def _follow(self) -> None:

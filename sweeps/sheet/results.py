@@ -49,7 +49,7 @@ def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tra
         return 1
     links = record(
         tracking,
-        name=f"{wanted.name} {wanted.scale}",
+        name=f"{wanted.name} {wanted.variant}",
         kind="table",
         files=files,
         metrics=metrics(scored, outcomes),

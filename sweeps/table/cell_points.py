@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -89,6 +90,13 @@ class Wanted:
         """What was asked for beside the table itself, as it was typed."""
         return (*self.extra, *(f"weights.{model}={file}" for model, file in self.weights.items()))
 
+    @property
+    def variant(self) -> str:
+        """The scale; with a short hash where further overrides make it another table."""
+        shown = [word for word in self.typed() if not word.startswith("dataset.root=")]
+        digest = hashlib.sha256("\n".join(sorted(shown)).encode()).hexdigest()[:6]
+        return f"{self.scale}-{digest}" if shown else self.scale
+
     def models(self) -> set[str]:
         """Networks that the rows name."""
         rows = [row for row in self.table.rows if self.table.runnable(row)]
@@ -112,14 +120,20 @@ def seeds_of(text: str) -> tuple[int, ...]:
     Raises:
         InputError: something else.
     """
-    words = text.strip("[]()").split(",")
+    is_list = text.startswith("[") and text.endswith("]")
+    words = (text[1:-1] if is_list else text).split(",")
     numbers = tuple(int(word) for word in words if word.strip().isdecimal())
-    if len(numbers) != len(words) or len(set(numbers)) != len(numbers) or numbers == (0,):
+    counted = len(numbers) == 1 and not is_list
+    if (
+        len(numbers) != len(words)
+        or len(set(numbers)) != len(numbers)
+        or (counted and not any(numbers))
+    ):
         raise InputError(
             f"seeds={text}: expected how many (3 for the seeds 0, 1, 2) or a list of different "
             "ones (0,4,7)."
         )
-    return tuple(range(numbers[0])) if len(numbers) == 1 else numbers
+    return tuple(range(numbers[0])) if counted else numbers
 
 
 def _short(labels: Sequence[str]) -> str:

@@ -103,6 +103,8 @@ def score(
         if row.label in ran:
             outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
             cells |= row_cells(table, row, outcomes)
+    # A mean over fewer seeds is no fair rival: it is shown, and takes no part in marks and orders.
+    whole = {place: cell for place, cell in cells.items() if cell.seeds == len(seeds)}
     found = {run.key: run.commit for outcome in runs.values() for run in outcome.found}
     return Scored(
         name=name,
@@ -110,8 +112,8 @@ def score(
         scale=scale,
         seeds=tuple(seeds),
         cells=cells,
-        orders={column.name: _order(table, column, cells) for column in table.columns},
-        ranks_ours=_ranks(table, {place: cell.mean for place, cell in cells.items()}),
+        orders={column.name: _order(table, column, whole) for column in table.columns},
+        ranks_ours=_ranks(table, {place: cell.mean for place, cell in whole.items()}),
         ranks_published=_ranks(table, _printed(table)),
         commits=Counter(commit for commit in found.values() if commit is not None),
     )

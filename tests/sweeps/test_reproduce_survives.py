@@ -47,6 +47,11 @@ def processes_in(runs: Path) -> list[int]:
     return found
 
 
+def table_of(runs: Path) -> str:
+    (file,) = (runs / "tables" / "my").glob("ablation_demo-*/table.md")
+    return file.read_text()
+
+
 def test_killed_and_called_again_loses_nothing_and_runs_nothing_twice(
     data: Path, tmp_path: Path
 ) -> None:
@@ -73,10 +78,10 @@ def test_killed_and_called_again_loses_nothing_and_runs_nothing_twice(
     starts = [len(json.loads((run / "provenance.json").read_text())) for run in finished]
     # Only what was killed was begun twice; it went on from its checkpoint.
     assert sorted(starts) == [1, 1, 1, 2]
-    text = (runs / "tables" / "my" / "ablation_demo" / "table.md").read_text()
+    text = table_of(runs)
     assert "masker.sigma_div must be positive, got 0" in text
 
     third = subprocess.run(words, capture_output=True, text=True, timeout=240)
     assert third.returncode == 1
     assert [len(json.loads((run / "provenance.json").read_text())) for run in finished] == starts
-    assert (runs / "tables" / "my" / "ablation_demo" / "table.md").read_text() == text
+    assert table_of(runs) == text

@@ -123,18 +123,18 @@ def test_our_sentence_at_the_end_is_the_reason_though_a_library_logged_a_traceba
 
 def test_the_process_that_holds_a_folder_is_asked_to_stop(tmp_path: Path) -> None:
     with held_by_another(tmp_path) as process:
-        stop_holder(tmp_path)
+        stop_holder(tmp_path, signal.SIGTERM)
         assert process.wait() == -signal.SIGTERM
 
 
 def test_a_holder_on_another_machine_is_left_alone(tmp_path: Path) -> None:
-    stop_holder(tmp_path)  # nothing there
+    stop_holder(tmp_path, signal.SIGTERM)  # nothing there
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
         (tmp_path / "lock").write_text(f"process {process.pid} on not-{os.uname().nodename}")
-        stop_holder(tmp_path)
+        stop_holder(tmp_path, signal.SIGTERM)
         (tmp_path / "lock").write_text("another process")
-        stop_holder(tmp_path)
+        stop_holder(tmp_path, signal.SIGTERM)
         assert process.poll() is None
         process.communicate(b"\n")
         assert process.returncode == 0
@@ -146,7 +146,7 @@ def test_a_holder_that_is_gone_already_needs_no_stop(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", "pass"])
     process.wait()
     (tmp_path / "lock").write_text(f"process {process.pid} on {os.uname().nodename}")
-    stop_holder(tmp_path)
+    stop_holder(tmp_path, signal.SIGTERM)
 
 
 def test_seconds_are_known_of_finished_runs_alone(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import pytest
 from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
 
+from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import MetricLine
 from sweeps import attributes as names
 from sweeps.points import Evaluation, Point
@@ -164,7 +168,7 @@ def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) 
         (tmp_path / run.key / "evaluations").mkdir()
         found = runs.find(run.key, run.dataset)
         assert found is not None
-        found.counts_file(ring).touch()
+        shutil.copyfile(found.folder / "counts_test.npz", found.counts_file(ring))
     both = known(plan, runs)
     assert both is not None
     assert [found.key for found in both] == [run.key for run in plan.runs]
@@ -317,3 +321,26 @@ def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
     assert number == 0
     ledger.study.tell(0, state=TrialState.FAIL)
     assert reason_of(ledger.trials()[0]) == "no reason was noted"
+
+
+def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_path: Path) -> None:
+    ring = Evaluation(regions="ring9")
+    plan = plan_of(Point("p", (), evaluations=(ring,)))
+    runs = list_desk(tmp_path, []).runs
+    (run,) = plan.runs
+    finish(tmp_path / run.key)
+    found = runs.find(run.key, run.dataset)
+    assert found is not None
+    file = found.counts_file(ring)
+    file.parent.mkdir()
+    shutil.copyfile(found.folder / "counts_test.npz", file)
+    assert found.has(ring)
+    os.utime(file, (0, 0))  # the run was trained again since
+    assert not found.has(ring)
+    assert known(plan, runs) is None
+    replace(Counts.load(found.folder / "counts_test.npz"), dataset="other").save(file)
+    assert not found.has(ring)
+    replace(Counts.load(found.folder / "counts_test.npz"), split="val").save(file)
+    assert not found.has(ring)
+    file.write_bytes(b"half")
+    assert not found.has(ring)

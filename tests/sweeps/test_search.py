@@ -1,0 +1,152 @@
+"""A search: what is refused before the first trial, what a study keeps to, how it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sweeps.search as searching
+from rgbt.checks import InputError, RunError
+from rgbt.config import compose
+from sweeps import attributes as names
+from sweeps.running.found import open_runs
+from sweeps.running.ledger import Ledger
+from sweeps.running.storage import load_study, open_storage
+from sweeps.search import Search, search
+from sweeps.settings import Objective, Settings
+from sweeps.space.space import parse_space
+from tests.sweeps.fakes import settings as plain_settings
+
+SPACE = {"masker.sigma_div": {"type": "float", "low": 1, "high": 4}}
+SMALL = ("dataset.num_train=4", "dataset.num_val=2", "dataset.num_test=2")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return f"dataset.cache_dir={tmp_path_factory.mktemp('cache')}"
+
+
+@pytest.fixture
+def wanted(tmp_path: Path, cache: str) -> Search:
+    place = (f"runs_dir={tmp_path}", "tracking=none", cache)
+    fixed = ("+experiment=grbm", *SMALL, *place)
+    return Search("s", fixed, parse_space(SPACE), open_runs(compose(place)), [])
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The states that the driver leaves trials in, instead of running them."""
+    states: list[str] = ["COMPLETE"]
+
+    def drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
+        del wanted, settings
+        for state in states:
+            trial = ledger.ask(None)
+            assert trial is not None
+            trial.suggest_float("masker.sigma_div", 1, 4)
+            if state == "COMPLETE":
+                ledger.complete(trial.number, [1.0], {names.RUNS: ["k"]})
+            else:
+                ledger.fail(trial.number, "no memory", {})
+
+    monkeypatch.setattr(searching, "_drive", drive)
+    monkeypatch.setattr(searching, "report", lambda *_: [("report", "here")])
+    return states
+
+
+def settings(**changes: Any) -> Settings:
+    objectives = (Objective("val/mIoU", "maximize"),)
+    return plain_settings(**{"trials": 3, "objectives": objectives, **changes})
+
+
+def test_a_search_begins_a_study_that_says_what_it_is(
+    wanted: Search, ends: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.orig_argv", ["python", "x=postgresql://me:secret@host/db"])
+    search(wanted, settings())
+    study = load_study("s", open_storage(None, tmp_path))
+    assert study.user_attrs[names.KIND] == "search"
+    assert "secret" not in study.user_attrs[names.COMMAND]
+    search(wanted, settings(trials=9))  # a larger budget is the same study
+    assert len(study.trials) == 2
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"space": {"masker.sigma_div": {"type": "float", "low": 1, "high": 8}}},
+        {"identity": ["trainer.max_steps=3"]},
+        {"data": "dataset.num_test=3"},
+        {"objectives": (Objective("val/Var", "minimize"),)},
+        {"replicates": 2},
+    ],
+    ids=lambda other: next(iter(other)),
+)
+def test_another_search_under_the_same_name_is_refused(
+    wanted: Search, ends: list[str], other: dict[str, Any]
+) -> None:
+    search(wanted, settings())
+    changed = wanted
+    if "space" in other:
+        changed = replace(wanted, parameters=parse_space(other["space"]))
+    if "identity" in other:
+        changed = replace(wanted, identity=other["identity"])
+    if "data" in other:
+        changed = replace(wanted, fixed=(*wanted.fixed, other["data"]))
+    kept = {key: other[key] for key in ("objectives", "replicates") if key in other}
+    with pytest.raises(InputError, match="there is a study 's' with"):
+        search(changed, settings(**kept))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"trials": None}, "needs a budget"),
+        ({"retry": "failed"}, "retry=failed is for grids"),
+        ({"sampler": {"seed": 1}}, "sampler: 'kind' has no value"),
+        ({"sampler": {"kind": "tpe", "seed": "x"}}, "sampler.seed: expected a whole number"),
+        (
+            {"objectives": (Objective("test/mIoU", "maximize"),), "pruner": {"kind": "median"}},
+            "known at the end alone",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_study_is_made(
+    wanted: Search, ends: list[str], tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        search(wanted, settings(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_wrong_with_every_trial_is_told_before_the_first(
+    wanted: Search, ends: list[str], tmp_path: Path
+) -> None:
+    mistaken = replace(wanted, fixed=(*wanted.fixed, "trainer.max_steps=x"))
+    with pytest.raises(InputError, match=r"trainer\.max_steps"):
+        search(mistaken, settings())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_search_without_a_finished_trial_ends_in_an_error(
+    wanted: Search, ends: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends[:] = ["FAIL", "FAIL"]
+    with pytest.raises(RunError, match="no trial of s has finished"):
+        search(wanted, settings())
+    assert "trial 1 failed: no memory" in capsys.readouterr().err
+
+
+def test_a_preview_says_what_is_left_and_writes_nothing(
+    wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search(wanted, settings(dry_run=True))
+    assert list(tmp_path.iterdir()) == []
+    assert "3 of 3 trials would be run" in capsys.readouterr().out
+    search(wanted, settings())
+    capsys.readouterr()
+    search(wanted, settings(dry_run=True))
+    assert "2 of 3 trials would be run" in capsys.readouterr().out

@@ -1,0 +1,204 @@
+"""What ``-m`` makes of overrides and settings: grids, lists and searches, without running them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import open_dict
+
+import sweeps.sweep as sweeping
+from rgbt.checks import InputError, RunError
+from rgbt.config import conf_dir, register_resolvers
+from sweeps.running.lists import Outcome, PointList
+from sweeps.search import Search
+from sweeps.settings import Settings
+from sweeps.sweep import sweep
+
+
+class Asked:
+    """What would have been run."""
+
+    def __init__(self) -> None:
+        self.lists: list[PointList] = []
+        self.searches: list[Search] = []
+        self.outcomes: list[Outcome] = []
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    found = Asked()
+
+    def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
+        del settings
+        found.lists.append(wanted)
+        return found.outcomes or [Outcome(point, "finished") for point in wanted.points]
+
+    def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
+        del settings
+        return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
+
+    monkeypatch.setattr(sweeping, "work_off", work_off)
+    monkeypatch.setattr(sweeping, "survey", survey)
+    monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
+    return found
+
+
+def call(runs: Path, *words: str, **settings: Any) -> None:
+    """What Hydra does with ``-m`` and these words, up to our sweeper."""
+    register_resolvers()
+    task = [f"runs_dir={runs}", "tracking=none", *words]
+    single = [word for word in task if "," not in word and "interval" not in word]
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        config = hydra.compose("config", ["hydra/sweeper=study", *single], return_hydra_config=True)
+        with open_dict(config):
+            for key, value in settings.items():
+                config.hydra.sweeper[key] = value
+        sweep(task, config, loader)
+
+
+def test_a_grid_is_all_combinations_each_with_its_parameters(asked: Asked, tmp_path: Path) -> None:
+    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
+    (wanted,) = asked.lists
+    assert [point.label for point in wanted.points] == [
+        *("sigma_div=1 seed=0", "sigma_div=1 seed=3", "sigma_div=2 seed=0", "sigma_div=2 seed=3"),
+    ]
+    assert wanted.points[3].params == {"masker.sigma_div": 2, "seed": 3}
+    assert "+experiment=grbm" in wanted.points[0].overrides
+    assert set(wanted.distributions or {}) == {"masker.sigma_div", "seed"}
+    assert wanted.kind == "grid"
+
+
+def test_points_are_run_for_every_value_of_the_grid(asked: Asked, tmp_path: Path) -> None:
+    points = [["masker.sigma_div=1", "masker.patch_size=8"], ["masker.sigma_div=4"]]
+    call(tmp_path, "+experiment=grbm", "seed=0,1", points=points)
+    (wanted,) = asked.lists
+    assert wanted.kind == "list"
+    assert [point.label for point in wanted.points] == [
+        *("seed=0 sigma_div=1 patch_size=8", "seed=0 sigma_div=4"),
+        *("seed=1 sigma_div=1 patch_size=8", "seed=1 sigma_div=4"),
+    ]
+
+
+def test_a_grid_in_a_file_is_read_as_it_would_be_typed(asked: Asked, tmp_path: Path) -> None:
+    params = {"masker.sigma_div": "1,2", "model.weights": None, "seed": 5}
+    call(tmp_path, "+experiment=grbm", params=params)
+    (wanted,) = asked.lists
+    assert len(wanted.points) == 2
+    assert {"model.weights=null", "seed=5"} <= set(wanted.points[0].overrides)
+
+
+def test_the_same_command_is_the_same_study_wherever_its_runs_lie(
+    asked: Asked, tmp_path: Path
+) -> None:
+    words = ("+experiment=grbm", "masker.sigma_div=1,2")
+    call(tmp_path / "a", *words)
+    call(tmp_path / "b", *words, "trainer.threads=1", "dataset.cache_dir=/c")
+    call(tmp_path / "a", *words, "trainer.max_steps=3")
+    first, moved, other = (wanted.study for wanted in asked.lists)
+    assert first == moved != other
+    assert first.startswith("grbm-sigma_div-")
+
+
+def test_the_same_search_is_the_same_study_in_any_order(asked: Asked, tmp_path: Path) -> None:
+    interval = "masker.sigma_div=interval(1,4)"
+    budget = {"trials": 3}
+    call(tmp_path, "+experiment=grbm", interval, "seed=1", "trainer.max_steps=3", **budget)
+    call(tmp_path, "trainer.max_steps=3", "+experiment=grbm", "seed=1", interval, **budget)
+    call(
+        tmp_path,
+        "+experiment=grbm",
+        interval,
+        "seed=1",
+        "trainer.threads=1",
+        "trainer.max_steps=3",
+        **budget,
+    )
+    objectives = [{"metric": "val/Var", "direction": "minimize"}]
+    same = ("+experiment=grbm", interval, "seed=1", "trainer.max_steps=3")
+    call(tmp_path, *same, objectives=objectives, **budget)
+    call(tmp_path, *same, replicates=2, **budget)
+    names = [wanted.study for wanted in asked.searches]
+    assert names[0] == names[1] == names[2]
+    assert len(set(names)) == 3
+    assert asked.searches[0].identity == asked.searches[2].identity
+    assert "trainer.max_steps=3" in asked.searches[0].identity
+
+
+def test_a_search_file_gives_ranges_and_its_runs_are_no_sweeps(
+    asked: Asked, tmp_path: Path
+) -> None:
+    call(tmp_path, "+search=grbm", "masker.sigma_div=4")
+    (wanted,) = asked.searches
+    keys = [parameter.key for parameter in wanted.parameters]
+    assert keys == ["masker.patch_size", "loss.spatial.alpha"]
+    assert "hydra.mode=RUN" in wanted.fixed
+    assert "masker.sigma_div=4" in wanted.fixed
+    call(tmp_path, "+search=grbm", "masker.sigma_div=1,2")
+    assert not [word for word in asked.searches[1].fixed if "sigma_div" in word]
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"trials": 3}, "hydra.sweeper.trials is for searches"),
+        ({"hours": 3}, "hydra.sweeper.hours is for searches"),
+        ({"replicates": 2}, "hydra.sweeper.replicates is for searches"),
+        ({"pruner": {"kind": "median"}}, "hydra.sweeper.pruner is for searches"),
+    ],
+)
+def test_what_a_grid_would_ignore_is_refused(
+    asked: Asked, tmp_path: Path, settings: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        call(tmp_path, "+experiment=grbm", "seed=0,1", **settings)
+    assert asked.lists == []
+
+
+def test_points_and_a_search_do_not_mix(asked: Asked, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="points and a search"):
+        call(tmp_path, "+search=grbm", points=[["seed=1"]])
+    assert asked.searches == []
+
+
+def test_one_point_is_said_to_be_one(
+    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call(tmp_path, "+experiment=grbm")
+    assert "this is one point" in capsys.readouterr().err
+    assert len(asked.lists) == 1
+
+
+def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) -> None:
+    from sweeps.points import Point
+
+    asked.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
+    with pytest.raises(InputError, match="a: no such key"):
+        call(tmp_path, "+experiment=grbm", "seed=0,1")
+    assert asked.lists == []
+
+
+def test_failed_points_end_in_an_error_after_the_table(
+    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sweeps.points import Point
+
+    asked.outcomes = [
+        Outcome(Point("a", ()), "finished", keys=("k1",)),
+        Outcome(Point("b", ()), "failed", "out of memory", keys=("k2",)),
+    ]
+    with pytest.raises(RunError, match="1 of 2 points failed, first b: out of memory"):
+        call(tmp_path, "+experiment=grbm", "seed=0,1")
+    assert "out of memory" in capsys.readouterr().out
+
+
+def test_a_preview_runs_nothing(
+    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call(tmp_path, "+experiment=grbm", "seed=0,1,2", dry_run=True)
+    assert asked.lists == []
+    assert "3 of 3 points would be run" in capsys.readouterr().err
