@@ -195,6 +195,10 @@ def test_all_tables_are_listed_and_only_listed(
         (("table=my/small", "seed=1"), "choose seeds=3"),
         (("table=my/small", "+experiment=crm"), "choose another table"),
         (("table=my/small", "tracking=mlfow"), "did you mean 'mlflow'"),
+        (("table=my/small", "metric=ring9"), "the columns of the table say what is counted"),
+        (("table=my/small", "metric.regions=9"), "the columns of the table say what is counted"),
+        (("table=my/small", "workes=2"), "did you mean 'workers'"),
+        (("table=my/small", "dryrun=true"), "did you mean 'dry_run'"),
         ((), "'table' has no value"),
     ],
 )

@@ -61,7 +61,13 @@ def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None
     ("text", "safe"),
     [
         ("uri=postgresql://me:secret@host/db x", "uri=postgresql://me:***@host/db x"),
+        ("a=postgresql://me:se/cr@t@host/db b=1", "a=postgresql://me:***@host/db b=1"),
+        (
+            "postgresql://host/db?user=me&password=secret&x=1",
+            "postgresql://host/db?user=me&password=***&x=1",
+        ),
         ("http://host:5000/a", "http://host:5000/a"),
+        ("http://host:5000/a?m=x@y", "http://host:5000/a?m=x@y"),
         ("sqlite:////a/b@c.db", "sqlite:////a/b@c.db"),
     ],
 )

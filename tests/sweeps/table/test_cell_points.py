@@ -77,7 +77,8 @@ def test_outcomes_go_back_to_their_cells() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "seeds"), [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7)), ("[5,0]", (5, 0))]
+    ("text", "seeds"),
+    [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7)), ("[5,0]", (5, 0)), ("[7]", (7,))],
 )
 def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
     assert seeds_of(text) == seeds
