@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rgbt.tracking.tables import ABSENT, Grid
 from sweeps.running.lists import Outcome, estimated_seconds
+from sweeps.running.live import duration
 from sweeps.running.sources import State
 from sweeps.table.cell_points import Wanted
 
@@ -36,7 +37,9 @@ def tables_grid(surveyed: Sequence[tuple[Wanted, Sequence[Outcome]]], workers: i
         runnable = sum(wanted.table.runnable(row) for row in wanted.table.rows)
         states = Counter(outcome.state for outcome in outcomes)
         counts = (str(states[state]) for state in STATES)
-        time = duration(estimated_seconds(outcomes, workers)) if outcomes else ABSENT
+        seconds = estimated_seconds(outcomes, workers)
+        known = "unknown" if seconds is None else duration(seconds)
+        time = known if outcomes else ABSENT
         rows.append((wanted.name, f"{runnable} of {len(wanted.table.rows)}", *counts, time))
     header = ("table", "rows to run", *STATES, "time left")
     return Grid("Runs of all tables", header, tuple(rows))
@@ -61,13 +64,3 @@ def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[s
         if column.needs is not None:
             lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
     return lines
-
-
-def duration(seconds: float | None) -> str:
-    """E.g. "2 h 05 min", "3 min", "40 s"; "unknown" before any run is finished."""
-    if seconds is None:
-        return "unknown"
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
