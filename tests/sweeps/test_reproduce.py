@@ -16,7 +16,6 @@ from sweeps.running import lists
 from sweeps.running.lists import Outcome, PointList
 from sweeps.settings import EXECUTION, Settings
 from sweeps.sheet import results as table_results
-from sweeps.sheet.preview import duration
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeFound, right
 
@@ -226,11 +225,3 @@ def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() 
     assert asked.submitit == {"cluster": "slurm", "timeout_min": 9}
     with pytest.raises(InputError, match="gpus="):
         settings_of(given | {"gpus": "[0"})
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(None, "unknown"), (40.4, "40 s"), (150.0, "2 min"), (7500.0, "2 h 05 min")],
-)
-def test_duration(seconds: float | None, words: str) -> None:
-    assert duration(seconds) == words
