@@ -25,7 +25,6 @@ Arguments = Mapping[str, str]
 OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out")
 """Arguments that are no settings of execution."""
 
-NAME = r"[\w\-. :/]+"
 WEIGHTS = "weights."
 """weights.mask2former_swin_b=FILE: for the rows that name this network."""
 
@@ -135,6 +134,7 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
         InputError: no such table, scale or metric; no seeds.
     """
     from rgbt.config import conf_dir
+    from sweeps.running.storage import NAME
     from sweeps.table.cell_points import Wanted, seeds_of
     from sweeps.table.scoring import check_metrics
     from sweeps.table.table import load_table

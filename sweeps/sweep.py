@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -156,7 +157,7 @@ def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:
     """A name that the same command gives again: method, what varies, a hash of everything."""
     text = json.dumps(_plain(identity), sort_keys=True, default=vars)
     digest = hashlib.sha256(text.encode()).hexdigest()[:6]
-    varied = "-".join(key.rpartition(".")[2] for key in keys)
+    varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
     return f"{config.name}-{varied[:60]}-{digest}" if varied else f"{config.name}-{digest}"
 
 

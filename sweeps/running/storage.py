@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 Opened = TypeVar("Opened")
 
 JOURNAL = "studies.journal"
+NAME = r"[\w\-. :/]+"
+"""What may stand in the name of a study or a table: it is part of MLflow tags."""
+
 SCHEMES = ("sqlite", "postgresql", "postgres")
 ATTEMPTS = 8
 FIXED = {
@@ -144,6 +148,10 @@ def begin_study(
     """
     import optuna
 
+    if not re.fullmatch(NAME, name):
+        raise InputError(
+            f"study={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone."
+        )
     study = _patiently(
         lambda: optuna.create_study(
             study_name=name,

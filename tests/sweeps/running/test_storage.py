@@ -183,3 +183,10 @@ def test_a_journal_in_the_home_folder_is_found(
     begin_study("study", open_storage("~/one.journal", tmp_path), UP, {})
     assert (tmp_path / "one.journal").is_file()
     assert existing_study("study", "~/one.journal", tmp_path) is not None
+
+
+def test_a_name_that_mlflow_cannot_show_is_refused(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path)
+    with pytest.raises(InputError, match="MLflow takes names"):
+        begin_study('a "b"', storage, UP, {})
+    begin_study("table/my-1: x_2.0", storage, UP, {})

@@ -142,3 +142,12 @@ def test_misspelt_metric_is_refused_before_anything_runs() -> None:
     with pytest.raises(InputError, match="did you mean 'mIoU'"):
         check_metrics(bad, bad.rows)
     check_metrics(table((Row(label="a"),), (ACC, RGB, LESS)), [Row(label="a")])
+
+
+def test_a_class_that_occurs_nowhere_counts_as_the_table_says() -> None:
+    """One of two classes has pixels, all right: 100 percent alone, 50 with a zero beside it."""
+    column = Column(name="mIoU", metric="mIoU")
+    runs = {("a", 0): outcome("k", right(100))}
+    for absent, wanted in (("released", 50.0), ("exclude", 100.0)):
+        asked = table((Row(label="a", experiment="crm"),), (column,), absent=absent)
+        assert score("t", asked, runs, scale="demo").cells["a", "mIoU"].mean == wanted

@@ -1,0 +1,71 @@
+"""Points known beforehand: how long they will take, and whose tags a shared run gets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rgbt.checks import InputError
+from sweeps.points import Point
+from sweeps.running import lists
+from sweeps.running.found import Found, Runs
+from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey
+from sweeps.running.plan import Plan
+from tests.sweeps.fakes import finish, plan_of, settings
+
+
+def made(folder: Path, seconds: float) -> Outcome:
+    run = finish(folder)
+    (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
+    return Outcome(Point("p", ()), "finished", found=(Found(run.path.name, run.path),))
+
+
+def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
+    tmp_path: Path,
+) -> None:
+    known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
+    left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
+    assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
+    assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
+    assert estimated_seconds(left, 1) is None
+
+
+class OneKey:
+    """Plans every point as the same run."""
+
+    def __init__(self, base: object) -> None:
+        del base
+
+    def plan(self, point: Point) -> Plan:
+        if "wrong" in point.overrides:
+            raise InputError("wrong=1 is no key.")
+        return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
+
+
+def wanted(tmp_path: Path, *points: Point) -> PointList:
+    from rgbt.tracking.mlflow_store import NoTracking
+
+    return PointList("s", "s", "list", points, Runs(tmp_path, NoTracking()))
+
+
+def test_points_that_are_one_run_share_their_tags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lists, "Planner", OneKey)
+    rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
+    prepared = lists._Prepared(wanted(tmp_path, *rows))
+    assert [plan.point.tags for plan in prepared.plans.values()] == [{"table": "1 | 1.0"}] * 2
+
+
+def test_a_mistake_of_all_points_is_one_of_the_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lists, "Planner", OneKey)
+    wrong, good = Point("a", ("wrong",)), Point("b", ("x=1",))
+    with pytest.raises(InputError, match="wrong=1 is no key"):
+        survey(wanted(tmp_path, wrong, wrong), settings())
+    states = [outcome.state for outcome in survey(wanted(tmp_path, wrong, good), settings())]
+    assert states == ["failed", "waiting"]
+    assert list(tmp_path.iterdir()) == []
