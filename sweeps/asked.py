@@ -170,13 +170,13 @@ def _weights(word: str) -> tuple[str, str]:
 
 def runs_of(place: Place) -> Runs:
     """Where finished runs are found, as the overrides of the tracker say."""
-    from rgbt.config import build, compose
-    from sweeps.running.found import Runs
+    from rgbt.config import compose
+    from sweeps.running.found import open_runs
 
     with composing(place.base):
         config = compose(place.base)
         check_node(config.tracking, "tracking")
-    return Runs(place.runs_dir.expanduser().resolve(), build(config.tracking))
+    return open_runs(config)
 
 
 def point_list(wanted: Wanted, place: Place, runs: Runs) -> PointList:

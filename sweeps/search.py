@@ -16,7 +16,7 @@ from sweeps import attributes as names
 from sweeps.points import Point
 from sweeps.running.driver import Driver
 from sweeps.running.found import Runs
-from sweeps.running.ledger import Ledger
+from sweeps.running.ledger import Ledger, counted
 from sweeps.running.lists import make_executor
 from sweeps.running.live import View
 from sweeps.running.owner import Owner
@@ -157,9 +157,8 @@ def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any
 def _preview(wanted: Search, settings: Settings) -> None:
     """Say what would be searched, and what there is; write nothing."""
     study = existing_study(wanted.study, settings.storage, wanted.runs.runs_dir)
-    trials = [] if study is None else study.get_trials(deepcopy=False)
-    counted = [trial for trial in trials if not trial.user_attrs.get(names.DROPPED)]
-    states = Counter(trial.state.name.lower() for trial in counted)
+    trials = [] if study is None else counted(study)
+    states = Counter(trial.state.name.lower() for trial in trials)
     sys.stdout.write(f"study {wanted.study}: {dict(states) or 'not begun'}\n")
     for parameter in wanted.parameters:
         sys.stdout.write(f"  {parameter}\n")
@@ -167,7 +166,7 @@ def _preview(wanted: Search, settings: Settings) -> None:
         sys.stdout.write(f"  {objective.direction} {objective.metric}\n")
     sys.stdout.write(f"  python -m rgbt.run {without_passwords(shlex.join(wanted.fixed))} ...\n")
     if settings.trials is not None:
-        left = max(0, settings.trials - len(counted))
+        left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
 
 

@@ -184,12 +184,9 @@ def _tracking(runs_dir: Path, overrides: Sequence[str]) -> Any:
 
 def show_places(places: Sequence[Link]) -> None:
     """Print where everything is, one "name  place" pair per line."""
-    from rich.text import Text
+    from rgbt.tracking.terminal import place_lines, show
 
-    from rgbt.tracking.terminal import show
-
-    width = max(len(name) for name, _ in places)
-    show(Text("\n".join(f"{name:<{width}}  {place}" for name, place in places), no_wrap=True))
+    show(place_lines(places))
 
 
 if __name__ == "__main__":

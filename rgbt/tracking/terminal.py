@@ -39,9 +39,13 @@ def final_lines(folder: Path, links: Sequence[tuple[str, str]]) -> Text:
         folder: the run folder.
         links: what the tracker answered (`links()`): (name, command or address).
     """
-    pairs = [("run folder", str(folder)), *links]
-    width = max(len(name) for name, _ in pairs)
-    return Text("\n".join(f"{name:<{width}}  {place}" for name, place in pairs), no_wrap=True)
+    return place_lines([("run folder", str(folder)), *links])
+
+
+def place_lines(places: Sequence[tuple[str, str]]) -> Text:
+    """Where things are, one "name  place" pair per line."""
+    width = max(len(name) for name, _ in places)
+    return Text("\n".join(f"{name:<{width}}  {place}" for name, place in places), no_wrap=True)
 
 
 def result_view(

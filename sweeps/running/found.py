@@ -165,10 +165,10 @@ class Runs:
 
     def stopped(self, key: str, reason: str) -> None:
         """Show in MLflow why a run was stopped before its end."""
-        folder_of_run = self.runs_dir / key
-        if not (folder_of_run / "run.json").exists() or (folder_of_run / "result.json").exists():
+        path = self.runs_dir / key
+        if not (path / "run.json").exists() or (path / "result.json").exists():
             return  # not begun, or finished while it was being stopped
-        folder = RunFolder(self.runs_dir / key)
+        folder = RunFolder(path)
         description = folder.description()
         assert description is not None, "run.json exists"
         folder.describe(replace(description, tags={**description.tags, "rgbt.stopped": reason}))

@@ -49,6 +49,20 @@ class Claim:
     past: Collection[int] = ()
 
 
+def counted(study: optuna.Study) -> list[FrozenTrial]:
+    """Trials of a study that count, by number."""
+    every = study.get_trials(deepcopy=False)
+    return [trial for trial in every if not trial.user_attrs.get(names.DROPPED)]
+
+
+def by_key(trials: Iterable[FrozenTrial]) -> dict[str, list[FrozenTrial]]:
+    """Trials by the key of their point, earlier ones first."""
+    found: dict[str, list[FrozenTrial]] = {}
+    for trial in trials:
+        found.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
+    return found
+
+
 class Ledger:
     """One study.
 
@@ -66,15 +80,11 @@ class Ledger:
 
     def trials(self) -> list[FrozenTrial]:
         """All trials that count, by number."""
-        every = self.study.get_trials(deepcopy=False)
-        return [trial for trial in every if not trial.user_attrs.get(names.DROPPED)]
+        return counted(self.study)
 
     def by_key(self) -> dict[str, list[FrozenTrial]]:
-        """Trials that count by the key of their point, earlier ones first."""
-        found: dict[str, list[FrozenTrial]] = {}
-        for trial in self.trials():
-            found.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
-        return found
+        """See the function `by_key`."""
+        return by_key(self.trials())
 
     def claim(self, wanted: Claim) -> int | None:
         """The number of a new running trial of ours; None if an earlier trial stands."""

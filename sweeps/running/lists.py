@@ -15,11 +15,11 @@ from sweeps.running.driver import Driver
 from sweeps.running.executors import Executor, LocalExecutor
 from sweeps.running.follow import known_seconds
 from sweeps.running.found import Found, Runs
-from sweeps.running.ledger import Ledger
+from sweeps.running.ledger import Ledger, by_key, counted
 from sweeps.running.live import View
 from sweeps.running.owner import Owner
 from sweeps.running.plan import Plan, Planner
-from sweeps.running.sources import ListSource, Standing, State, known
+from sweeps.running.sources import ListSource, Standing, State, known, reason_of
 from sweeps.running.storage import begin_study, existing_study, open_storage
 from sweeps.settings import Settings
 
@@ -79,11 +79,8 @@ def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
     """What is known of the points; nothing is run and nothing written."""
     prepared = _Prepared(wanted)
     study = existing_study(wanted.study, settings.storage, prepared.runs.runs_dir)
-    by_key: dict[str, list[FrozenTrial]] = {}
-    for trial in study.get_trials(deepcopy=False) if study is not None else ():
-        if not trial.user_attrs.get(names.DROPPED):
-            by_key.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
-    return prepared.outcomes(lambda plan: _seen(plan, by_key.get(plan.key, []), prepared.runs))
+    trials = by_key(() if study is None else counted(study))
+    return prepared.outcomes(lambda plan: _seen(plan, trials.get(plan.key, []), prepared.runs))
 
 
 def _seen(plan: Plan, trials: Sequence[FrozenTrial], runs: Runs) -> Standing:
@@ -94,7 +91,7 @@ def _seen(plan: Plan, trials: Sequence[FrozenTrial], runs: Runs) -> Standing:
     if "RUNNING" in states:
         return Standing("running")
     if states and states[-1] == "FAIL":
-        return Standing("failed", str(trials[-1].user_attrs.get(names.REASON, "")))
+        return Standing("failed", reason_of(trials[-1]))
     return Standing("waiting")
 
 
@@ -117,8 +114,8 @@ def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
     source = ListSource(plans, ledger, runs, settings, dict(wanted.distributions or {}))
 
     def done() -> int:
-        by_key = ledger.by_key()
-        states = [source.standing(plan, by_key).state for plan in source.plans.values()]
+        trials = ledger.by_key()
+        states = [source.standing(plan, trials).state for plan in source.plans.values()]
         return sum(state in ("finished", "failed") for state in states)
 
     view = View(wanted.title, len(source.plans), settings.workers, done)
@@ -133,8 +130,8 @@ def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
     )
     with view:
         driver.run()
-    by_key = ledger.by_key()
-    return prepared.outcomes(lambda plan: source.standing(plan, by_key))
+    trials = ledger.by_key()
+    return prepared.outcomes(lambda plan: source.standing(plan, trials))
 
 
 class _Prepared:

@@ -32,7 +32,6 @@ class View:
     Args:
         title: what is worked on, e.g. the table.
         total: points in all; None for a search that ends by time.
-        done: points that are finished already, at the start.
         workers: how many work at a time.
         count: asked now and then for the number of points that are done, also by other drivers.
     """
@@ -48,7 +47,6 @@ class View:
         self._seconds: list[float] = []
         self._done = count()
         self._counted = time.monotonic()
-        self._began = time.monotonic()
         self._live = Live(console=CONSOLE, refresh_per_second=4) if CONSOLE.is_terminal else None
 
     def __enter__(self) -> View:

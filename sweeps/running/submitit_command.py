@@ -15,11 +15,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, BinaryIO
 
+from sweeps.running.executors import GRACE_S
+
 if TYPE_CHECKING:
     import submitit
-
-GRACE_S = 20.0
-"""What a run that is asked to stop may take before it is killed."""
 
 KILL_S = 600.0
 """How long a job that SLURM told to go waits for SLURM to end it."""

@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.text import Text
-
 from rgbt.tracking.files import write_atomic
-from rgbt.tracking.terminal import show, tell
+from rgbt.tracking.terminal import place_lines, show, tell
 from sweeps.report.records import record
 from sweeps.running.lists import Outcome
 from sweeps.sheet.figure import draw_table
@@ -61,9 +59,7 @@ def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tra
         note=markdown(sheet),
     )
     places = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
-    width = max(len(name) for name, _ in places)
-    lines = "\n".join(f"{name:<{width}}  {place}" for name, place in places)
-    show(Text(lines, no_wrap=True))
+    show(place_lines(places))
     return 1 if failed else 0
 
 
