@@ -211,7 +211,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             row_label=label,
             region_ious=tuple(map(float, region_ious)),
             miou=float(scores.miou(whole, absent)),
-            variance=scores.variance(region_ious),
+            variance=float(scores.variance(region_ious)),
         ),
         classes=ClassTable(
             names=counts.classes,

@@ -91,7 +91,7 @@ def miou(counts: Matrices, absent: Absent) -> Scores:
     return class_mean(iou(counts, absent))
 
 
-def variance(region_scores: ArrayLike) -> float:
+def variance(region_scores: ArrayLike) -> Scores:
     """Population variance over regions, in squared percent points.
 
         10^4 / R  sum_r (s_r - mean s)^2
@@ -99,14 +99,14 @@ def variance(region_scores: ArrayLike) -> float:
     Source: SpatialSeg, Eq. 19.
 
     Args:
-        region_scores: (R,) fractions; regions that are NaN (no class to score) are left out.
+        region_scores: (..., R) fractions; regions that are NaN (no class to score) are left out.
 
     Returns:
-        >= 0; NaN where every region is NaN.
+        (...) >= 0; NaN where every region is NaN.
     """
-    scores = np.asarray(region_scores, dtype=np.float64)
-    scores = scores[~np.isnan(scores)]
-    return float(np.var(100 * scores)) if scores.size else float("nan")
+    percents = 100 * np.asarray(region_scores, dtype=np.float64)
+    distances = percents - class_mean(percents)[..., None]
+    return class_mean(distances**2)
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
@@ -157,7 +157,7 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
 def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
     return {
         names.MIOU: float(miou(counts.whole(), absent)),
-        names.VAR: variance(miou(counts.by_region(), absent)),
+        names.VAR: float(variance(miou(counts.by_region(), absent))),
     }
 
 

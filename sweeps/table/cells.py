@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.points import Evaluation
-from sweeps.table.metric_values import value
+from rgbt.metrics.named import value
 
 if TYPE_CHECKING:
     from sweeps.running.lists import Outcome

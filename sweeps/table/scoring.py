@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sweeps.table.cells import Cell, Place, is_counted, metric_of, row_cells
-from sweeps.table.metric_values import parse
+from rgbt.metrics.named import parse
 
 if TYPE_CHECKING:
     from sweeps.running.lists import Outcome

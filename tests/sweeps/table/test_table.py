@@ -13,7 +13,7 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.config import build, check, conf_dir, register_resolvers, run_key
-from sweeps.table.metric_values import parse
+from rgbt.metrics.named import parse
 from sweeps.table.table import Row, Table, load_table, table_names
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.table.metric_values import parse, value
+from rgbt.metrics.named import images_of, parse, value, values
 from tests.sweeps.tabled import DAY, counts_of
 
 
@@ -51,10 +52,25 @@ def test_nearest_metric_is_named() -> None:
 def test_unknown_class_and_region() -> None:
     with pytest.raises(InputError, match="no class 'carr'; did you mean 'car'"):
         value("class/carr", counts_of(), "released")
-    with pytest.raises(InputError, match=r"ring2.* regions 1 to 2"):
+    with pytest.raises(InputError, match="the counts have the regions 1 to 2"):
         value("region/3", counts_of(), "released")
 
 
 def test_images_that_are_not_told_apart() -> None:
     with pytest.raises(InputError, match="told apart"):
         value("night/mIoU", counts_of(DAY, night=None), "released")
+
+
+@pytest.mark.parametrize(
+    "metric",
+    ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"],
+)
+def test_many_sums_at_once_are_each_alone(metric: str) -> None:
+    asked, counts = parse(metric), counts_of()
+    by_region = images_of(asked, counts).by_region()
+    many = np.stack([by_region, 3 * by_region, by_region[::-1]])[:, None]
+    found = values(asked, many, counts.classes, "released")
+    alone = [values(asked, each[0], counts.classes, "released") for each in many]
+    assert found.shape == (3, 1)
+    np.testing.assert_allclose(found[:, 0], alone)
+    np.testing.assert_allclose(found[0], value(metric, counts, "released"))

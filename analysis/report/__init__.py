@@ -1,0 +1,1 @@
+"""One page from the store: what was run, beside what was published."""

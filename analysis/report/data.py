@@ -1,0 +1,246 @@
+"""What the page shows, as plain data: read once from the store, drawn by the page.
+
+Scores are in percent, `Var` in squared percent points, times in seconds. None: there is no value.
+`to_json` of the whole is what the page's script reads; its keys are the names of these fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from rgbt.tracking.tables import without_nan
+
+Uncertainty = Literal["images", "seeds", "images and seeds", "none"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunEntry:
+    """One run: what a click on any of its numbers shows.
+
+    Attributes:
+        key: config key.
+        name: as MLflow shows it.
+        run_id: of MLflow.
+        status: "FINISHED", "RUNNING", "FAILED" or "KILLED".
+        experiment: name of the experiment, or "".
+        scale: "demo" or "paper".
+        seed: of the run.
+        group: what seeds of one method share, or "".
+        studies: names of the studies that the run is part of.
+        table_rows: table -> row that the run stands for.
+        split: that the scores are of.
+        partition: e.g. "ring5".
+        classes: K names.
+        scores: metric name -> percent (`rgbt.metrics.names`).
+        region_ious: R percents, region 1 first.
+        class_region_ious: K rows of R percents.
+        images: number of images scored.
+        commit: git commit, "+" after it for uncommitted changes, or "".
+        started: ISO 8601, UTC.
+        seconds: from start to end, or None.
+        command: as typed.
+        repeat: command that makes the run again.
+        host: name and devices of the machine.
+        dataset: fingerprint of the data set.
+        config: dotted key -> value as text.
+    """
+
+    key: str
+    name: str
+    run_id: str
+    status: str
+    experiment: str
+    scale: str
+    seed: int | None
+    group: str
+    studies: tuple[str, ...]
+    table_rows: Mapping[str, str]
+    split: str
+    partition: str
+    classes: tuple[str, ...]
+    scores: Mapping[str, float]
+    region_ious: tuple[float, ...]
+    class_region_ious: tuple[tuple[float, ...], ...]
+    images: int
+    commit: str
+    started: str
+    seconds: float | None
+    command: str
+    repeat: str
+    host: str
+    dataset: str
+    config: Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellEntry:
+    """One cell of a table.
+
+    Attributes:
+        mean: over seeds; None where there is no value of ours.
+        sd: over seeds (n - 1).
+        seeds: number of seeds.
+        low: lower end of the 95 % interval of the mean.
+        high: its upper end.
+        covers: what the interval is over.
+        published: printed value.
+        difference: mean less published.
+        reason: why there is no value, or seeds are missing.
+        runs: keys of the runs.
+        rank: 1 best, 2 second best of the column among ours, else 0.
+        published_rank: the same among the printed values.
+    """
+
+    mean: float | None = None
+    sd: float | None = None
+    seeds: int = 0
+    low: float | None = None
+    high: float | None = None
+    covers: Uncertainty = "none"
+    published: float | None = None
+    difference: float | None = None
+    reason: str = ""
+    runs: tuple[str, ...] = ()
+    rank: int = 0
+    published_rank: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableEntry:
+    """One table, ours beside the paper.
+
+    Attributes:
+        name: e.g. "spatialseg/table3".
+        paper: its folder.
+        number: as printed.
+        caption: in own words.
+        scale: "demo" or "paper"; "" where nothing was run yet.
+        data: what the printed values were measured on.
+        unit: e.g. "percent".
+        columns: names.
+        best: by column, "highest", "lowest" or "none".
+        rows: labels.
+        proposed: by row, whether it is the method that the paper proposes.
+        cells: by row, then by column.
+        orders: column -> (Spearman's rho or None, number of rows).
+        notes: sentences below the table.
+        command: that completes it.
+    """
+
+    name: str
+    paper: str
+    number: str
+    caption: str
+    scale: str
+    data: str
+    unit: str
+    columns: tuple[str, ...]
+    best: tuple[str, ...]
+    rows: tuple[str, ...]
+    proposed: tuple[bool, ...]
+    cells: tuple[tuple[CellEntry, ...], ...]
+    orders: Mapping[str, tuple[float | None, int]]
+    notes: tuple[str, ...]
+    command: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialEntry:
+    """One trial of a study: state, parameters, objectives, whether on the front, runs."""
+
+    number: int
+    state: str
+    params: Mapping[str, str]
+    values: tuple[float, ...]
+    on_front: bool
+    runs: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyEntry:
+    """One search, grid or list.
+
+    Attributes:
+        name: of the study.
+        kind: "search", "grid" or "list".
+        objectives: names of the metrics.
+        maximize: whether more is better, by objective.
+        trials: by number.
+        note: its report in Markdown.
+        command: that began it, or "".
+    """
+
+    name: str
+    kind: str
+    objectives: tuple[str, ...]
+    maximize: tuple[bool, ...]
+    trials: tuple[TrialEntry, ...]
+    note: str
+    command: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class DifferenceEntry:
+    """A place where paper and release differ, and what it does where the store holds both.
+
+    Attributes:
+        topic: e.g. "GRBM cells".
+        paper: setting and sentence.
+        released: setting and sentence.
+        source: paper section, equation or table.
+        effect: sentence with the paired difference and its interval, or why there is none.
+        runs: keys of the runs behind it.
+    """
+
+    topic: str
+    paper: str
+    released: str
+    source: str
+    effect: str
+    runs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture inside the page: title, caption, data address ("data:image/png;base64,...")."""
+
+    title: str
+    caption: str
+    address: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportData:
+    """Everything on the page.
+
+    Attributes:
+        title: of the page.
+        made: ISO 8601, UTC.
+        store: address of the store, passwords hidden.
+        command: that makes the page again.
+        runs: newest first.
+        tables: those with runs first, then those that wait.
+        studies: by name.
+        masks: mask examples.
+        differences: paper against release.
+        remarks: what could not be read, one sentence each.
+    """
+
+    title: str
+    made: str
+    store: str
+    command: str
+    runs: tuple[RunEntry, ...]
+    tables: tuple[TableEntry, ...]
+    studies: tuple[StudyEntry, ...]
+    masks: tuple[Picture, ...]
+    differences: tuple[DifferenceEntry, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; NaN becomes None."""
+        return dict(without_nan(asdict(self)))

@@ -1,0 +1,168 @@
+"""Scores by the names that tables and comparisons give them, from counts.
+
+``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
+(mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, nearest
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.scores import (
+    Matrices,
+    Scores,
+    class_mean,
+    f1,
+    iou,
+    miou,
+    pixel_accuracy,
+    precision,
+    recall,
+    variance,
+)
+
+MEANS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+    names.MIOU: miou,
+    names.MACC: lambda counts, absent: class_mean(recall(counts, absent)),
+    names.MPRECISION: lambda counts, absent: class_mean(precision(counts, absent)),
+    names.MF1: lambda counts, absent: class_mean(f1(counts, absent)),
+    names.PIXEL_ACCURACY: lambda counts, _: pixel_accuracy(counts),
+}
+"""Scores of (..., K, K) matrices as fractions (...)."""
+
+FORMS = ("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A metric name, taken apart.
+
+    Attributes:
+        metric: the name.
+        part: "day", "night", or None for all images.
+        score: a mean over classes, "Var", "IoU" or "acc".
+        class_name: of one class alone, or None.
+        region: number from 1, or None for the whole image.
+    """
+
+    metric: str
+    part: str | None
+    score: str
+    class_name: str | None = None
+    region: int | None = None
+
+
+def parse(metric: str) -> Asked:
+    """Take a metric name apart.
+
+    Raises:
+        InputError: it is none, with the nearest one.
+    """
+    words = metric.split("/")
+    part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
+    match words:
+        case [score] if score in MEANS or score == names.VAR:
+            return Asked(metric, part, score)
+        case ["region", number] if _is_number(number):
+            return Asked(metric, part, names.MIOU, region=int(number))
+        case ["class", name] if name:
+            return Asked(metric, part, "IoU", name)
+        case ["class", name, "acc"] if name:
+            return Asked(metric, part, "acc", name)
+        case ["class", name, "region", number] if name and _is_number(number):
+            return Asked(metric, part, "IoU", name, int(number))
+    known = nearest("/".join(words), [*MEANS, names.VAR, *FORMS])
+    raise InputError(
+        f"'{metric}' is not a metric; {known}; day/ or night/ may stand before each of them."
+    )
+
+
+def value(metric: str, counts: Counts, absent: Absent) -> float:
+    """The score called `metric`.
+
+    Args:
+        metric: a name, see the module docstring.
+        counts: of one evaluation.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+
+    Returns:
+        percent 0..100; the variance in squared percent points. NaN: nothing to score.
+
+    Raises:
+        InputError: no such metric, class or region, or images that are not told apart.
+    """
+    asked = parse(metric)
+    by_region = images_of(asked, counts).by_region()
+    return float(values(asked, by_region, counts.classes, absent))
+
+
+def values(
+    asked: Asked, by_region: Matrices, classes: tuple[str, ...], absent: Absent
+) -> NDArray[np.float64]:
+    """The score of many summed counts at once, e.g. one per resample.
+
+    Args:
+        asked: the score; its part (day, night) has been taken by `images_of` before summing.
+        by_region: (..., R, K, K), summed over images.
+        classes: K names.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+
+    Returns:
+        (...) percent; the variance in squared percent points. NaN: nothing to score.
+
+    Raises:
+        InputError: no such class or region.
+    """
+    if asked.score == names.VAR:
+        return variance(miou(by_region, absent))
+    if asked.region is None:
+        matrices = by_region.sum(-3)
+    elif 1 <= asked.region <= by_region.shape[-3]:
+        matrices = by_region[..., asked.region - 1, :, :]
+    else:
+        raise InputError(
+            f"'{asked.metric}': the counts have the regions 1 to {by_region.shape[-3]}; use counts "
+            "of another file of conf/metric (a table's key `regions`)."
+        )
+    if asked.class_name is None:
+        return 100.0 * MEANS[asked.score](matrices, absent)
+    score = recall if asked.score == "acc" else iou
+    return 100.0 * score(matrices, absent)[..., _class_index(asked, classes)]
+
+
+def images_of(asked: Asked, counts: Counts) -> Counts:
+    """The images that a metric is over: all, those of the day or those of the night.
+
+    Raises:
+        InputError: the split does not hold both, or the data set does not tell them apart.
+    """
+    if asked.part is None:
+        return counts
+    parts = counts.parts()
+    if asked.part not in parts:
+        raise InputError(
+            f"'{asked.metric}': split '{counts.split}' of the run's data set does not hold images "
+            "of day and of night that are told apart."
+        )
+    return parts[asked.part]
+
+
+def _is_number(text: str) -> bool:
+    return text.isdecimal() and int(text) >= 1
+
+
+def _class_index(asked: Asked, classes: tuple[str, ...]) -> int:
+    if asked.class_name not in classes:
+        raise InputError(
+            f"'{asked.metric}': the data set of the run has no class '{asked.class_name}'; "
+            f"{nearest(str(asked.class_name), classes)}."
+        )
+    return classes.index(asked.class_name)
