@@ -20,7 +20,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
-Matrices = NDArray[np.integer]
+Matrices = NDArray[np.integer] | NDArray[np.float64]
 ClassScore = Callable[[Matrices, Absent], Scores]
 
 

@@ -1,0 +1,182 @@
+"""Which images are drawn together: neighbouring frames of a drive are no separate evidence."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.uncertainty.settings import NamedBlocks
+from rgbt.checks import InputError
+
+FEWEST = 10
+"""Blocks below which an interval would rest on almost nothing."""
+
+BAND = 2.0
+"""Standard errors beyond which an autocorrelation counts as one (Politis and White, 2004)."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A partition of N images.
+
+    Attributes:
+        index: (N,) int64, block 0..count-1 of every image.
+        count: number of blocks.
+        said: what they are, e.g. "40 blocks of up to 10 neighbouring frames".
+    """
+
+    index: NDArray[np.int64]
+    count: int
+    said: str
+
+
+def make_blocks(
+    names: Sequence[str], choice: NamedBlocks | int, series: NDArray[np.float64]
+) -> Blocks:
+    """The blocks that `choice` asks for (see `Resampling.blocks`).
+
+    Args:
+        names: of N images; frames of one sequence differ in their last number alone.
+        choice: see `Resampling.blocks`.
+        series: (L, N), influence of every image on each of L scores; read by "auto" alone, which
+            takes the longest of their block lengths.
+
+    Raises:
+        InputError: fewer than `FEWEST` blocks, or names without a number where frames are asked
+            for.
+    """
+    sequences = _sequences(names)
+    if choice == "none" or (choice == "auto" and sequences is None):
+        return _singles(len(names))
+    if sequences is None:
+        raise InputError(
+            f"blocks={choice}: the name '{_without_number(names)}' holds no frame number, so that "
+            "neighbours cannot be told; use blocks=none."
+        )
+    if choice == "sequence":
+        blocks = _joined(len(names), sequences, f"{len(sequences)} sequences")
+    else:
+        longest = max(map(len, sequences))
+        length = choice if isinstance(choice, int) else _automatic(series, sequences)
+        if length <= 1:
+            return _singles(len(names))
+        pieces = [piece for each in sequences for piece in _cut(each, min(length, longest))]
+        said = f"{len(pieces)} blocks of up to {length} neighbouring frames"
+        blocks = _joined(len(names), pieces, said)
+    if blocks.count < FEWEST:
+        raise InputError(
+            f"blocks={choice}: {len(names)} images make {blocks.said}, and fewer than {FEWEST} "
+            "pieces say nothing about how sure a score is; give a smaller number of images."
+        )
+    return blocks
+
+
+def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]]) -> int:
+    """Neighbours to draw together, so that resampling sees their correlation.
+
+        b = (2 G^2 / D)^(1/3) n^(1/3),  G = sum |k| w(k) R(k),  D = 4/3 (sum w(k) R(k))^2
+
+    with the autocovariances R over lags k within sequences and the flat-top window w. 1 where no
+    lag is correlated beyond chance.
+
+    Source: Politis and White, Econometric Reviews 23 (2004), with the correction of Patton,
+    Politis and White (2009).
+
+    Args:
+        series: (N,) a value of every image.
+        sequences: places of the images of each sequence, in the order of their frames.
+
+    Returns:
+        1..N/3.
+    """
+    count = len(series)
+    centred = series - series.mean()
+    covered = math.ceil(math.sqrt(count)) + _window(count)
+    lags = np.array([_autocovariance(centred, sequences, lag) for lag in range(covered + 1)])
+    if lags[0] <= 0:
+        return 1
+    last = _last_correlated(lags / lags[0], count)
+    if last == 0:
+        return 1
+    steps = np.arange(1, min(2 * last, covered) + 1)
+    weights = np.minimum(1.0, 2.0 * (1.0 - steps / steps[-1])) if len(steps) > 1 else np.ones(1)
+    long_run = lags[0] + 2.0 * (weights * lags[steps]).sum()
+    slope = 2.0 * (weights * steps * lags[steps]).sum()
+    if long_run <= 0:
+        return 1
+    length = (2.0 * slope**2 / (4.0 / 3.0 * long_run**2)) ** (1 / 3) * count ** (1 / 3)
+    return int(min(max(1, math.ceil(length)), max(1, count // 3)))
+
+
+def _window(count: int) -> int:
+    """Lags in a row that must be uncorrelated before the earlier ones are believed to be all."""
+    return max(5, math.ceil(math.sqrt(math.log10(count))))
+
+
+def _last_correlated(correlations: NDArray[np.float64], count: int) -> int:
+    """The lag after which `_window` lags in a row are within chance; 0: none is correlated."""
+    bound = BAND * math.sqrt(math.log10(count) / count)
+    beyond = np.flatnonzero(np.abs(correlations[1:]) >= bound) + 1
+    last = 0
+    for lag in beyond:
+        if lag - last > _window(count):
+            break
+        last = int(lag)
+    return last
+
+
+def _autocovariance(
+    centred: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]], lag: int
+) -> float:
+    """Of pairs `lag` frames apart in one sequence, over the number of all images."""
+    products = [
+        centred[each[: len(each) - lag]] @ centred[each[lag:]]
+        for each in sequences
+        if len(each) > lag
+    ]
+    return float(sum(products)) / len(centred)
+
+
+def _automatic(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]]) -> int:
+    """The longest length of the scores, as far as it leaves `FEWEST` blocks."""
+    wanted = max(block_length(each, sequences) for each in series)
+    while wanted > 1 and sum(math.ceil(len(each) / wanted) for each in sequences) < FEWEST:
+        wanted -= 1
+    return wanted
+
+
+def _sequences(names: Sequence[str]) -> list[NDArray[np.int64]] | None:
+    """Places of the images of every sequence, by frame; None where a name holds no number."""
+    found: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for place, name in enumerate(names):
+        match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
+        if match is None:
+            return None
+        before, number, after = match.groups()
+        found.setdefault((before, after), []).append((int(number), place))
+    return [np.array([place for _, place in sorted(frames)]) for frames in found.values()]
+
+
+def _without_number(names: Sequence[str]) -> str:
+    return next(name for name in names if not re.search(r"\d", name))
+
+
+def _cut(places: NDArray[np.int64], length: int) -> list[NDArray[np.int64]]:
+    """Pieces of nearly equal size, at most `length` each."""
+    return np.array_split(places, math.ceil(len(places) / length))
+
+
+def _joined(count: int, pieces: Sequence[NDArray[np.int64]], said: str) -> Blocks:
+    index = np.empty(count, np.int64)
+    for number, piece in enumerate(pieces):
+        index[piece] = number
+    return Blocks(index, len(pieces), said)
+
+
+def _singles(count: int) -> Blocks:
+    return Blocks(np.arange(count), count, f"{count} single images")

@@ -1,0 +1,159 @@
+"""The difference between two methods on the same images, and whether it means anything."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from analysis.uncertainty.blocks import FEWEST
+from analysis.uncertainty.estimate import Estimate, by_part, estimate_of, image_spread
+from analysis.uncertainty.images import Images, prepare
+from analysis.uncertainty.intervals import (
+    Interval,
+    Values,
+    holm,
+    over_images,
+    over_seeds,
+    student,
+    student_p,
+    swap_p,
+    together,
+)
+from analysis.uncertainty.settings import Resampling
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import Asked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Method b less method a in one score; percent points (variance: squared percent points).
+
+    Attributes:
+        metric: name of the score.
+        a: the score of the first method.
+        b: of the second.
+        value: b - a, means over seeds.
+        p_images: two-sided p-value with the methods exchanged at random on each block of images;
+            NaN where there is nothing to score.
+        images: interval over the draw of the images, trainings as they are.
+        both: interval over images and seeds (Student); None unless both methods have two seeds.
+        p_both: its p-value.
+        p_corrected: `p`, corrected for the number of scores compared (Holm); NaN without p.
+    """
+
+    metric: str
+    a: Estimate
+    b: Estimate
+    value: float
+    p_images: float
+    images: Interval | None = None
+    both: Interval | None = None
+    p_both: float = math.nan
+    p_corrected: float = math.nan
+
+    @property
+    def interval(self) -> Interval | None:
+        """The interval to go by: over images and seeds, else over images."""
+        return self.both or self.images
+
+    @property
+    def p(self) -> float:
+        """The p-value that belongs to `interval`."""
+        return self.p_images if self.both is None else self.p_both
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Two methods compared.
+
+    Attributes:
+        differences: in the order of the metrics asked for.
+        images: number of images.
+        said: how they were drawn, e.g. "393 single images".
+        level: of the intervals.
+    """
+
+    differences: tuple[Difference, ...]
+    images: int
+    said: str
+    level: float
+
+
+def compare(
+    a: Sequence[Counts], b: Sequence[Counts], metrics: Sequence[str], settings: Resampling
+) -> Comparison:
+    """Compare two methods on the same images.
+
+    Intervals over images resample blocks of images, the same for both methods. p-values over
+    images exchange the predictions of the methods on every block with probability 1/2: under the
+    hypothesis that the methods are alike all these are equally likely. Seeds of the two methods
+    are not paired (Welch).
+
+    Args:
+        a: counts of the trainings of the first method, one or more.
+        b: of the second, on the same images.
+        metrics: names, see `rgbt.metrics.named`.
+        settings: of the resampling.
+
+    Raises:
+        InputError: other images, classes, regions or labels; fewer than `FEWEST` blocks; no such
+            metric.
+    """
+    found: dict[str, Difference] = {}
+    described: dict[str | None, Images] = {}
+    for group in by_part(metrics):
+        images = prepare([a, b], group[0], settings)
+        if images.blocks.count < FEWEST:
+            raise InputError(
+                f"{images.blocks.said} are too few to compare two methods; {FEWEST} are the least."
+            )
+        described[group[0].part] = images
+        found |= {difference.metric: difference for difference in _differences(images, group)}
+    ordered = [found[metric] for metric in metrics]
+    corrected = holm([difference.p for difference in ordered])
+    main = described[min(described, key=lambda part: part is not None)]
+    return Comparison(
+        differences=tuple(
+            replace(difference, p_corrected=p)
+            for difference, p in zip(ordered, corrected, strict=True)
+        ),
+        images=main.images,
+        said=main.blocks.said,
+        level=settings.level,
+    )
+
+
+def _differences(images: Images, asked: Sequence[Asked]) -> Iterator[Difference]:
+    a, b = images.drawn(asked)
+    swapped_a, swapped_b = images.swapped(asked)
+    every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
+    for each, rows_a, rows_b, swapped in every:
+        first, second = estimate_of(images, *rows_a), estimate_of(images, *rows_b)
+        value = second.value - first.value
+        plain = Difference(
+            metric=each.metric, a=first, b=second, value=value, p_images=swap_p(value, swapped)
+        )
+        resampled, without = rows_b[1] - rows_a[1], rows_b[2] - rows_a[2]
+        yield _with_intervals(images, plain, (resampled, without), (rows_a[0], rows_b[0]))
+
+
+def _with_intervals(
+    images: Images,
+    plain: Difference,
+    resampled: tuple[Values, Values],
+    points: tuple[Values, Values],
+) -> Difference:
+    settings, value = images.settings, plain.value
+    around = over_images(value, *resampled, method=settings.method, level=settings.level)
+    spread = over_seeds(*points)
+    if around is None or spread is None:
+        return replace(plain, images=around)
+    whole = together(image_spread(images, resampled[0]), spread)
+    return replace(
+        plain,
+        images=around,
+        both=student(value, whole, settings.level),
+        p_both=student_p(value, whole),
+    )

@@ -1,0 +1,111 @@
+"""Scores of one method with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from analysis.uncertainty.images import Images, prepare
+from analysis.uncertainty.intervals import (
+    Interval,
+    Spread,
+    Values,
+    over_images,
+    over_seeds,
+    student,
+    together,
+)
+from analysis.uncertainty.settings import Resampling
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import Asked, parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A score and how sure it is; percent, the variance in squared percent points.
+
+    Attributes:
+        value: mean over seeds; NaN where there is nothing to score.
+        sd: standard deviation over seeds (n - 1); NaN for one.
+        seeds: their number S.
+        images: interval over the draw of the images, trainings as they are; None with too few
+            images or nothing to score.
+        trainings: interval over seeds (Student), images as they are; None for one seed.
+        both: interval over images and seeds; None where one of the two is.
+        said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
+    """
+
+    value: float
+    sd: float
+    seeds: int
+    images: Interval | None
+    trainings: Interval | None
+    both: Interval | None
+    said: str
+
+    @property
+    def widest(self) -> Interval | None:
+        """The interval that covers most of what is known: both, else over images."""
+        return self.both or self.images
+
+
+def estimate(
+    seeds: Sequence[Counts], metrics: Sequence[str], settings: Resampling
+) -> dict[str, Estimate]:
+    """Scores of one method.
+
+    Args:
+        seeds: counts of its trainings on the same images, one or more.
+        metrics: names, see `rgbt.metrics.named`.
+        settings: of the resampling.
+
+    Returns:
+        metric -> estimate, in the order asked for.
+
+    Raises:
+        InputError: no such metric, class or region; seeds on different images; blocks that cannot
+            be made.
+    """
+    found: dict[str, Estimate] = {}
+    for group in by_part(metrics):
+        images = prepare([seeds], group[0], settings)
+        (drawn,) = images.drawn(group)
+        found |= {
+            asked.metric: estimate_of(images, *rows)
+            for asked, rows in zip(group, drawn.rows(), strict=True)
+        }
+    return {metric: found[metric] for metric in metrics}
+
+
+def by_part(metrics: Sequence[str]) -> list[list[Asked]]:
+    """The metrics taken apart, those over the same images together."""
+    every = sorted(map(parse, metrics), key=lambda asked: asked.part or "")
+    return [list(group) for _, group in groupby(every, key=lambda asked: asked.part)]
+
+
+def estimate_of(images: Images, points: Values, resampled: Values, without: Values) -> Estimate:
+    """The estimate that one row of `Drawn` makes."""
+    settings, value = images.settings, float(points.mean())
+    level = settings.level
+    around = over_images(value, resampled, without, method=settings.method, level=level)
+    spread = over_seeds(points)
+    both = None
+    if around is not None and spread is not None:
+        both = student(value, together(image_spread(images, resampled), spread), level)
+    return Estimate(
+        value=value,
+        sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),
+        seeds=len(points),
+        images=around,
+        trainings=None if spread is None else student(value, spread, level),
+        both=both,
+        said=images.blocks.said,
+    )
+
+
+def image_spread(images: Images, resampled: Values) -> Spread:
+    """Standard error over the draw of the images."""
+    return Spread(float(np.nanstd(resampled)), images.blocks.count - 1)

@@ -1,0 +1,243 @@
+"""Counts of one or two methods on the same images, made ready for many resamples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
+from analysis.uncertainty.settings import Resampling
+from rgbt.checks import InputError, nearest
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import Asked, images_of, values
+from rgbt.randomness import numpy_generator
+
+CHUNK = 500
+"""Resamples computed at once: their counts stay in the cache of the processor."""
+
+Scores = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Scores of one method, percent; NaN: nothing to score.
+
+    Attributes:
+        points: (metrics, S) of every seed over all images.
+        resampled: (metrics, resamples) mean over seeds; none with too few blocks.
+        without: (metrics, B) the same without one block each.
+    """
+
+    points: Scores
+    resampled: Scores
+    without: Scores
+
+    def rows(self) -> Iterator[tuple[Scores, Scores, Scores]]:
+        """Points, resampled and without of each metric."""
+        return zip(self.points, self.resampled, self.without, strict=True)
+
+
+@dataclass(frozen=True)
+class Images:
+    """Counts of M methods, each with its seeds, on the same images.
+
+    Attributes:
+        methods: per method (S, B, R K K) float64: counts of every seed, summed inside each block;
+            whole numbers below 2^53, so that sums are exact.
+        shape: (R, K, K).
+        classes: K names.
+        images: N.
+        blocks: how the images are drawn.
+        settings: of the resampling.
+    """
+
+    methods: tuple[NDArray[np.float64], ...]
+    shape: tuple[int, int, int]
+    classes: tuple[str, ...]
+    images: int
+    blocks: Blocks
+    settings: Resampling
+
+    def drawn(self, asked: Sequence[Asked]) -> list[Drawn]:
+        """The scores of every method, as they are and with images drawn anew or left out."""
+        if self.blocks.count < FEWEST:
+            nothing = np.empty((len(asked), 0))
+            return [Drawn(points, nothing, nothing) for points in self.points(asked)]
+        parts = (self.points(asked), self.resampled(asked), self.without_each(asked))
+        return [Drawn(*each) for each in zip(*parts, strict=True)]
+
+    def points(self, asked: Sequence[Asked]) -> list[Scores]:
+        """Per method (metrics, S): the score of every seed over all images."""
+        return [self._scores(asked, method.sum(1)) for method in self.methods]
+
+    def resampled(self, asked: Sequence[Asked]) -> list[Scores]:
+        """Per method (metrics, resamples): mean over seeds; both methods see the same draws."""
+        count = self.blocks.count
+        even = np.full(count, 1.0 / count)
+
+        def draw(rng: np.random.Generator, size: int) -> list[NDArray[np.float64]]:
+            weights = rng.multinomial(count, even, size).astype(np.float64)
+            return [weights @ method for method in self.methods]
+
+        return self._many(asked, "bootstrap", draw)
+
+    def swapped(self, asked: Sequence[Asked]) -> list[Scores]:
+        """Two methods (metrics, resamples) whose predictions were exchanged on half of the blocks.
+
+        Seeds are exchanged in pairs; where the numbers of seeds differ, each is repeated as often
+        as makes them equal.
+        """
+        first, second = self.methods
+        pairs = math.lcm(len(first), len(second))
+        a = np.tile(first, (pairs // len(first), 1, 1))
+        b = np.tile(second, (pairs // len(second), 1, 1))
+
+        def draw(rng: np.random.Generator, size: int) -> list[NDArray[np.float64]]:
+            flags = rng.integers(0, 2, (size, self.blocks.count)).astype(np.float64)
+            moved = flags @ (b - a)
+            return [a.sum(1)[:, None] + moved, b.sum(1)[:, None] - moved]
+
+        return self._many(asked, "swap", draw)
+
+    def without_each(self, asked: Sequence[Asked]) -> list[Scores]:
+        """Per method (metrics, B): the mean over seeds without one block each (jackknife)."""
+        return [
+            self._scores(asked, method.sum(1, keepdims=True) - method).mean(1)
+            for method in self.methods
+        ]
+
+    def _many(
+        self,
+        asked: Sequence[Asked],
+        purpose: str,
+        draw: Callable[[np.random.Generator, int], list[NDArray[np.float64]]],
+    ) -> list[Scores]:
+        parts: list[list[Scores]] = [[] for _ in self.methods]
+        for number, size in enumerate(_chunks(self.settings.resamples)):
+            rng = numpy_generator(self.settings.seed, purpose, number)
+            for part, summed in zip(parts, draw(rng, size), strict=True):
+                part.append(self._scores(asked, summed).mean(1))
+        return [np.concatenate(part, axis=1) for part in parts]
+
+    def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
+        """(metrics, ...) percent of summed counts (..., R K K)."""
+        by_region = summed.reshape(*summed.shape[:-1], *self.shape)
+        absent = self.settings.absent
+        return np.stack([values(each, by_region, self.classes, absent) for each in asked])
+
+
+def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampling) -> Images:
+    """Counts of the images that `asked` is over, summed inside blocks.
+
+    Args:
+        methods: per method the counts of its seeds; all of the same images, in any order.
+        asked: tells day, night or all images; the blocks are made for its score too.
+        settings: of the resampling.
+
+    Raises:
+        InputError: counts of other images, classes, regions or data; no images of that part;
+            blocks that cannot be made.
+    """
+    alike = _alike(methods)
+    parts = [[images_of(asked, counts) for counts in seeds] for seeds in alike]
+    first = parts[0][0]
+    regions, classes = first.counts.shape[1], len(first.classes)
+    flat = [
+        np.stack([counts.counts.reshape(len(first.names), -1) for counts in seeds])
+        for seeds in parts
+    ]
+    single = Images(
+        methods=tuple(each.astype(np.float64) for each in flat),
+        shape=(regions, classes, classes),
+        classes=first.classes,
+        images=len(first.names),
+        blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
+        settings=settings,
+    )
+    blocks = make_blocks(first.names, settings.blocks, _influence(single, asked))
+    return Images(
+        methods=tuple(_summed(each, blocks) for each in single.methods),
+        shape=single.shape,
+        classes=single.classes,
+        images=single.images,
+        blocks=blocks,
+        settings=settings,
+    )
+
+
+def _influence(single: Images, asked: Asked) -> Scores:
+    """(L, N) how much each image moves the score of every method, and their difference."""
+    if single.settings.blocks != "auto":
+        return np.empty((0, single.images))
+    moved = [each[0] for each in single.without_each([asked])]
+    series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
+    return np.nan_to_num(np.stack(series))
+
+
+def _summed(method: NDArray[np.float64], blocks: Blocks) -> NDArray[np.float64]:
+    """(S, B, F) from (S, N, F)."""
+    order = np.argsort(blocks.index, kind="stable")
+    starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))
+    return np.asarray(np.add.reduceat(method[:, order], starts, axis=1), np.float64)
+
+
+def _alike(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
+    """The counts in one order of images; refused where they cannot be compared."""
+    first = methods[0][0]
+    return [[_like(first, counts) for counts in seeds] for seeds in methods]
+
+
+def _like(first: Counts, other: Counts) -> Counts:
+    if other.classes != first.classes:
+        raise InputError(
+            f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
+            f"{', '.join(other.classes)}; score both on one data set."
+        )
+    if other.partition != first.partition:
+        raise InputError(
+            f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
+            f"evaluate again with regions={first.partition}."
+        )
+    if set(other.names) != set(first.names):
+        only = sorted(set(first.names) ^ set(other.names))
+        raise InputError(
+            f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
+            f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in one alone; "
+            "score both on one split, or take missing=leave_out to compare what both hold."
+        )
+    same = other if other.names == first.names else other.select(first.names)
+    labelled = [each.counts.sum(-1).astype(np.int64) for each in (first, same)]
+    unequal = np.flatnonzero((labelled[0] != labelled[1]).any((1, 2)))
+    if len(unequal):
+        raise InputError(
+            f"'{first.names[unequal[0]]}' holds other labels in the one than in the other counts "
+            f"({len(unequal)} images do); score both on the same labels at the same size."
+        )
+    return same
+
+
+def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
+    """The counts of the images that all of them hold, in the order of the first.
+
+    Raises:
+        InputError: no image is in all of them.
+    """
+    every = [counts for seeds in methods for counts in seeds]
+    shared = set(every[0].names).intersection(*(counts.names for counts in every))
+    names = [name for name in every[0].names if name in shared]
+    if not names:
+        other = next(counts for counts in every if not set(counts.names) & set(every[0].names))
+        raise InputError(
+            f"no image is in all counts, '{other.names[0]}' for one is not in the first; "
+            f"{nearest(other.names[0], every[0].names[:10])}."
+        )
+    return [[counts.select(names) for counts in seeds] for seeds in methods]
+
+
+def _chunks(total: int) -> Iterator[int]:
+    for start in range(0, total, CHUNK):
+        yield min(CHUNK, total - start)

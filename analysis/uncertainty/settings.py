@@ -1,0 +1,54 @@
+"""How images are resampled: one choice for every interval and test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.metrics.metric import Absent
+
+Method = Literal["bca", "percentile"]
+NamedBlocks = Literal["auto", "none", "sequence"]
+
+MOST = 1_000_000
+"""Resamples beyond which only time is lost."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resampling:
+    """Settings of intervals and tests.
+
+    Attributes:
+        resamples: number of resamples, 100..`MOST`.
+        level: share of intervals that shall hold the true value, 0.5..0.999.
+        method: of intervals over images. "bca": bias-corrected and accelerated (Efron, 1987);
+            "percentile": quantiles of the resampled scores.
+        blocks: what is drawn together, because neighbouring frames show nearly the same:
+            "none" single images; a number: that many neighbours; "sequence": whole sequences (names
+            that are equal but for the frame number); "auto": as many neighbours as the scores of
+            the images are correlated over (Politis and White, 2004).
+        seed: of the draws.
+        absent: how a class without pixels scores, see `rgbt.metrics.scores`.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    resamples: int = 10_000
+    level: float = 0.95
+    method: Method = "bca"
+    blocks: NamedBlocks | int = "auto"
+    seed: int = 0
+    absent: Absent = "released"
+
+    def __post_init__(self) -> None:
+        check_range("resamples", self.resamples, 100, MOST)
+        check_range("level", self.level, 0.5, 0.999)
+        check_choice("method", self.method, get_args(Method))
+        check_choice("absent", self.absent, get_args(Absent))
+        if isinstance(self.blocks, int):
+            check_range("blocks", self.blocks, 1, MOST)
+        elif self.blocks not in get_args(NamedBlocks):
+            known = ", ".join(get_args(NamedBlocks))
+            raise InputError(f"blocks={self.blocks}: expected {known} or a number of images.")
