@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from rgbt.config import check, compose, flatten, register_resolvers, run_key, we
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
+from rgbt.tracking.folder import find_run
 
 CHECKPOINTS = ("best", "last")
 GROUPS = ("dataset", "metric")
@@ -77,24 +77,6 @@ def open_trained(
     # Copies of a data set in other places may hold other images.
     place = f"{run_key(config)}-{session.dataset.fingerprint()[:8]}"
     return Stored(session, 0, runs_dir / "evaluations" / place, source.name)
-
-
-def find_run(run: str, runs_dir: Path) -> Path:
-    """The folder of a run given as a folder, a config key, or an MLflow run id.
-
-    Raises:
-        InputError: there is no such run.
-    """
-    for folder in (Path(run), runs_dir / run):
-        if (folder / "config.yaml").is_file():
-            return folder.resolve()
-    for sent in sorted(runs_dir.glob("*/mlflow.json")):
-        if json.loads(sent.read_text()).get("run_id") == run:
-            return sent.parent.resolve()
-    raise InputError(
-        f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
-        f"{runs_dir.resolve()}; list that folder to see the runs, or name another with runs_dir=..."
-    )
 
 
 def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> Stored:

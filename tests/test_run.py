@@ -388,7 +388,7 @@ def test_names_say_what_differs_and_groups_leave_the_seed_out() -> None:
 
 def test_a_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
     from rgbt.checks import InputError
-    from rgbt.stored import find_run
+    from rgbt.tracking.folder import find_run
 
     folder = tmp_path / "abc"
     folder.mkdir()

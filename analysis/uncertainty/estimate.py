@@ -34,7 +34,8 @@ class Estimate:
         images: interval over the draw of the images, trainings as they are; None with too few
             images or nothing to score.
         trainings: interval over seeds (Student), images as they are; None for one seed.
-        both: interval over images and seeds; None where one of the two is.
+        both: interval over images and seeds (Student with Satterthwaite's degrees of freedom, not
+            narrower than `trainings`); None where one of the two is.
         said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
     """
 
@@ -92,15 +93,19 @@ def estimate_of(images: Images, points: Values, resampled: Values, without: Valu
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
     spread = over_seeds(points)
-    both = None
-    if around is not None and spread is not None:
-        both = student(value, together(image_spread(images, resampled), spread), level)
+    trainings = both = None
+    if spread is not None:
+        trainings = student(value, spread, level)
+        if around is not None:
+            whole = student(value, together(image_spread(images, resampled), spread), level)
+            # Two or three seeds: Satterthwaite's degrees of freedom alone cover too rarely.
+            both = max(whole, trainings, key=lambda interval: interval.half)
     return Estimate(
         value=value,
         sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),
         seeds=len(points),
         images=around,
-        trainings=None if spread is None else student(value, spread, level),
+        trainings=trainings,
         both=both,
         said=images.blocks.said,
     )

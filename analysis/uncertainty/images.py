@@ -175,7 +175,7 @@ def _influence(single: Images, asked: Asked) -> Scores:
         return np.empty((0, single.images))
     moved = [each[0] for each in single.without_each([asked])]
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
-    return np.nan_to_num(np.stack(series))
+    return np.asarray(np.nan_to_num(np.stack(series)), np.float64)
 
 
 def _summed(method: NDArray[np.float64], blocks: Blocks) -> NDArray[np.float64]:

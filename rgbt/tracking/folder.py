@@ -217,3 +217,21 @@ def runs_in(runs_dir: Path | str) -> list[RunFolder]:
     if not root.is_dir():
         raise InputError(f"{root}: there is no such folder; runs_dir=... names the folder of runs.")
     return [RunFolder(path.parent) for path in sorted(root.glob("*/run.json"))]
+
+
+def find_run(run: str, runs_dir: Path) -> Path:
+    """The folder of a run given as a folder, a config key, or an MLflow run id.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    for folder in (Path(run), runs_dir / run):
+        if (folder / "config.yaml").is_file():
+            return folder.resolve()
+    for sent in sorted(runs_dir.glob("*/mlflow.json")):
+        if json.loads(sent.read_text()).get("run_id") == run:
+            return sent.parent.resolve()
+    raise InputError(
+        f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
+        f"{runs_dir.resolve()}; list that folder to see the runs, or name another with runs_dir=..."
+    )

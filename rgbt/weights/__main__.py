@@ -129,7 +129,7 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     checkpoint  best (by the selection split) or last
     """
     from rgbt.pretrained import differences
-    from rgbt.stored import find_run
+    from rgbt.tracking.folder import find_run
     from rgbt.tracking.terminal import tell
     from rgbt.weights.layout import family_named
     from rgbt.weights.read import read

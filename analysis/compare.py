@@ -1,0 +1,223 @@
+"""Compare two methods: ``python -m analysis.compare a=runs/<key> b=runs/<key>``.
+
+One table and one sentence: the differences with intervals and p-values, over images and seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError, check_choice, nearest
+from rgbt.command import plain_command
+
+if TYPE_CHECKING:
+    from analysis.results import Stored
+    from analysis.uncertainty import Comparison, Interval, Resampling
+    from rgbt.metrics.counts import Counts
+    from rgbt.tracking.tables import Grid
+
+OWN = {
+    "a": None,
+    "b": None,
+    "metrics": "auto",
+    "split": "test",
+    "missing": "refuse",
+    "level": "0.95",
+    "resamples": "10000",
+    "method": "bca",
+    "blocks": "auto",
+    "absent": "released",
+    "seed": "0",
+    "runs_dir": "runs",
+    "out": "",
+}
+MISSING = ("refuse", "leave_out")
+
+
+def main(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Compare two methods on the same images.
+
+    a, b      each a run (folder, config key or MLflow run id), a file of counts (.npz, of
+              rgbt.evaluate or analysis.score), a group of runs ("grbm sigma_div=2": all its seeds),
+              or several of these with commas: seeds of one method
+    metrics   mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night
+    missing   refuse, or leave_out: compare the images that both hold
+    level     of the intervals;  resamples: their number;  seed: of the draws
+    method    bca or percentile: how intervals over images are taken from the resamples
+    blocks    images drawn together: auto, none, sequence, or a number of neighbouring frames
+    absent    released: a class without a pixel scores 0; exclude: it is left out of means
+    split     of runs
+    out       folder for comparison.md and comparison.csv
+    """
+    from analysis.results import label_of, open_counts
+    from analysis.uncertainty import compare
+    from analysis.uncertainty.sentence import sentence
+    from rgbt.tracking.terminal import rich_table, show
+
+    if overrides:
+        key = overrides[0].partition("=")[0]
+        raise InputError(f"'{key}' is not a key of this command; {nearest(key, OWN)}.")
+    check_choice("missing", arguments["missing"], MISSING)
+    opened = [
+        open_counts(arguments[side], arguments["runs_dir"], arguments["split"]) for side in "ab"
+    ]
+    a, b = _counts(opened, arguments["missing"])
+    settings = settings_of(arguments)
+    comparison = compare(a, b, metrics_of(arguments["metrics"], a[0]), settings)
+    labels = _labels([label_of(each) for each in opened])
+    grid = comparison_grid(comparison, labels)
+    said = sentence(comparison, *labels)
+    show(rich_table(grid))
+    show(said + "\n" + remark(settings))
+    if arguments["out"]:
+        _write(Path(arguments["out"]), grid, said, comparison)
+    return 0
+
+
+def settings_of(arguments: dict[str, str]) -> Resampling:
+    """The settings of the resampling that a command was given as text.
+
+    Raises:
+        InputError: a value that is no number, or out of range.
+    """
+    from typing import cast
+
+    from analysis.uncertainty.settings import Method, NamedBlocks, Resampling
+    from rgbt.metrics.metric import Absent
+
+    blocks = arguments["blocks"]
+    return Resampling(
+        resamples=int(_number("resamples", arguments["resamples"])),
+        level=_number("level", arguments["level"]),
+        method=cast(Method, arguments["method"]),
+        blocks=int(blocks) if blocks.isdecimal() else cast(NamedBlocks, blocks),
+        seed=int(_number("seed", arguments["seed"])),
+        absent=cast(Absent, arguments["absent"]),
+    )
+
+
+def metrics_of(text: str, counts: Counts) -> list[str]:
+    """The metrics asked for; "auto": mIoU, Var, every region, and mIoU by day and by night."""
+    from rgbt.metrics import names
+
+    if text != "auto":
+        return [word.strip() for word in text.split(",")]
+    regions = [names.region(number + 1) for number in range(counts.counts.shape[1])]
+    parts = [names.subset(part, names.MIOU) for part in counts.parts()]
+    return [names.MIOU, names.VAR, *regions, *parts]
+
+
+def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
+    """One line per score.
+
+    Args:
+        comparison: of two methods.
+        labels: what they are called.
+    """
+    from rgbt.tracking.tables import Grid, number
+
+    with_seeds = any(difference.both is not None for difference in comparison.differences)
+    level = f"{100 * comparison.level:g} %"
+    over = [f"{level} over images", "p"]
+    more = [f"{level} over images and seeds", "p"] if with_seeds else []
+    rows = []
+    for each in comparison.differences:
+        both = [_shown(each.both), _p(each.p_both)] if with_seeds else []
+        difference = number(each.value) if each.value != each.value else f"{each.value:+.2f}"
+        scores = [f"{number(side.value)}{_spread(side.sd)}" for side in (each.a, each.b)]
+        images = [_shown(each.images), _p(each.p_images)]
+        rows.append((each.metric, *scores, difference, *images, *both, _p(each.p_corrected)))
+    singles = f"{comparison.images} single images"
+    drawn = (
+        singles if comparison.said == singles else f"{comparison.images} images, {comparison.said}"
+    )
+    title = f"{labels[1]} less {labels[0]}: {drawn}"
+    header = ("", *labels, "difference", *over, *more, "p (Holm)")
+    return Grid(title, header, tuple(rows))
+
+
+def remark(settings: Resampling) -> str:
+    """How the numbers of the table were made, in one line."""
+    return (
+        f"Percent points (Var: squared). Intervals: {settings.method}, {settings.resamples} "
+        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
+        "Holm: corrected for the number of lines."
+    )
+
+
+def _counts(
+    opened: Sequence[tuple[Stored, ...]], missing: str
+) -> tuple[list[Counts], list[Counts]]:
+    from analysis.uncertainty.images import common
+    from rgbt.tracking.terminal import tell
+
+    methods = [[stored.counts for stored in each] for each in opened]
+    if {each.path for each in opened[0]} & {each.path for each in opened[1]}:
+        raise InputError("a and b hold the same counts; a method is compared with another one.")
+    if missing == "leave_out":
+        before = max(len(counts.names) for seeds in methods for counts in seeds)
+        methods = common(methods)
+        left = before - len(methods[0][0].names)
+        if left:
+            tell(f"{left} of {before} images are not in all counts and were left out.")
+    return methods[0], methods[1]
+
+
+def _labels(labels: list[str]) -> list[str]:
+    """Labels that differ."""
+    return labels if labels[0] != labels[1] else [f"a: {labels[0]}", f"b: {labels[1]}"]
+
+
+def _shown(interval: Interval | None) -> str:
+    return "-" if interval is None else f"{interval.low:+.2f} to {interval.high:+.2f}"
+
+
+def _spread(sd: float) -> str:
+    return "" if sd != sd else f" ± {sd:.2f}"
+
+
+def _p(value: float) -> str:
+    if value != value:
+        return "-"
+    return "<0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def _number(key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{key}={text}: expected a number.") from None
+
+
+def _write(out: Path, grid: Grid, said: str, comparison: Comparison) -> None:
+    from rgbt.tracking.files import write_atomic
+    from rgbt.tracking.terminal import place_lines, show
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
+    write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
+    show(place_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
+
+
+def comparison_csv(comparison: Comparison) -> str:
+    """One line per score with all digits; empty where there is no value."""
+    import csv
+    import io
+
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    ends = ("images_low", "images_high", "p_images", "both_low", "both_high", "p_both", "p_holm")
+    writer.writerow(("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends))
+    for each in comparison.differences:
+        images = (each.images.low, each.images.high) if each.images else ("", "")
+        both = (each.both.low, each.both.high) if each.both else ("", "")
+        values = (*images, each.p_images, *both, each.p_both, each.p_corrected)
+        row = (each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value, *values)
+        writer.writerow((each.metric, *("" if value != value else value for value in row)))
+    return stream.getvalue()
+
+
+if __name__ == "__main__":
+    plain_command(OWN, main)()

@@ -1,0 +1,137 @@
+"""Counts of what was run or scored, opened by the names that people give them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rgbt.checks import InputError, nearest
+from rgbt.metrics.counts import Counts
+from rgbt.tracking.folder import RunFolder, find_run, runs_in
+
+GROUP = "rgbt.group"
+"""Tag that the seeds of one method share (`rgbt.naming`)."""
+
+SEED = "rgbt.seed"
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Counts with where they come from.
+
+    Attributes:
+        label: what they are called in tables.
+        key: config key of the run; "" for a file.
+        seed: of the run; None for a file.
+        path: of the counts.
+        counts: the counts.
+    """
+
+    label: str
+    key: str
+    seed: int | None
+    path: Path
+    counts: Counts
+
+
+def open_counts(
+    text: str, runs_dir: Path | str = "runs", split: str = "test"
+) -> tuple[Stored, ...]:
+    """The counts that `text` names, the seeds of one method one after the other.
+
+    Args:
+        text: a run (folder, config key or MLflow run id), a file of counts (.npz), the name of a
+            group ("grbm sigma_div=2": all its seeds in `runs_dir`), or several of these with commas
+            between them.
+        runs_dir: where runs lie.
+        split: of runs; a file holds one.
+
+    Raises:
+        InputError: there is no such thing, or a run has no counts yet.
+    """
+    found = [stored for word in _words(text) for stored in _open(word, Path(runs_dir), split)]
+    paths = [stored.path for stored in found]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise InputError(f"'{text}' names {path} twice; one training counts once.")
+    return tuple(found)
+
+
+def label_of(stored: tuple[Stored, ...]) -> str:
+    """What a method is called: its group, or all that its counts are called."""
+    return " + ".join(dict.fromkeys(each.label for each in stored))
+
+
+def _words(text: str) -> list[str]:
+    words = [word.strip() for word in text.split(",")]
+    if not all(words):
+        raise InputError(
+            f"'{text}': expected runs, files of counts or a group, with commas between them."
+        )
+    return words
+
+
+def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
+    path = Path(word).expanduser()
+    if path.suffix == ".npz":
+        return [Stored(path.stem, "", None, path.resolve(), Counts.load(path))]
+    if path.is_dir() and not (path / "config.yaml").is_file():
+        return [_of_scores(path)]
+    grouped = _of_group(word, runs_dir)
+    if grouped:
+        return [_of_run(folder, split) for folder in grouped]
+    try:
+        folder = find_run(word, runs_dir)
+    except InputError as error:
+        groups = sorted({_tag(run, GROUP) for run in _runs(runs_dir)} - {""})
+        known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
+        raise InputError(
+            f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
+            f"counts (.npz){known}."
+        ) from error
+    return [_of_run(RunFolder(folder), split)]
+
+
+def _of_scores(folder: Path) -> Stored:
+    """The counts in a folder that `analysis.score` wrote, if they are of one partition."""
+    files = sorted(folder.glob("counts_*.npz"))
+    if not files:
+        raise InputError(
+            f"{folder} holds neither a run (config.yaml) nor counts (counts_*.npz); label images "
+            "of a method are counted with: python -m analysis.score predictions=... dataset=..."
+        )
+    if len(files) > 1:
+        raise InputError(
+            f"{folder} holds {', '.join(file.name for file in files)}; name one of these files."
+        )
+    return Stored(folder.name, "", None, files[0].resolve(), Counts.load(files[0]))
+
+
+def _of_group(word: str, runs_dir: Path) -> list[RunFolder]:
+    return [run for run in _runs(runs_dir) if _tag(run, GROUP) == word and run.result() is not None]
+
+
+def _runs(runs_dir: Path) -> list[RunFolder]:
+    return runs_in(runs_dir) if runs_dir.is_dir() else []
+
+
+def _of_run(run: RunFolder, split: str) -> Stored:
+    path = run.counts_path(split)
+    if not path.is_file():
+        raise InputError(
+            f"{run.path} has no counts of split '{split}'; it is not finished, or "
+            f"python -m rgbt.evaluate run={run.path} split={split} out={path} makes them."
+        )
+    seed = _tag(run, SEED)
+    return Stored(
+        label=_tag(run, GROUP) or run.path.name,
+        key=run.path.name,
+        seed=int(seed) if seed else None,
+        path=path,
+        counts=Counts.load(path),
+    )
+
+
+def _tag(run: RunFolder, name: str) -> str:
+    description = run.description()
+    return "" if description is None else description.tags.get(name, "")
