@@ -49,7 +49,10 @@ def open_counts(
     Raises:
         InputError: there is no such thing, or a run has no counts yet.
     """
-    found = [stored for word in _words(text) for stored in _open(word, Path(runs_dir), split)]
+    root = Path(runs_dir)
+    # A group's name may hold commas itself: "crm train_sizes=[240,480]".
+    words = [text] if _of_group(text, root) else _words(text)
+    found = [stored for word in words for stored in _open(word, root, split)]
     paths = [stored.path for stored in found]
     for path in paths:
         if paths.count(path) > 1:

@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 RGBT = sorted(path for path in (ROOT / "rgbt").rglob("*.py") if "conf" not in path.parts)
 SWEEPS = sorted((ROOT / "sweeps").rglob("*.py"))
-FILES = [*RGBT, *SWEEPS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
+ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
+FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
 COMMON = {"rgbt.types", "rgbt.checks", "rgbt.geometry", "rgbt.randomness"}
 ISLANDS = {"data", "transforms", "maskers", "models", "losses", "metrics"}
@@ -82,6 +83,42 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
             assert rest[0] in SWEEPS_MAY, f"{inside} imports {name}"
         if package == "sweeps" and room and rest and rest[0] in ROOMS and rest[0] != room:
             assert rest[0] in ROOMS[room], f"{inside} imports {name}"
+
+
+ANALYSIS_MAY = {"checks", "types", "config", "command", "randomness", "metrics", "tracking", "data"}
+"""What of rgbt the analysis may import: data sets and what runs have left, never a network."""
+
+ANALYSIS_ROOMS = {
+    "statistics": set(),
+    "predictions": set(),
+    "uncertainty": set(),
+    "figures": {"statistics", "predictions", "uncertainty"},
+    "report": {"uncertainty", "figures"},
+}
+"""Folders of analysis, and which others each of them knows; its commands join them."""
+
+PUBLISHED = ("sweeps.table", "sweeps.report.data")
+"""What of the sweeps the report may import: the papers' tables as data, and studies read."""
+
+PARENTS = {"sweeps.report"}
+"""``from sweeps.report import data`` names this too."""
+
+
+@pytest.mark.parametrize("path", ANALYSIS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_analysis_reads_what_is_stored_and_knows_no_network(path: Path) -> None:
+    inside = path.relative_to(ROOT / "analysis")
+    is_room = len(inside.parts) > 1 and inside.name != "__main__.py"
+    for name in imports(ast.parse(path.read_text())):
+        package, *rest = name.split(".")
+        assert package != "tests", f"{inside} imports {name}"
+        if package == "rgbt" and rest:
+            assert rest[0] in ANALYSIS_MAY, f"{inside} imports {name}"
+        if package == "sweeps" and rest:
+            known = any(name == each or name.startswith(f"{each}.") for each in PUBLISHED)
+            assert known or name in PARENTS, f"{inside} imports {name}"
+        if package == "analysis" and is_room and rest and rest[0] in ANALYSIS_ROOMS:
+            room = inside.parts[0]
+            assert rest[0] in ANALYSIS_ROOMS[room] | {room}, f"{inside} imports {name}"
 
 
 @pytest.mark.parametrize("path", RGBT, ids=lambda path: str(path.relative_to(ROOT)))
