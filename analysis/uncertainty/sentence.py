@@ -29,8 +29,8 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     more = "higher" if found.value > 0 else "lower"
     size = f"{abs(found.value):.2f}{_unit(found)}"
     if is_told:
-        said = f"{label_b} has a {found.metric} {size} {more} than {label_a} ({scores}; {evidence})"
-        return f"{said}, {basis}."
+        said = f"The {found.metric} of {label_b} is {size} {more} than that of {label_a}"
+        return f"{said} ({scores}; {evidence}), {basis}."
     return (
         f"A difference in {found.metric} between {label_b} and {label_a} is not shown ({scores}; "
         f"{evidence}), {basis}; with this much, one below about {found.interval.half:.2f}"
