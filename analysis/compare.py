@@ -133,7 +133,7 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
     drawn = (
         singles if comparison.said == singles else f"{comparison.images} images, {comparison.said}"
     )
-    title = f"{labels[1]} less {labels[0]}: {drawn}"
+    title = f"{labels[1]} less {labels[0]}: {drawn}, {comparison.partition}"
     header = ("", *labels, "difference", *over, *more, "p (Holm)")
     return Grid(title, header, tuple(rows))
 

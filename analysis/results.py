@@ -96,8 +96,8 @@ def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
 
 
 def _of_scores(folder: Path) -> Stored:
-    """The counts in a folder that `analysis.score` wrote, if they are of one partition."""
-    files = sorted(folder.glob("counts_*.npz"))
+    """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
+    files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
     if not files:
         raise InputError(
             f"{folder} holds neither a run (config.yaml) nor counts (counts_*.npz); label images "

@@ -6,11 +6,14 @@ From a folder of predicted label images, or from the counts that a run has store
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rgbt.checks import InputError, check_choice, check_range
 from rgbt.command import composing, plain_command
+from rgbt.metrics.names import MIOU
+from rgbt.metrics.regions import MAX_REGIONS
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import Options, Scored
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
     from analysis.uncertainty import Resampling
     from rgbt.data.mfnet import MFNet
     from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Absent
 
 OF_A_FOLDER = {
     "partition": "all",
@@ -71,24 +73,26 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     threads      that read and count; 0: one per core
     overrides of the data set, such as dataset=mfnet dataset.root=/data/MFNet
     """
+    from analysis.predictions.text import remarks_on
+
     given = [key for key in ("predictions", "counts") if arguments[key]]
     if len(given) != 1:
         raise InputError(
-            f"expected one of predictions=folder and counts=run, got {' and '.join(given) or 'none'}."
+            "expected one of predictions=folder and counts=run, got "
+            f"{' and '.join(given) or 'neither'}."
         )
     out = Path(arguments["out"]) if arguments["out"] else None
     settings = _resampling(arguments)
     if given == ["counts"]:
-        counted, remarks = _stored(arguments, overrides)
+        counted, remarks = _stored(arguments, overrides), []
     else:
         scored = _scored(arguments, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
         remarks = remarks_on(scored)
-        _write_counts(scored, out)
+        if out is not None:
+            write_counts(scored, out)
     tables = score_tables(counted, settings)
-    if settings is not None:
-        remarks.append(_about_intervals(settings))
-    _report(tables, remarks, out)
+    _show(tables, remarks, out)
     return 0
 
 
@@ -107,7 +111,7 @@ def score_tables(
     from rich.console import Console
     from rich.progress import Progress
 
-    from analysis.predictions.table import score_table, with_intervals
+    from analysis.predictions.table import score_table
 
     tables = [score_table(counts, name) for name, counts in counted]
     if settings is None:
@@ -115,43 +119,44 @@ def score_tables(
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("resampling", total=len(tables))
         for index, (_, counts) in enumerate(counted):
-            intervals = _intervals(tables[index], counts, settings)
-            tables[index] = with_intervals(tables[index], intervals)
+            tables[index] = _with_intervals(tables[index], counts, settings)
             progress.advance(task)
     return tables
 
 
-def remarks_on(scored: Scored) -> list[str]:
-    """What a reader of the numbers has to know about the folder, one sentence each."""
-    from analysis.predictions.folder import listed
-    from analysis.predictions.maps import iou_map, ring_means
+def write_counts(scored: Scored, out: Path) -> None:
+    """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
+    out.mkdir(parents=True, exist_ok=True)
+    for counts in scored.counts:
+        counts.save(out / f"counts_{counts.partition}.npz")
+    (out / "maps.npz").unlink(missing_ok=True)  # an earlier map would pass for one of these images
+    if scored.maps is not None:
+        scored.maps.save(out / "maps.npz")
 
-    found, remarks = scored.found, []
-    if found.missing:
-        number = len(found.missing) + len(found.paths)
-        remarks.append(
-            f"{len(found.missing)} of {number} images of the split have no prediction and are left "
-            f"out of every number ({listed(found.missing)})."
-        )
-    if scored.resized:
-        remarks.append(
-            f"{len(scored.resized)} predictions were resized to their label by the nearest pixel "
-            f"({listed(scored.resized)})."
-        )
-    if found.extra:
-        remarks.append(
-            f"{len(found.extra)} other PNG files of the folder belong to no image of the split and "
-            f"were not read ({listed(found.extra)})."
-        )
-    if scored.maps is None:
-        remarks.append("The images differ in size, so there is no map by pixel.")
-        return remarks
-    means = 100 * ring_means(iou_map(scored.maps), 5)
-    remarks.append(
-        f"Mean IoU by pixel (classes that never occur at a pixel left out): centre {means[0]:.2f}, "
-        f"edge {means[-1]:.2f} (first and last of five rings)."
-    )
-    return remarks
+
+def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) -> None:
+    """Write the tables as Markdown and CSV where a folder is given, and print them."""
+    from rich.console import Group
+    from rich.text import Text
+
+    from analysis.predictions.text import convention_line, grids, markdown, tidy_csv
+    from rgbt.tracking.files import write_atomic
+    from rgbt.tracking.terminal import place_lines, rich_table, show
+
+    places = []
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        title = "Scores of " + ", ".join(dict.fromkeys(table.name for table in tables))
+        write_atomic(out / "scores.md", markdown(title, tables, remarks).encode())
+        write_atomic(out / "scores.csv", tidy_csv(tables).encode())
+        places = [("tables", str(out / "scores.md")), ("tidy", str(out / "scores.csv"))]
+    for table in tables:
+        said = "\n".join(filter(None, (convention_line(table), table.intervals)))
+        show(Group(*map(rich_table, grids(table)), Text(f"{said}\n")))
+    if remarks:
+        show(Text("\n".join(remarks)))
+    if places:
+        show(place_lines(places))
 
 
 def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
@@ -191,42 +196,41 @@ def _dataset(overrides: list[str]) -> MFNet:
 
 
 def _options(arguments: dict[str, str]) -> Options:
-    from typing import Any
-
     from analysis.predictions.scoring import PARTITIONS, Options
 
     partition = arguments["partition"]
     check_choice("partition", partition, ("all", *PARTITIONS))
-    chosen: dict[str, Any] = {
-        key: arguments[key] for key in ("missing", "resize", "suffix", "name")
-    }
+    words: dict[str, Any] = {key: arguments[key] for key in ("missing", "resize", "suffix", "name")}
     return Options(
-        partitions=PARTITIONS if partition == "all" else (cast(Any, partition),),
-        regions=_whole_number(arguments, "regions", 1, 255),
-        form=cast(Any, arguments["format"]),
+        partitions=tuple(each for each in PARTITIONS if partition in ("all", each)),
+        regions=_whole_number(arguments, "regions", 1, MAX_REGIONS),
+        form=cast(Any, arguments["format"]),  # Options refuses other words
         threads=_whole_number(arguments, "threads", 0, MAX_THREADS),
-        **chosen,
+        **words,
     )
 
 
-def _stored(
-    arguments: dict[str, str], overrides: list[str]
-) -> tuple[list[tuple[str, Counts]], list[str]]:
+def _stored(arguments: dict[str, str], overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import tell
 
-    set_here = [key for key, default in OF_A_FOLDER.items() if arguments[key] != default]
-    for key in [*set_here, *overrides]:
+    without_effect = [key for key, default in OF_A_FOLDER.items() if arguments[key] != default]
+    without_effect += [word.partition("=")[0] for word in overrides]
+    if without_effect:
         raise InputError(
-            f"'{key.partition('=')[0]}' has no effect on stored counts, which are counted already; "
+            f"'{without_effect[0]}' has no effect on stored counts, which are counted already; "
             "leave it out, or give a folder with predictions=..."
         )
     found = open_counts(arguments["counts"], Path(arguments["runs_dir"]), arguments["split"])
     tell(
-        "stored counts hold no pixels, so there is no map by pixel; write predictions with "
-        "python -m rgbt.predict run=... input=<split> out=folder and score that folder."
+        "stored counts hold one partition and no map by pixel; for the others write predictions "
+        "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
     )
-    return [(stored.label, stored.counts) for stored in found], []
+    several = len({stored.label for stored in found}) < len(found)
+    return [
+        (f"{stored.label} seed {stored.seed}" if several else stored.label, stored.counts)
+        for stored in found
+    ]
 
 
 def _resampling(arguments: dict[str, str]) -> Resampling | None:
@@ -240,16 +244,32 @@ def _resampling(arguments: dict[str, str]) -> Resampling | None:
     except ValueError as error:
         raise InputError(f"level={arguments['level']}: expected a number such as 0.95.") from error
     blocks = arguments["blocks"]
-    number: int | Literal["auto"] = (
-        int(blocks) if blocks.isdecimal() else cast("Literal['auto']", blocks)
+    drawn: Any = int(blocks) if blocks.isdecimal() else blocks  # Resampling refuses other words
+    return Resampling(resamples=resamples, level=level, blocks=drawn)
+
+
+def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> ScoreTable:
+    """The table with intervals over images, under the conventions that it shows."""
+    from analysis.predictions.table import interval_cells, with_intervals
+    from analysis.uncertainty import estimate
+
+    found, drawn = {}, ""
+    for absent in table.conventions():
+        cells = interval_cells(table, absent)
+        estimates = estimate([counts], list(cells), replace(settings, absent=absent))
+        for metric, each in estimates.items():
+            if each.images is not None:
+                found[cells[metric]] = (each.images.low, each.images.high)
+        drawn = estimates[MIOU].said
+    if not found:
+        return replace(
+            table, intervals=f"{table.partition}: no intervals, too few images: {drawn}."
+        )
+    said = (
+        f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
+        f"({settings.method}, {settings.resamples} resamples of {drawn})."
     )
-    return Resampling(resamples=resamples, level=level, blocks=number)
-
-
-def _intervals(
-    table: ScoreTable, counts: Counts, settings: Resampling
-) -> list[tuple[object, tuple[float, float]]]:
-    return []
+    return with_intervals(table, found, said)
 
 
 def _whole_number(arguments: dict[str, str], key: str, low: int, high: int) -> int:

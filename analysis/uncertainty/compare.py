@@ -72,12 +72,14 @@ class Comparison:
         differences: in the order of the metrics asked for.
         images: number of images.
         said: how they were drawn, e.g. "393 single images".
+        partition: of the regions, e.g. "ring5".
         level: of the intervals.
     """
 
     differences: tuple[Difference, ...]
     images: int
     said: str
+    partition: str
     level: float
 
 
@@ -121,6 +123,7 @@ def compare(
         ),
         images=main.images,
         said=main.blocks.said,
+        partition=a[0].partition,
         level=settings.level,
     )
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError, nearest
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import Asked, images_of, values
+from rgbt.metrics.named import Asked, images_of, parse, values
 from rgbt.randomness import numpy_generator
 
 CHUNK = 500
@@ -135,7 +136,7 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
 
     Args:
         methods: per method the counts of its seeds; all of the same images, in any order.
-        asked: tells day, night or all images; the blocks are made for its score too.
+        asked: tells day, night or all images.
         settings: of the resampling.
 
     Raises:
@@ -158,7 +159,7 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
     )
-    blocks = make_blocks(first.names, settings.blocks, _influence(single, asked))
+    blocks = make_blocks(first.names, settings.blocks, _influence(single))
     return Images(
         methods=tuple(_summed(each, blocks) for each in single.methods),
         shape=single.shape,
@@ -169,13 +170,18 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
     )
 
 
-def _influence(single: Images, asked: Asked) -> Scores:
-    """(L, N) how much each image moves the score of every method, and their difference."""
+WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
+"""Scores that tell how far neighbouring images are alike, whatever is asked for: the one that
+counts, and the one that shows likeness most clearly."""
+
+
+def _influence(single: Images) -> Scores:
+    """(L, N) how much each image moves the scores of every method, and their difference."""
     if single.settings.blocks != "auto":
         return np.empty((0, single.images))
-    moved = [each[0] for each in single.without_each([asked])]
+    moved = single.without_each(WATCHED)
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
-    return np.asarray(np.nan_to_num(np.stack(series)), np.float64)
+    return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
 
 
 def _summed(method: NDArray[np.float64], blocks: Blocks) -> NDArray[np.float64]:
@@ -228,14 +234,14 @@ def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
     """
     every = [counts for seeds in methods for counts in seeds]
     shared = set(every[0].names).intersection(*(counts.names for counts in every))
-    names = [name for name in every[0].names if name in shared]
-    if not names:
+    kept = [name for name in every[0].names if name in shared]
+    if not kept:
         other = next(counts for counts in every if not set(counts.names) & set(every[0].names))
         raise InputError(
             f"no image is in all counts, '{other.names[0]}' for one is not in the first; "
             f"{nearest(other.names[0], every[0].names[:10])}."
         )
-    return [[counts.select(names) for counts in seeds] for seeds in methods]
+    return [[counts.select(kept) for counts in seeds] for seeds in methods]
 
 
 def _chunks(total: int) -> Iterator[int]:

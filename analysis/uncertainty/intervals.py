@@ -58,7 +58,7 @@ def over_images(
         level: of the interval.
 
     Returns:
-        None where there is nothing to score.
+        holds `value`; None where there is nothing to score.
     """
     known = resampled[~np.isnan(resampled)]
     if math.isnan(value) or not known.size:
@@ -67,7 +67,8 @@ def over_images(
     if method == "bca":
         tails = _corrected(tails, _bias(value, known), _acceleration(without_each))
     low, high = np.quantile(known, tails)
-    return Interval(float(low), float(high))
+    # Resampling raises a variance over regions; where that is all there is, quantiles miss it.
+    return Interval(min(float(low), value), max(float(high), value))
 
 
 def _bias(value: float, known: Values) -> float:

@@ -1,0 +1,114 @@
+"""Which file of a folder is the prediction of which image, and what is missing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+
+Missing = Literal["refuse", "leave_out"]
+
+OVERLAY = "_overlay"
+"""Ending of the pictures that `rgbt.predict` writes beside its indices."""
+
+SHOWN = 3
+"""Names that a sentence lists before it says "and so on"."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Files of a split.
+
+    Attributes:
+        paths: name of the image -> its prediction, in the order of the split.
+        missing: names of the split without a file.
+        extra: names of PNG files that belong to no image of the split (overlays left out).
+    """
+
+    paths: dict[str, Path]
+    missing: tuple[str, ...]
+    extra: tuple[str, ...]
+
+
+def find(folder: Path, dataset: MFNet, split: str, suffix: str, missing: Missing) -> Found:
+    """The predictions of a split: files NAME + `suffix` + ".png".
+
+    Args:
+        folder: holds the PNG files.
+        dataset: whose names are looked up.
+        split: of the data set.
+        suffix: between the name and the ending, e.g. "_pred"; "" for none.
+        missing: "refuse", or "leave_out" to go on without the images that have no file.
+
+    Raises:
+        InputError: no such folder, no PNG in it, no file of this split, or files missing.
+    """
+    stems = _stems(folder)
+    names = dataset.names(split)
+    there = {name: folder / f"{name}{suffix}.png" for name in names if f"{name}{suffix}" in stems}
+    absent = tuple(name for name in names if name not in there)
+    if not there:
+        raise InputError(
+            f"none of the {len(names)} images of split '{split}' has a file NAME{suffix}.png in "
+            f"{folder}; it holds {_listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
+        )
+    if absent and missing == "refuse":
+        raise InputError(
+            f"{folder} lacks the predictions of {len(absent)} of the {len(names)} images of split "
+            f"'{split}' ({_listed(absent, f'{suffix}.png')}); add them, or count the others alone "
+            "with missing=leave_out."
+        )
+    own = {f"{name}{suffix}" for name in names} | {f"{name}{OVERLAY}" for name in names}
+    return Found(there, absent, tuple(sorted(stems - own)))
+
+
+def listed(names: tuple[str, ...]) -> str:
+    """The first names of many, for a sentence."""
+    return _listed(names, "")
+
+
+def _stems(folder: Path) -> set[str]:
+    if not folder.is_dir():
+        raise InputError(
+            f"predictions={folder}: there is no such folder; give the one that holds NAME.png for "
+            "every image of the split."
+        )
+    stems = {path.stem for path in folder.glob("*.png")}
+    if not stems:
+        others = sorted(path.name for path in folder.iterdir())
+        holds = f"it holds {_listed(others, '')}" if others else "it is empty"
+        raise InputError(f"predictions={folder}: expected PNG files named NAME.png, but {holds}.")
+    return stems
+
+
+def _hint(stems: set[str], dataset: MFNet, suffix: str) -> str:
+    """What else the names could mean: a suffix, or another split."""
+    for split in dataset.splits:
+        if not dataset.list_path(split).is_file():
+            continue
+        names = dataset.names(split)
+        number = sum(f"{name}{suffix}" in stems for name in names)
+        if number:
+            return f", {number} of them images of split '{split}': give split={split}"
+        endings = _endings(stems, names)
+        if endings:
+            return f": give suffix={endings} and split={split} if these are the predictions"
+    return ""
+
+
+def _endings(stems: set[str], names: tuple[str, ...]) -> str:
+    """The most frequent text after a name of the split; "" where there is none."""
+    after = Counter(
+        stem[len(name) :] for stem in stems for name in names if name and stem.startswith(name)
+    )
+    after.pop(OVERLAY, None)
+    return after.most_common(1)[0][0] if after else ""
+
+
+def _listed(names: tuple[str, ...] | list[str], ending: str) -> str:
+    shown = ", ".join(f"{name}{ending}" for name in names[:SHOWN])
+    return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"

@@ -1,0 +1,194 @@
+"""Scores by region, class, day and night as one tidy list, from counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.scores import class_mean, iou, miou, recall, variance
+
+ALL = "all"
+CONVENTIONS: tuple[Absent, ...] = get_args(Absent)
+Metric = Literal["IoU", "Acc", "Var"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """What a score is of: two scores of a table differ in one of these.
+
+    Attributes:
+        images: "all", "day" or "night".
+        region: 1..R, or None for the whole image.
+        class_name: of one class, or None for the mean over classes.
+        metric: "IoU", "Acc" (recall, as the papers call it) or "Var" (of the regions' mean IoU).
+        absent: how a class without a pixel counts, see `rgbt.metrics.scores`.
+    """
+
+    images: str = ALL
+    region: int | None = None
+    class_name: str | None = None
+    metric: Metric = "IoU"
+    absent: Absent = "released"
+
+    @property
+    def metric_name(self) -> str | None:
+        """Its name in `rgbt.metrics.named`; None for those that have none."""
+        if self.metric == "Var":
+            name = names.VAR
+        elif self.metric == "Acc" and self.region is not None:
+            return None
+        elif self.class_name is None:
+            whole = names.MACC if self.metric == "Acc" else names.MIOU
+            name = whole if self.region is None else names.region(self.region)
+        else:
+            name = names.class_iou(self.class_name)
+            name += "/acc" if self.metric == "Acc" else ""
+            name += "" if self.region is None else f"/region/{self.region}"
+        return name if self.images == ALL else names.subset(self.images, name)
+
+
+@dataclass(frozen=True)
+class Score:
+    """One score.
+
+    Attributes:
+        value: percent; the variance in squared percent points; NaN where nothing can be scored.
+        low: lower end of its interval over images, NaN without one.
+        high: upper end, same rule.
+    """
+
+    value: float
+    low: float = float("nan")
+    high: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """The scores of one method on one partition.
+
+    Attributes:
+        name: of the method.
+        partition: e.g. "ring5".
+        split: of the data set.
+        regions: R.
+        classes: K names.
+        num_images: number of images by "all" and, where both are there, "day" and "night".
+        scores: of every cell, under both conventions for absent classes.
+        intervals: what the intervals are, in a sentence; "" without them.
+    """
+
+    name: str
+    partition: str
+    split: str
+    regions: int
+    classes: tuple[str, ...]
+    num_images: Mapping[str, int]
+    scores: Mapping[Cell, Score]
+    intervals: str = ""
+
+    def conventions(self, metric: Metric | None = None) -> tuple[Absent, ...]:
+        """Both where a mean differs between them, else "released" alone.
+
+        Args:
+            metric: look at this one over all images; None: at all of them, day and night too.
+        """
+        same = all(
+            score.value == self.scores[replace(cell, absent="exclude")].value
+            for cell, score in self.scores.items()
+            if cell.class_name is None
+            and (metric is None or (cell.metric, cell.images) == (metric, ALL))
+        )
+        return CONVENTIONS[:1] if same else CONVENTIONS
+
+    def absent_classes(self) -> tuple[str, ...]:
+        """Classes without a pixel to count in a region, by day or by night."""
+        gone = {
+            cell.class_name
+            for cell, score in self.scores.items()
+            if cell.absent == "exclude" and np.isnan(score.value)
+        }
+        return tuple(name for name in self.classes if name in gone)
+
+
+def score_table(counts: Counts, name: str) -> ScoreTable:
+    """All scores of one method on one partition, without intervals.
+
+    Args:
+        counts: of one split, at least one image.
+        name: of the method.
+
+    Returns:
+        mIoU, mAcc, IoU and accuracy of each class, for each region and the whole image; variance
+        over regions; all images, and day and night where the data set tells them apart.
+    """
+    parts = {ALL: counts, **counts.parts()}
+    scores = {
+        cell: Score(value)
+        for images, subset in parts.items()
+        for absent in CONVENTIONS
+        for cell, value in _scores(subset, Cell(images=images, absent=absent))
+    }
+    return ScoreTable(
+        name=name,
+        partition=counts.partition,
+        split=counts.split,
+        regions=counts.counts.shape[1],
+        classes=counts.classes,
+        num_images={images: len(subset.names) for images, subset in parts.items()},
+        scores=scores,
+    )
+
+
+def interval_cells(table: ScoreTable, absent: Absent) -> dict[str, Cell]:
+    """The cells that are given intervals, by metric name: mIoU, variance, mIoU of each region.
+
+    The mIoU of the whole image stands first, so that blocks of neighbouring images that are made
+    for the first score are the same for every partition, and with them its interval.
+    """
+    regions = (None, *range(1, table.regions + 1))
+    cells = [
+        replace(cell, images=images, absent=absent)
+        for images in table.num_images
+        for cell in (*(Cell(region=region) for region in regions), Cell(metric="Var"))
+    ]
+    return {cell.metric_name: cell for cell in cells if cell.metric_name is not None}
+
+
+def with_intervals(
+    table: ScoreTable, intervals: Mapping[Cell, tuple[float, float]], said: str
+) -> ScoreTable:
+    """The table with the given intervals.
+
+    Args:
+        table: see `score_table`.
+        intervals: cell -> (low, high) in the unit of the score.
+        said: what they are, in a sentence.
+    """
+    scores = dict(table.scores)
+    for cell, (low, high) in intervals.items():
+        scores[cell] = replace(scores[cell], low=low, high=high)
+    return replace(table, scores=scores, intervals=said)
+
+
+def _scores(counts: Counts, base: Cell) -> Iterator[tuple[Cell, float]]:
+    by_region = counts.by_region()
+    matrices = np.concatenate([by_region, by_region.sum(0, keepdims=True)])
+    regions: list[int | None] = [*range(1, len(by_region) + 1), None]
+    ratios: dict[Metric, NDArray[np.float64]] = {
+        "IoU": iou(matrices, base.absent),
+        "Acc": recall(matrices, base.absent),
+    }
+    for metric, ratio in ratios.items():
+        for region, by_class, mean in zip(regions, ratio, class_mean(ratio), strict=True):
+            cell = replace(base, metric=metric, region=region)
+            yield cell, 100.0 * float(mean)
+            for name, value in zip(counts.classes, by_class, strict=True):
+                yield replace(cell, class_name=name), 100.0 * float(value)
+    yield replace(base, metric="Var"), float(variance(miou(by_region, base.absent)))

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from analysis.predictions.images import Format, Reader, check_one_kind, read_header
+from rgbt.checks import InputError
+
+CLASSES = ("ground", "car", "person")
+PALETTE = ((0, 0, 0), (64, 0, 128), (64, 64, 0))
+INDICES = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+COLOURS = np.array(PALETTE, np.uint8)[INDICES]
+
+
+def reader(form: Format = "auto") -> Reader:
+    return Reader(CLASSES, PALETTE, form)
+
+
+def grey(path: Path, values: np.ndarray = INDICES) -> Path:
+    Image.fromarray(values).save(path)
+    return path
+
+
+def with_palette(path: Path, palette: object, values: np.ndarray = INDICES) -> Path:
+    image = Image.new("P", values.shape[::-1])
+    image.putdata(values.ravel().tolist())
+    image.putpalette(np.array(palette, np.uint8).ravel().tolist())
+    image.save(path)
+    return path
+
+
+def test_the_three_kinds_of_file_say_the_same(tmp_path: Path) -> None:
+    opaque = np.dstack([COLOURS, np.full(INDICES.shape, 255, np.uint8)])
+    files = [
+        grey(tmp_path / "index.png"),
+        grey(tmp_path / "colour.png", COLOURS),
+        grey(tmp_path / "opaque.png", opaque),
+        with_palette(tmp_path / "palette.png", PALETTE),
+    ]
+    assert read_header(files[3]).bits < 8  # packed pixels of a short palette are indices too
+    for file in files:
+        np.testing.assert_array_equal(reader().read(file), INDICES, err_msg=file.name)
+
+
+def test_colours_can_be_asked_for_of_any_file_and_indices_of_equal_channels(tmp_path: Path) -> None:
+    # A palette in another order: the stored numbers are 0, 2, 1 where the colours say 0, 1, 2.
+    shuffled = with_palette(tmp_path / "p.png", [PALETTE[0], PALETTE[2], PALETTE[1]])
+    swapped = np.array([[0, 2, 1], [1, 2, 0]])
+    np.testing.assert_array_equal(reader("colour").read(shuffled), swapped)
+    np.testing.assert_array_equal(reader("index").read(shuffled), INDICES)
+    with pytest.raises(InputError, match=r"index 1 is shown as \(64, 64, 0\).*car.*format=index"):
+        reader().read(shuffled)
+    three = grey(tmp_path / "three.png", np.dstack([INDICES] * 3))
+    np.testing.assert_array_equal(reader("index").read(three), INDICES)
+    black = grey(tmp_path / "black.png", np.zeros((2, 2), np.uint8))
+    assert not reader("colour").read(black).any()
+
+
+def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
+    """VOC's colour of index 3 is another class's colour here: both readings are possible."""
+    voc = [(0, 0, 0), (128, 0, 0), (0, 128, 0), (64, 0, 128)]
+    path = with_palette(tmp_path / "voc.png", voc, np.array([[0, 3]], np.uint8))
+    with pytest.raises(InputError, match=r"only the classes 0 to 2; say what counts: format="):
+        reader().read(path)
+    unused = with_palette(tmp_path / "unused.png", voc, np.array([[0, 0]], np.uint8))
+    assert not reader().read(unused).any()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.array([[0, 3]], np.uint8), r"bad\.png: value 3 is no class; expected 0 to 2 .*person"),
+        (np.array([[0, 255]], np.uint8), r"bad\.png: 1 pixels are 255; a prediction has no pixels"),
+        (
+            np.array([[[0, 0, 0], [64, 0, 127]]], np.uint8),
+            r"bad\.png: colour \(64, 0, 127\) at row 0, column 1 .*\(1 such .*car \(64, 0, 128\)",
+        ),
+        (np.array([[0, 1]], np.uint16), r"bad\.png: expected 8 bits per channel, got 16"),
+        (np.array([[True, False]]), r"bad\.png: expected 8 bits per pixel, got 1"),
+        (np.zeros((1, 2, 4), np.uint8), r"bad\.png: 2 pixels are transparent"),
+        (np.zeros((1, 2, 2), np.uint8), r"bad\.png: .*got grey with transparency"),
+    ],
+)
+def test_what_is_no_prediction_is_refused(tmp_path: Path, values: object, message: str) -> None:
+    path = grey(tmp_path / "bad.png", np.asarray(values))
+    with pytest.raises(InputError, match=message):
+        reader().read(path)
+
+
+def test_three_different_channels_are_no_indices(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"three equal ones, got three that differ"):
+        reader("index").read(grey(tmp_path / "a.png", COLOURS))
+
+
+def test_files_that_are_no_png_or_half_of_one(tmp_path: Path) -> None:
+    text = tmp_path / "text.png"
+    text.write_text("no picture, but long enough for a header")
+    with pytest.raises(InputError, match=r"text\.png is no PNG file"):
+        reader().read(text)
+    noise = np.random.default_rng(0).integers(0, 3, (64, 64), np.uint8)
+    whole = grey(tmp_path / "whole.png", noise).read_bytes()
+    half = tmp_path / "half.png"
+    half.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"half\.png cannot be decoded"):
+        reader().read(half)
+
+
+def test_two_classes_of_one_colour_cannot_be_told_by_colour(tmp_path: Path) -> None:
+    twice = Reader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
+    np.testing.assert_array_equal(twice.read(grey(tmp_path / "index.png")), INDICES)
+    with pytest.raises(InputError, match=r"gives car and person the same colour"):
+        twice.read(grey(tmp_path / "colour.png", COLOURS))
+
+
+def test_files_of_different_kinds_are_refused_together(tmp_path: Path) -> None:
+    files = [grey(tmp_path / "a.png"), grey(tmp_path / "b.png")]
+    check_one_kind(files)
+    files.append(grey(tmp_path / "c.png", COLOURS))
+    with pytest.raises(InputError, match=r"one channel \(.*a\.png\), others with colours \(.*c\.p"):
+        check_one_kind(files)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.predictions.maps import MapSum, PixelMaps, iou_map, ring_means
+from rgbt.checks import InputError
+
+
+def maps(intersection: object, union: object) -> PixelMaps:
+    both = np.array(intersection, np.int32), np.array(union, np.int32)
+    return PixelMaps(
+        intersection=both[0],
+        union=both[1],
+        images=4,
+        classes=("a", "b")[: len(both[0])],
+        palette=((0, 0, 0), (1, 2, 3)),
+        dataset="f",
+        split="test",
+        name="m",
+    )
+
+
+def test_sums_are_those_of_a_loop_over_pixels() -> None:
+    rng = np.random.default_rng(0)
+    images = 300  # more than a byte holds
+    labels = rng.integers(0, 4, (images, 3, 5), np.uint8)
+    labels[labels == 3] = 255
+    predictions = rng.integers(0, 3, (images, 3, 5), np.uint8)
+    labels[:, 0, 0] = predictions[:, 0, 0] = 1  # always right: counts beyond 255
+    summed = MapSum(3, (3, 5))
+    intersection, union = np.zeros((2, 3, 3, 5), int)
+    for label, prediction in zip(labels, predictions, strict=True):
+        summed.add(label, prediction)
+        for y, x in np.ndindex(3, 5):
+            if label[y, x] == 255:
+                continue
+            if label[y, x] == prediction[y, x]:
+                intersection[label[y, x], y, x] += 1
+            for index in {label[y, x], prediction[y, x]}:
+                union[index, y, x] += 1
+    summed.flush()
+    np.testing.assert_array_equal(summed.intersection, intersection)
+    np.testing.assert_array_equal(summed.union, union)
+    assert summed.union[1, 0, 0] == images
+
+
+def test_mean_over_classes_by_hand_under_both_conventions() -> None:
+    # pixels: a 2/4, b 1/1 | a 1/2, b absent | nothing labelled
+    found = maps([[[2, 1, 0]], [[1, 0, 0]]], [[[4, 2, 0]], [[1, 0, 0]]])
+    np.testing.assert_allclose(iou_map(found), [[0.75, 0.5, np.nan]])
+    np.testing.assert_allclose(iou_map(found, "released"), [[0.75, 0.25, 0.0]])
+
+
+def test_centre_and_edge_are_the_first_and_last_ring() -> None:
+    heat = np.zeros((8, 8))
+    heat[:, 0] = np.nan  # left out, not counted as 0
+    heat[7] = 0.25
+    heat[3:5, 3:5] = 0.5
+    means = ring_means(heat, 4)  # the first ring is the square of 8 / sqrt(4) = 4 pixels a side
+    assert means[0] == pytest.approx(0.5 * 4 / 16)
+    assert 0 < means[3] < 0.25
+    means = ring_means(np.where(heat == 0.25, np.nan, heat), 4)
+    assert means[3] == 0.0
+    assert np.isnan(ring_means(np.full((8, 8), np.nan), 4)).all()
+
+
+def test_saved_and_loaded_are_equal(tmp_path: Path) -> None:
+    before = maps([[[2, 1]], [[1, 0]]], [[[4, 2]], [[1, 0]]])
+    before.save(tmp_path / "maps.npz")
+    after = PixelMaps.load(tmp_path / "maps.npz")
+    np.testing.assert_array_equal(after.intersection, before.intersection)
+    np.testing.assert_array_equal(after.union, before.union)
+    assert after.union.dtype == np.int32
+    nothing = np.zeros((2, 1, 1), np.int32)
+    without = {"intersection": nothing, "union": nothing}
+    assert replace(after, **without).__dict__.keys() == before.__dict__.keys()
+    for key in ("images", "classes", "palette", "dataset", "split", "name"):
+        assert getattr(after, key) == getattr(before, key)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no file of pixel maps"):
+        PixelMaps.load(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("text")
+    with pytest.raises(InputError, match="not a readable file of pixel maps"):
+        PixelMaps.load(tmp_path / "text.npz")
+    np.savez(tmp_path / "other.npz", format=np.array("rgbt counts 1"))
+    with pytest.raises(InputError, match="got 'rgbt counts 1'"):
+        PixelMaps.load(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match="K=2"):
+        maps([[[1]], [[1]]], [[[1]]])

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from analysis.predictions.maps import iou_map
+from analysis.predictions.scoring import Options, score_folder
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+from rgbt.metrics.metric import Regions
+from tests.analysis.predictions.conftest import LABELS, PALETTE, PREDICTIONS, Write
+
+STRIPS = Options(partitions=("vertical", "horizontal"), regions=2)
+
+
+def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
+    scored = score_folder(write(PREDICTIONS), tiny, "test", STRIPS)
+    vertical, horizontal = scored.counts
+    first = [[[4, 0, 0], [1, 3, 0], [0, 0, 0]], [[4, 0, 0], [0, 0, 0], [1, 1, 1]]]
+    second = [[[8, 0, 0], [0, 0, 0], [0, 0, 0]]] * 2
+    np.testing.assert_array_equal(vertical.counts, [first, second])
+    # The upper half of the first image is its car, the lower half its person, as left and right.
+    np.testing.assert_array_equal(horizontal.counts, [first, second])
+    assert vertical.counts.dtype == np.int32
+    assert (vertical.partition, horizontal.partition) == ("vertical2", "horizontal2")
+    assert vertical.names == tuple(LABELS)
+    assert vertical.night == (False, True)
+    assert vertical.classes == tiny.classes
+    assert (vertical.split, vertical.dataset) == ("test", tiny.fingerprint())
+    assert scored.name == "pred"
+
+
+def test_the_map_by_hand(tiny: MFNet, write: Write) -> None:
+    maps = score_folder(write(PREDICTIONS), tiny, "test", STRIPS).maps
+    assert maps is not None
+    # Row 0: car right and ground right (1 + 1) / 2; car taken for ground: ground 1/2, car 0/1.
+    np.testing.assert_allclose(iou_map(maps)[0], [1.0, 0.25, 1.0, 1.0])
+    # Row 3: person taken for car: ground 1/1, car 0/1, person 0/1; the ignored pixel: ground 1/1.
+    np.testing.assert_allclose(iou_map(maps)[3], [1.0, 1.0, 1 / 3, 1.0])
+    assert maps.images == 2
+
+
+def test_indices_palettes_and_colours_give_equal_counts(tiny: MFNet, write: Write) -> None:
+    from PIL import Image
+
+    indices = write(PREDICTIONS)
+    palettes, colours = write({}, "palettes"), write({}, "colours")
+    for name, prediction in PREDICTIONS.items():
+        image = Image.fromarray(np.array(prediction, np.uint8))
+        Image.fromarray(np.array(PALETTE, np.uint8)[np.array(image)]).save(colours / f"{name}.png")
+        image.putpalette(np.array(PALETTE, np.uint8).ravel().tolist())
+        image.save(palettes / f"{name}.png")
+    expected = score_folder(indices, tiny, "test", STRIPS).counts[0].counts
+    for folder in (palettes, colours):
+        found = score_folder(folder, tiny, "test", STRIPS)
+        np.testing.assert_array_equal(found.counts[0].counts, expected)
+
+
+def test_how_files_are_read_and_called_can_be_chosen(tiny: MFNet, write: Write) -> None:
+    folder = write({f"{name}_out": value for name, value in PREDICTIONS.items()})
+    three = np.dstack([np.array(PREDICTIONS["00002N"], np.uint8)] * 3)
+    cv2.imwrite(str(folder / "00002N_out.png"), three)
+    with pytest.raises(InputError, match=r"one channel \(.*00001D_out.*others with colours"):
+        score_folder(folder, tiny, "test", Options(regions=2, suffix="_out"))
+    chosen = Options(partitions=("vertical",), regions=2, suffix="_out", form="index", name="mine")
+    scored = score_folder(folder, tiny, "test", chosen)
+    np.testing.assert_array_equal(scored.counts[0].whole().sum(0), [26, 4, 1])
+    assert scored.name == "mine"
+
+
+def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write) -> None:
+    rng = np.random.default_rng(1)
+    names = [f"{number:05d}{'DN'[number % 2]}" for number in range(6)]
+    labels = rng.integers(0, 9, (6, 24, 32), np.uint8)
+    labels[rng.random(labels.shape) < 0.1] = 255
+    predictions = rng.integers(0, 9, labels.shape, np.uint8)
+    root = write(dict(zip(names, labels, strict=True)), "labels").parent
+    (root / "images").mkdir()
+    (root / "test.txt").write_text("\n".join(names))
+    folder = write(dict(zip(names, predictions, strict=True)))
+    dataset = MFNet(str(root))
+    one, two = (
+        score_folder(folder, dataset, "test", Options(threads=threads)) for threads in (1, 2)
+    )
+    for counts, again in zip(one.counts, two.counts, strict=True):
+        aspect = "image" if counts.partition == "ring5" else None
+        regions = Regions(
+            partition=counts.partition[:-1],  # type: ignore[arg-type]
+            regions=5,
+            aspect=aspect,  # type: ignore[arg-type]
+            absent="released",
+        )
+        region_map = regions.map((24, 32))
+        expected = np.zeros((6, 5, 9, 9), int)
+        for index, y, x in np.ndindex(labels.shape):
+            label = labels[index, y, x]
+            if label != 255:
+                expected[index, region_map[y, x], label, predictions[index, y, x]] += 1
+        np.testing.assert_array_equal(counts.counts, expected)
+        np.testing.assert_array_equal(again.counts, expected)
+    assert [counts.partition for counts in one.counts] == ["ring5", "vertical5", "horizontal5"]
+    assert one.maps is not None
+    assert two.maps is not None
+    np.testing.assert_array_equal(one.maps.union, two.maps.union)
+    # Pixels and regions count the same.
+    right = one.counts[0].whole().diagonal()
+    np.testing.assert_array_equal(one.maps.intersection.sum((1, 2)), right)
+
+
+def test_left_out_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
+    folder = write({"00002N": PREDICTIONS["00002N"]})
+    options = Options(partitions=("vertical",), regions=2, missing="leave_out")
+    scored = score_folder(folder, tiny, "test", options)
+    assert scored.counts[0].names == ("00002N",)
+    assert scored.counts[0].night == (True,)
+    assert scored.counts[0].whole().sum() == 16
+    assert scored.found.missing == ("00001D",)
+    assert scored.maps is not None
+    assert scored.maps.images == 1
+
+
+def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write: Write) -> None:
+    half = {name: np.array(value)[::2, ::2] for name, value in PREDICTIONS.items()}
+    folder = write(half)
+    with pytest.raises(
+        InputError, match=r"00001D\.png is 2x2 pixels but its label is 4x4.*nearest"
+    ):
+        score_folder(folder, tiny, "test", STRIPS)
+    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    scored = score_folder(folder, tiny, "test", options)
+    # Each predicted pixel stands for 2 x 2: all of the car, all of the person are right.
+    first = scored.counts[0].counts[0]
+    np.testing.assert_array_equal(first.sum(0), [[8, 0, 0], [0, 4, 0], [0, 0, 3]])
+    assert scored.resized == tuple(LABELS)
+
+
+def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> None:
+    bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
+    for _ in range(3):
+        with pytest.raises(InputError, match=r"00001D\.png: value 7 is no class"):
+            score_folder(bad, tiny, "test", STRIPS)
+
+
+def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Write) -> None:
+    larger = np.zeros((6, 8), np.uint8)
+    cv2.imwrite(str(tiny.label_path("00002N")), larger)
+    scored = score_folder(write(PREDICTIONS | {"00002N": larger}), tiny, "test", STRIPS)
+    assert scored.maps is None
+    assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]
+
+
+def test_progress_is_told_once_per_image(tiny: MFNet, write: Write) -> None:
+    calls: list[int] = []
+    score_folder(write(PREDICTIONS), tiny, "test", STRIPS, lambda: calls.append(1))
+    assert len(calls) == 2
+
+
+def test_unknown_choices_name_the_known_ones() -> None:
+    with pytest.raises(InputError, match="'color' is not a choice; did you mean 'colour'"):
+        Options(form="color")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'leave' is not a choice"):
+        Options(missing="leave")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'linear' is not a choice"):
+        Options(resize="linear")  # type: ignore[arg-type]

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from analysis.predictions.maps import PixelMaps
+from analysis.predictions.scoring import score_folder
+from analysis.predictions.table import Cell
+from analysis.score import OWN, main, score_tables
+from analysis.uncertainty import Resampling, estimate
+from rgbt.command import plain_command
+from rgbt.data.mfnet import MFNet
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
+from tests.commands import SPLITS, Call
+from tests.conftest import pair
+
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
+REAL = SHARED / "realdata"
+HW = (48, 64)
+
+
+@pytest.fixture
+def predictions(data: Path, tmp_path: Path) -> Path:
+    """Labels of split test with the left third taken for class 0."""
+    folder = tmp_path / "method"
+    folder.mkdir()
+    for name in SPLITS["test"]:
+        prediction = pair(name, HW)[2].copy()
+        prediction[:, : HW[1] // 3] = 0
+        cv2.imwrite(str(folder / f"{name}.png"), prediction)
+    return folder
+
+
+def score(call: Call, *arguments: str) -> tuple[int, str, str]:
+    return call(plain_command(OWN, main), *arguments)
+
+
+def place(data: Path) -> tuple[str, str]:
+    return "dataset=mfnet", f"dataset.root={data}"
+
+
+def test_a_folder_is_scored_and_written(
+    call: Call, data: Path, predictions: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "scores"
+    code, shown, err = score(
+        call, f"predictions={predictions}", *place(data), f"out={out}", "resamples=0"
+    )
+    assert code == 0, err
+    counts = {name: Counts.load(out / f"counts_{name}5.npz") for name in ("ring", "vertical")}
+    assert counts["ring"].names == tuple(SPLITS["test"])
+    assert (out / "counts_horizontal5.npz").is_file()
+    np.testing.assert_array_equal(counts["ring"].whole(), counts["vertical"].whole())
+    assert PixelMaps.load(out / "maps.npz").name == "method"
+    expected = value("region/5", counts["vertical"], "released")
+    assert expected == 100  # the right strip is the label itself
+    with (out / "scores.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["partition"] == "vertical5"]
+    wanted = {"images": "all", "region": "1", "class": "mean", "metric": "IoU"}
+    (row, *_) = (row for row in rows if wanted.items() <= row.items())
+    assert float(row["value"]) == pytest.approx(
+        value("region/1", counts["vertical"], "released"), abs=1e-3
+    )
+    assert row["low"] == ""
+    page = (out / "scores.md").read_text()
+    for text in (shown, page):
+        assert "vertical5: mIoU, mAcc and IoU of each class by region" in text
+        assert "Mean IoU by pixel" in text
+
+
+def test_intervals_hold_the_score(call: Call, data: Path, tmp_path: Path) -> None:
+    names = [f"{number:05d}D" for number in range(12)]
+    folder = tmp_path / "method"
+    folder.mkdir()
+    (data / "test.txt").write_text("\n".join(names))
+    for number, name in enumerate(names):
+        label = pair(name, HW)[2]
+        cv2.imwrite(str(data / "labels" / f"{name}.png"), label)
+        cv2.imwrite(str(folder / f"{name}.png"), np.where(label > number % 4, label, 0))
+    fewer = ("partition=ring", "regions=2", "resamples=500", "blocks=none", "level=0.9")
+    out = tmp_path / "scores"
+    code, shown, err = score(
+        call, f"predictions={folder}", *place(data), *fewer, f"out={out}", "name=mine"
+    )
+    assert code == 0, err
+    assert "90 % intervals over images" in shown
+    assert sorted(path.name for path in out.glob("*.npz")) == ["counts_ring2.npz", "maps.npz"]
+    with (out / "scores.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["low"]]
+    assert {(row["region"], row["metric"]) for row in rows} == {
+        *(("1", "IoU"), ("2", "IoU"), ("whole", "IoU"), ("whole", "Var")),
+    }
+    for row in rows:
+        assert row["method"] == "mine"
+        if row["metric"] == "IoU":
+            assert float(row["low"]) < float(row["value"]) < float(row["high"])
+
+
+def test_each_convention_has_intervals_of_its_own() -> None:
+    """A class that few images hold is absent from resamples: 0 pulls the mean down, exclude not."""
+    images = np.zeros((20, 2, 2, 2), np.int32)
+    images[:, :, 0, 0] = 10 + np.arange(20)[:, None]
+    images[:, :, 0, 1] = np.arange(20)[:, None] % 3
+    images[:2, 0, 1, 1] = 5
+    images[:, 1, 0, 1] = 0  # the second class is nowhere in the second region
+    names = tuple(f"{number:05d}D" for number in range(20))
+    counts = Counts(
+        counts=images,
+        names=names,
+        night=None,
+        classes=("a", "b"),
+        partition="vertical2",
+        dataset="f",
+        split="test",
+    )
+    settings = Resampling(resamples=400, blocks="none")
+    (table,) = score_tables([("ours", counts)], settings)
+    for absent in ("released", "exclude"):
+        expected = estimate([counts], ["mIoU", "region/2"], replace(settings, absent=absent))
+        for region, metric in ((None, "mIoU"), (2, "region/2")):
+            score = table.scores[Cell(region=region, absent=absent)]
+            interval = expected[metric].images
+            assert interval is not None
+            assert (score.low, score.high) == (interval.low, interval.high)
+            assert score.value == pytest.approx(expected[metric].value)
+    assert table.scores[Cell(region=2)].high <= 50
+    assert table.scores[Cell(region=2, absent="exclude")].low > 90
+
+
+def test_what_was_left_out_is_said_in_the_terminal_and_in_the_file(
+    call: Call, data: Path, predictions: Path, tmp_path: Path
+) -> None:
+    (predictions / f"{SPLITS['test'][0]}.png").rename(predictions / "stray.png")
+    arguments = (f"predictions={predictions}", *place(data), "resamples=0")
+    code, _, err = score(call, *arguments)
+    assert code == 2
+    assert "lacks the predictions of 1 of the 3 images" in err
+    out = tmp_path / "scores"
+    code, shown, _ = score(call, *arguments, "missing=leave_out", f"out={out}")
+    assert code == 0
+    for text in (shown, (out / "scores.md").read_text()):
+        assert "1 of 3 images of the split have no prediction and are left out" in text
+        assert "1 other PNG files of the folder" in text
+
+
+def test_stored_counts_are_scored(
+    call: Call, data: Path, predictions: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "scores"
+    arguments = (f"predictions={predictions}", *place(data), "resamples=0")
+    score(call, *arguments, f"out={out}", "name=counts_ring5", "partition=ring")
+    written = (out / "scores.csv").read_text()
+    stored = f"counts={out / 'counts_ring5.npz'}"
+    code, _, err = score(call, stored, "resamples=0", f"out={tmp_path / 'again'}")
+    assert code == 0, err
+    assert "no map by pixel" in err
+    assert (tmp_path / "again" / "scores.csv").read_text() == written
+    code, _, err = score(call, stored, "regions=9")
+    assert code == 2
+    assert "'regions' has no effect on stored counts" in err
+    code, _, err = score(call, stored, *place(data))
+    assert "'dataset' has no effect on stored counts" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "expected one of predictions=folder and counts=run, got neither"),
+        (("predictions=a", "counts=b"), "got predictions and counts"),
+        (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect on a score"),
+        (("predictions=a", "dataset=mfnte"), "did you mean 'mfnet'"),
+        (("predictions=a", "dataset=mfnet"), "dataset.root"),
+        (("predictions=a", "resamples=many"), "resamples=many: expected a whole number"),
+        (("predictions=a", "level=high"), "level=high: expected a number"),
+        (("predictions=a", "blocks=run"), "blocks=run: expected auto"),
+    ],
+)
+def test_arguments_that_make_no_sense(
+    call: Call, arguments: tuple[str, ...], sentence: str
+) -> None:
+    code, _, err = score(call, *arguments)
+    assert code == 2
+    assert sentence in err
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("argument", "sentence"),
+    [
+        ("partition=rings", "partition: 'rings' is not a choice; did you mean 'ring'"),
+        ("regions=0", "regions must lie in [1, 255]"),
+        ("format=color", "format: 'color' is not a choice"),
+        ("split=val", "2 of them"),
+        ("split=tset", "did you mean 'test'"),
+    ],
+)
+def test_choices_that_do_not_fit_the_folder(
+    call: Call, data: Path, predictions: Path, argument: str, sentence: str
+) -> None:
+    sentence = sentence.replace("2 of them", "3 of them images of split 'test': give split=test")
+    code, _, err = score(call, f"predictions={predictions}", *place(data), argument)
+    assert code == 2
+    assert sentence in err
+
+
+def test_help_waits_for_no_heavy_import() -> None:
+    code = (
+        "import sys; sys.argv[1:] = ['--help']\n"
+        "from analysis.score import *\n"
+        "try: plain_command(OWN, main)()\n"
+        "except SystemExit as left: assert left.code == 0\n"
+        "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'PIL', 'cv2'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "usage: [predictions=]" in done.stdout
+
+
+@pytest.mark.slow
+def test_real_weights_scored_from_their_images_give_the_known_counts(tmp_path: Path) -> None:
+    """The authors' network on 100 real pairs, through PNG files: the counts known beforehand."""
+    if not (REAL / "mfnet_weights" / "final.pth").is_file():
+        pytest.skip("needs the MFNet authors' weights and real pairs")
+    place = f"dataset.root={REAL / 'mfnet200'}"
+    weights = f"model.weights={REAL / 'mfnet_weights' / 'final.pth'}"
+    command = [sys.executable, "-m", "rgbt.predict", "model=mfnet", weights, place]
+    folders = ["input=val", f"out={tmp_path / 'p'}", f"runs_dir={tmp_path}"]
+    subprocess.run([*command, *folders], cwd=ROOT, check=True, capture_output=True)
+    known = json.loads((REAL / "mfnet_weights" / "expected_confusions.json").read_text())
+    expected = known["MFNet_final_pth/val"]["confusion"]
+    scored = score_folder(tmp_path / "p", MFNet(str(REAL / "mfnet200")), "val")
+    for counts in scored.counts:
+        np.testing.assert_array_equal(counts.whole(), expected)
