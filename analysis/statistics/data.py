@@ -1,0 +1,206 @@
+"""Statistics of a split by region: what is measured once, and the file that holds it.
+
+Letters: ``N`` images, ``R`` regions, ``K`` classes, ``P`` parts, ``H W`` pixels; the axis of length
+2 is the modality (`MODALITIES`). What is computed from them is in `derive`.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, check_choice
+from rgbt.metrics.names import DAY, NIGHT
+
+FORMAT = "rgbt spatial statistics 1"
+"""Written into every file; another number means another layout."""
+
+MODALITIES = ("rgb", "thermal")
+"""Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits."""
+
+ALL = "all"
+NOISE = "noise/"
+"""Beginning of the keys under which a file holds the noise, by estimator."""
+
+ARRAYS = ("palette", "region_map", "labels", "ignored", "occupied", "laplacian", "mean")
+TEXTS = ("dataset", "fingerprint", "split", "partition", "kernel")
+LISTS = ("classes", "names", "parts")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpatialStatistics:
+    """Measurements of every image of a split, by region.
+
+    Attributes:
+        dataset: name of the data set.
+        fingerprint: its fingerprint.
+        split: split that the images come from.
+        classes: names of the K classes; class 0 is the background.
+        palette: (K, 3) uint8, red, green, blue.
+        partition: name of the regions, e.g. "ring9" (`rgbt.metrics.metric.Regions.name`).
+        region_map: (H, W) uint8, region index 0..R-1 of every pixel.
+        kernel: of the Laplacian, "four" or "eight" neighbours.
+        names: names of the N images.
+        night: (N,) bool, taken at night; None where the data set does not say.
+        labels: (N, R, K) int64, pixels of each class.
+        ignored: (N, R) int64, pixels whose label is 255.
+        parts: first axis of `occupied`: ("day", "night"), or ("all",) where `night` is None.
+        occupied: (P, K, H, W) int32, images of the part that have class k at the pixel.
+        laplacian: (N, 2, R) float64, variance of the Laplacian (Eq. 3), squared grey levels.
+        mean: (N, 2, R) float64, mean pixel value, grey levels 0..255.
+        noise: estimator -> (N, 2, R) float64, standard deviation of the noise, grey levels; NaN
+            where a region holds no window of the estimator.
+
+    Raises:
+        ValueError: the sizes do not agree.
+    """
+
+    dataset: str
+    fingerprint: str
+    split: str
+    classes: tuple[str, ...]
+    palette: NDArray[np.uint8]
+    partition: str
+    region_map: NDArray[np.uint8]
+    kernel: str
+    names: tuple[str, ...]
+    night: NDArray[np.bool_] | None
+    labels: NDArray[np.int64]
+    ignored: NDArray[np.int64]
+    parts: tuple[str, ...]
+    occupied: NDArray[np.int32]
+    laplacian: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    noise: dict[str, NDArray[np.float64]]
+
+    def __post_init__(self) -> None:
+        images, regions, classes = len(self.names), self.num_regions, len(self.classes)
+        by_modality = (images, len(MODALITIES), regions)
+        expected = {
+            "palette": (classes, 3),
+            "labels": (images, regions, classes),
+            "ignored": (images, regions),
+            "occupied": (len(self.parts), classes, *self.region_map.shape),
+            "laplacian": by_modality,
+            "mean": by_modality,
+        }
+        found = {name: getattr(self, name).shape for name in expected}
+        found |= {f"noise['{name}']": values.shape for name, values in self.noise.items()}
+        if self.night is not None:
+            found["night"], expected["night"] = self.night.shape, (images,)
+        for name, shape in found.items():
+            if shape != expected.get(name, by_modality):
+                raise ValueError(
+                    f"{name}: expected shape {expected.get(name, by_modality)}, got {shape}."
+                )
+
+    @property
+    def num_regions(self) -> int:
+        """R."""
+        return int(self.region_map.max()) + 1
+
+    def subsets(self) -> tuple[str, ...]:
+        """What can be told apart: ("all", "day", "night"), or ("all",) without images of both."""
+        both = self.night is not None and 0 < int(self.night.sum()) < len(self.names)
+        return (ALL, DAY, NIGHT) if both else (ALL,)
+
+    def chosen(self, part: str) -> NDArray[np.bool_]:
+        """(N,): which images belong to `part`: "all", "day" or "night".
+
+        Raises:
+            InputError: another word, a data set that does not tell, or no such image.
+        """
+        check_choice("part", part, (ALL, DAY, NIGHT))
+        if part == ALL:
+            return np.ones(len(self.names), bool)
+        if self.night is None:
+            raise InputError(
+                f"part={part}: {self.dataset} does not say which images were taken at night; use "
+                "part=all."
+            )
+        wanted = self.night if part == NIGHT else ~self.night
+        if not wanted.any():
+            raise InputError(
+                f"part={part}: split '{self.split}' of {self.dataset} holds no such image."
+            )
+        return wanted
+
+    def select(self, part: str) -> SpatialStatistics:
+        """The statistics of the images of `part`; "all" is the whole.
+
+        Raises:
+            InputError: see `chosen`.
+        """
+        wanted = self.chosen(part)
+        if part == ALL:
+            return self
+        index = self.parts.index(part)
+        return replace(
+            self,
+            names=tuple(name for name, take in zip(self.names, wanted, strict=True) if take),
+            night=None if self.night is None else self.night[wanted],
+            labels=self.labels[wanted],
+            ignored=self.ignored[wanted],
+            parts=(part,),
+            occupied=self.occupied[index : index + 1],
+            laplacian=self.laplacian[wanted],
+            mean=self.mean[wanted],
+            noise={name: values[wanted] for name, values in self.noise.items()},
+        )
+
+    def save(self, path: Path) -> None:
+        """Write one compressed file under a temporary name, then rename: never half a file."""
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+        values: dict[str, Any] = {key: getattr(self, key) for key in ARRAYS}
+        values |= {key: np.array(getattr(self, key)) for key in (*TEXTS, *LISTS)}
+        values |= {f"{NOISE}{name}": noise for name, noise in self.noise.items()}
+        # Missing is stored as no value at all: npz without pickles knows no None.
+        values["night"] = np.zeros(0, bool) if self.night is None else self.night
+        values["format"] = np.array(FORMAT)
+        with partial.open("wb") as stream:
+            np.savez_compressed(stream, **values)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> SpatialStatistics:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: no such file, or not a file of statistics.
+        """
+        values = _read(path)
+        night = values["night"].astype(bool)
+        fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
+        fields |= {key: str(values[key]) for key in TEXTS}
+        fields |= {key: tuple(values[key].tolist()) for key in LISTS}
+        fields["noise"] = {
+            key.removeprefix(NOISE): array for key, array in values.items() if key.startswith(NOISE)
+        }
+        return cls(night=night if len(night) else None, **fields)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    advice = "write it with python -m analysis.spatial dataset=... out=..."
+    if not path.is_file():
+        raise InputError(f"there is no file of statistics '{path}'; {advice}.")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {key: stored[key] for key in stored.files}
+    # TypeError: a lone array of NumPy's other format opens, but is no archive.
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"'{path}' is not a readable file of statistics; {advice}.") from error
+    if str(values.get("format")) != FORMAT:
+        raise InputError(
+            f"'{path}' is no file of statistics: expected the mark '{FORMAT}', got "
+            f"'{values.get('format')}'; {advice}."
+        )
+    return values

@@ -1,0 +1,143 @@
+"""Intervals for quantities of a split: resampled blocks of images, by day and by night.
+
+Neighbouring frames of a drive show nearly the same scene, so that blocks of them are drawn, not
+images. Small and local: comparing methods is the business of `analysis.uncertainty`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.statistics.data import ALL, SpatialStatistics
+from rgbt.metrics.names import DAY, NIGHT
+from rgbt.randomness import numpy_generator
+
+MIN_BLOCKS = 5
+"""Fewer blocks of a part say too little about how blocks differ to decide anything."""
+
+Scale = Literal["linear", "ratio"]
+Floats = NDArray[np.float64]
+
+
+class Interval(NamedTuple):
+    """A value with the ends of its interval; NaN ends where there is none."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Blocks:
+    """Blocks of images and how often each resample draws each of them.
+
+    The images of a part (day, night; all where the data set does not tell) are sorted by name and
+    cut into blocks of `size` consecutive ones; every resample draws as many blocks of the part as
+    it has, with replacement. Row 0 of everything is the sample itself, the other rows resamples.
+
+    Args:
+        stats: measurements.
+        size: images per block, at least 1, which treats images as independent.
+        resamples: B, at least 2.
+        seed: of the draws.
+    """
+
+    def __init__(
+        self, stats: SpatialStatistics, *, size: int = 10, resamples: int = 2000, seed: int = 0
+    ) -> None:
+        strata = (DAY, NIGHT) if stats.night is not None else (ALL,)
+        self._block_of = np.zeros(len(stats.names), np.intp)
+        self._stratum_of: list[str] = []
+        rng = numpy_generator(seed, "statistics")
+        weights = []
+        for stratum in strata:
+            chosen = self._images(stats, stratum)
+            ordered = chosen[np.argsort(np.array(stats.names)[chosen], kind="stable")]
+            count = -(-len(ordered) // size)
+            self._block_of[ordered] = len(self._stratum_of) + np.arange(len(ordered)) // size
+            self._stratum_of += [stratum] * count
+            drawn = rng.multinomial(count, np.full(count, 1 / max(1, count)), resamples)
+            weights.append(np.vstack([np.ones((1, count)), drawn]))
+        self._weights = np.hstack(weights)
+        self._images_of = np.bincount(self._block_of, minlength=len(self._stratum_of))
+
+    @staticmethod
+    def _images(stats: SpatialStatistics, stratum: str) -> NDArray[np.intp]:
+        if stratum == ALL or stats.night is None:
+            return np.arange(len(stats.names))
+        return np.flatnonzero(stats.night == (stratum == NIGHT))
+
+    def mean(self, values: NDArray[np.number], part: str = ALL) -> Floats:
+        """Mean over the images of `part`, of the sample and of every resample.
+
+        Args:
+            values: (N, ...).
+            part: "all", "day" or "night"; one that holds images.
+
+        Returns:
+            (1 + B, ...).
+        """
+        summed = np.zeros((len(self._stratum_of), *values.shape[1:]))
+        np.add.at(summed, self._block_of, values)
+        chosen = self._chosen(part)
+        weights = self._weights[:, chosen]
+        totals = np.tensordot(weights, summed[chosen], axes=1)
+        images = weights @ self._images_of[chosen]
+        return np.asarray(totals / images.reshape(-1, *[1] * (values.ndim - 1)))
+
+    def sizes(self, part: str = ALL) -> tuple[int, ...]:
+        """Number of blocks of every stratum of `part`."""
+        strata = [self._stratum_of[index] for index in self._chosen(part)]
+        return tuple(strata.count(name) for name in sorted(set(strata)))
+
+    def containing(self, present: NDArray[np.bool_]) -> int:
+        """Number of blocks that hold one of the images `present`, (N,)."""
+        return len(set(self._block_of[present].tolist()))
+
+    def interval(
+        self,
+        samples: Floats,
+        part: str = ALL,
+        *,
+        level: float = 0.95,
+        scale: Scale = "linear",
+    ) -> Interval:
+        """Interval of a quantity: value -+ t times its bootstrap standard error.
+
+        With the few blocks that a small split has, percentiles of resamples are too narrow. So the
+        standard error is enlarged by ``sqrt(n / (n - 1))``, n blocks of the smallest stratum, and
+        t has as many degrees of freedom as there are blocks less strata; for a plain mean of one
+        stratum this is the t interval of its blocks. Ratios are treated on the logarithmic scale.
+
+        Args:
+            samples: (1 + B,) as `mean` gives them, or computed from these row by row.
+            part: the part that they come from.
+            level: of confidence, 0..1.
+            scale: "ratio" for positive quotients.
+
+        Returns:
+            ends are NaN where a value is not finite or a stratum has one block.
+        """
+        from scipy.special import stdtrit
+
+        value = float(samples[0])
+        sizes = self.sizes(part)
+        smallest, freedom = min(sizes), sum(sizes) - len(sizes)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            scaled = np.log(samples) if scale == "ratio" else samples
+        # A resample without a pixel of a rare class has no value for it.
+        spread = scaled[1:][~np.isnan(scaled[1:])]
+        if smallest < 2 or not np.isfinite(scaled[0]) or not np.isfinite(spread).all():
+            return Interval(value, math.nan, math.nan)
+        quantile = float(stdtrit(freedom, 0.5 + level / 2))
+        reach = quantile * float(spread.std()) * math.sqrt(smallest / (smallest - 1))
+        ends = scaled[0] - reach, scaled[0] + reach
+        low, high = (math.exp(end) for end in ends) if scale == "ratio" else ends
+        return Interval(value, float(low), float(high))
+
+    def _chosen(self, part: str) -> list[int]:
+        """Blocks of `part`."""
+        return [i for i, stratum in enumerate(self._stratum_of) if part in (ALL, stratum)]

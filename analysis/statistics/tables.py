@@ -1,0 +1,212 @@
+"""Tables of the statistics: grids of text for terminal and Markdown, and one tidy table of values.
+
+A grid has a column per region, or, with many regions, a row per region.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.statistics import derive
+from analysis.statistics.data import MODALITIES, SpatialStatistics
+from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Finding, Range
+from rgbt.tracking.tables import ABSENT, Grid, number
+
+COLUMNS = 12
+"""More regions than this become rows."""
+
+Row = tuple[str, NDArray[np.float64]]
+
+SHORT = {HOLDS: "yes", FAILS: "no", OPEN: "open"}
+
+CSV_COLUMNS = (
+    *("dataset", "split", "partition", "images", "part", "quantity", "modality"),
+    *("class", "estimator", "average", "region", "value"),
+)
+
+
+def occupancy_grids(stats: SpatialStatistics) -> tuple[Grid, ...]:
+    """Sample occupancy by part, by class, and by class relative to its largest region."""
+    rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in stats.subsets()]
+    by_class = 100 * derive.class_region_occupancy(stats)
+    relative = 100 * derive.normalised(derive.class_region_occupancy(stats))
+    named = list(enumerate(stats.classes))[1:]
+    return (
+        region_grid("sample occupancy rate, % (Eq. 2)", rows),
+        region_grid("by class, % of the pixels", [(name, by_class[k]) for k, name in named]),
+        region_grid(
+            "by class, % of its largest region (Fig. 3)", [(name, relative[k]) for k, name in named]
+        ),
+    )
+
+
+def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple[Grid, ...]:
+    """Laplacian variance, noise and signal to noise of both modalities by part."""
+    wanted = [(modality, part) for modality in MODALITIES for part in stats.subsets()]
+    laplacian = [(f"{m}, {part}", derive.region_laplacian(stats, m, part)) for m, part in wanted]
+    return (
+        region_grid(f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)", laplacian),
+        noise_grid(stats, estimator),
+        snr_grid(stats, estimator, average),
+    )
+
+
+def noise_grid(stats: SpatialStatistics, estimator: str) -> Grid:
+    """Noise of both modalities by part; below one grey level rounding is a good part of it."""
+    rows = [
+        (f"{modality}, {part}", derive.region_noise(stats, modality, part, estimator))
+        for modality in MODALITIES
+        for part in stats.subsets()
+    ]
+    return region_grid(f"noise, grey levels ({estimator}; rounding alone is 0.29)", rows)
+
+
+def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> Grid:
+    """Signal to noise of both modalities by part."""
+    rows = [
+        (f"{modality}, {part}", derive.region_snr(stats, modality, part, estimator, average))
+        for modality in MODALITIES
+        for part in stats.subsets()
+    ]
+    return region_grid(f"signal to noise (Eq. 4; {estimator}, {average})", rows)
+
+
+def entropy_grid(stats: SpatialStatistics) -> Grid:
+    """Label entropy with and without background by part."""
+    rows = [
+        (f"{part}, {word} background", derive.label_entropy(stats, part, background))
+        for part in stats.subsets()
+        for word, background in (("with", True), ("without", False))
+    ]
+    return region_grid("label entropy, bits (Eq. 5)", rows)
+
+
+def region_grid(title: str, rows: Sequence[Row]) -> Grid:
+    """Values by region, and their mean over regions."""
+    regions = len(rows[0][1])
+    header = ("", *(f"R{index + 1}" for index in range(regions)), "mean")
+    lines = [(name, *map(number, (*values, float(values.mean())))) for name, values in rows]
+    if regions <= COLUMNS:
+        return Grid(title, header, tuple(lines))
+    turned = list(zip(header, *lines, strict=True))
+    return Grid(title, turned[0], tuple(turned[1:]))
+
+
+def claims_grid(claims: Sequence[Claim], level: float) -> Grid:
+    """A line per claim with its verdict, below it a line per number that decides it."""
+    rows: list[tuple[str, ...]] = []
+    for claim in claims:
+        how = f", {claim.estimator}, {claim.average}" if claim.estimator else ""
+        rows.append((f"{claim.statement}{how} ({claim.source})", "", "", "", claim.verdict, ""))
+        for each in claim.findings:
+            value, low, high = each.interval
+            ends = ABSENT if math.isnan(low) else f"[{_digits(low)}, {_digits(high)}]"
+            cells = (_digits(value), ends, _range(each.wanted), SHORT[each.verdict], each.note)
+            rows.append((f"   {each.what}", *cells))
+    header = ("claim", "value", f"{100 * level:g} % interval", "claimed", "holds", "")
+    return Grid("claims of SpatialSeg, Sec. III", header, tuple(rows))
+
+
+def estimator_grid(claims: Sequence[Claim]) -> Grid:
+    """How the numbers about noise depend on its estimator and on the average."""
+    columns: dict[tuple[str, str], dict[tuple[str, str], Finding]] = {}
+    for claim in claims:
+        if claim.estimator:
+            column = columns.setdefault((claim.estimator, claim.average), {})
+            column |= {(claim.statement, each.what): each for each in claim.findings}
+    ways = list(columns)
+    rows = []
+    for statement, what in columns[ways[0]]:
+        found = [columns[way][statement, what] for way in ways]
+        cells = [f"{_digits(each.interval.value)} {SHORT[each.verdict]}" for each in found]
+        rows.append((what, _range(found[0].wanted), *cells))
+    header = ("signal to noise", "claimed", *(f"{name}, {average}" for name, average in ways))
+    return Grid("how it depends on the estimator of the noise and the average", header, tuple(rows))
+
+
+def markdown(
+    stats: SpatialStatistics, claims: Sequence[Claim], ways: Sequence[tuple[str, str]], level: float
+) -> str:
+    """Everything as Markdown.
+
+    Args:
+        stats: measurements.
+        claims: decided on them, of every estimator and average.
+        ways: (estimator, average) of every table of signal to noise.
+        level: of the intervals.
+    """
+    first, *others = ways
+    grids = [*occupancy_grids(stats), *image_grids(stats, *first)]
+    grids += [noise_grid(stats, name) for name in stats.noise if name != first[0]]
+    grids += [snr_grid(stats, *way) for way in others]
+    grids += [entropy_grid(stats), claims_grid(claims, level), estimator_grid(claims)]
+    return "\n".join([f"# {heading(stats)}", "", *(grid.to_markdown() for grid in grids)])
+
+
+def heading(stats: SpatialStatistics) -> str:
+    """What was measured, in a line."""
+    hw = stats.region_map.shape
+    nights = "" if stats.night is None else f" ({int(stats.night.sum())} at night)"
+    ignored = float(stats.ignored.sum() / max(1, stats.ignored.sum() + stats.labels.sum()))
+    return (
+        f"{stats.dataset}, split {stats.split}: {len(stats.names)} images{nights} of "
+        f"{hw[0]}x{hw[1]}, {stats.partition}, {100 * ignored:.2f} % of the pixels ignored"
+    )
+
+
+def to_csv(stats: SpatialStatistics) -> str:
+    """One value per line, with everything it depends on in its own column (`CSV_COLUMNS`)."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    for part in stats.subsets():
+        images = int(stats.chosen(part).sum())
+        start = (stats.dataset, stats.split, stats.partition, images, part)
+        for keys, values in _quantities(stats, part):
+            for region, value in enumerate(values.tolist(), start=1):
+                cell = "" if math.isnan(value) else f"{value:.8g}"
+                writer.writerow((*start, *keys, region, cell))
+    return stream.getvalue()
+
+
+def _quantities(
+    stats: SpatialStatistics, part: str
+) -> Iterator[tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """((quantity, modality, class, estimator, average), values by region)."""
+    yield ("occupancy", "", "", "", ""), derive.region_occupancy(stats, part)
+    by_class = derive.class_region_occupancy(stats, part)
+    relative = derive.normalised(by_class)
+    for index, name in enumerate(stats.classes):
+        yield ("class_occupancy", "", name, "", ""), by_class[index]
+        yield ("class_occupancy_normalised", "", name, "", ""), relative[index]
+    for word, background in (("with", True), ("without", False)):
+        values = derive.label_entropy(stats, part, background)
+        yield (f"entropy_{word}_background", "", "", "", ""), values
+    for modality in MODALITIES:
+        yield ("laplacian", modality, "", "", ""), derive.region_laplacian(stats, modality, part)
+        for estimator in stats.noise:
+            noise = derive.region_noise(stats, modality, part, estimator)
+            yield ("noise", modality, "", estimator, ""), noise
+            for average in derive.AVERAGES:
+                ratio = derive.region_snr(stats, modality, part, estimator, average)
+                yield ("snr", modality, "", estimator, average), ratio
+
+
+def _range(wanted: Range) -> str:
+    low, high = wanted
+    if math.isinf(high):
+        return f"> {low:g}"
+    return f"< {high:g}" if low <= 0 else f"{low:.3g} to {high:.3g}"
+
+
+def _digits(value: float) -> str:
+    """Three significant digits, or two decimals of what is larger than 10."""
+    if math.isnan(value):
+        return ABSENT
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.2f}"

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.statistics import derive
+from analysis.statistics.collect import CHUNK, Settings, collect
+from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.measure import ESTIMATORS, Meter
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+from rgbt.metrics.metric import Regions
+from tests.analysis.statistics.scenes import InMemory, made, random_sample
+
+RINGS = Regions(partition="ring", regions=3, aspect="image", absent="released")
+SETTINGS = Settings(regions=RINGS, workers=1)
+
+
+def memory(names: list[str], hw: tuple[int, int] = (24, 32)) -> InMemory:
+    rng = np.random.default_rng(5)
+    return InMemory([random_sample(name, hw, rng) for name in names])
+
+
+def assert_same(one: SpatialStatistics, other: SpatialStatistics) -> None:
+    for name in one.__dataclass_fields__:
+        a, b = getattr(one, name), getattr(other, name)
+        if name == "noise":
+            assert a.keys() == b.keys()
+            for key in a:
+                np.testing.assert_array_equal(a[key], b[key])
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+            assert a.dtype == b.dtype, name
+        else:
+            assert a == b, name
+
+
+def test_every_image_in_order_and_maps_by_part() -> None:
+    dataset = memory([f"{n:05d}{'DNN'[n % 3]}" for n in range(7)])
+    stats = collect(dataset, "train", SETTINGS)
+    assert stats.names == tuple(dataset.samples)
+    assert stats.night.tolist() == [name.endswith("N") for name in stats.names]
+    meter = Meter(stats.region_map, 9)
+    for n, sample in enumerate(dataset.samples.values()):
+        measured = meter(sample)
+        np.testing.assert_array_equal(stats.labels[n], measured.labels)
+        np.testing.assert_array_equal(stats.ignored[n], measured.ignored)
+        np.testing.assert_array_equal(stats.laplacian[n], measured.laplacian)
+        np.testing.assert_array_equal(stats.mean[n], measured.mean)
+        for name in ESTIMATORS:
+            np.testing.assert_array_equal(stats.noise[name][n], measured.noise[name])
+    labels = np.stack([sample.label for sample in dataset.samples.values()])
+    for part, wanted in (("day", ~stats.night), ("night", stats.night)):
+        for k in range(9):
+            np.testing.assert_array_equal(
+                stats.occupied[stats.parts.index(part), k], (labels[wanted] == k).sum(0)
+            )
+
+
+def test_does_not_depend_on_the_number_of_workers() -> None:
+    dataset = memory([f"{n:05d}{'DN'[n % 2]}" for n in range(2 * CHUNK + 5)], hw=(12, 16))
+    one = collect(dataset, "train", SETTINGS)
+    for workers in (2, 5):
+        assert_same(one, collect(dataset, "train", replace(SETTINGS, workers=workers)))
+
+
+def test_without_letters_there_is_one_part() -> None:
+    stats = collect(memory(["a", "b"]), "train", SETTINGS)
+    assert stats.night is None
+    assert stats.parts == ("all",)
+    assert stats.subsets() == ("all",)
+    with pytest.raises(InputError, match="does not say which images were taken at night"):
+        stats.select("day")
+
+
+def test_day_and_night_are_the_images_of_each() -> None:
+    names = [f"{n:05d}{'DNN'[n % 3]}" for n in range(9)]
+    dataset = memory(names)
+    stats = collect(dataset, "train", SETTINGS)
+    for letter, part in (("D", "day"), ("N", "night")):
+        alone = InMemory([s for s in dataset.samples.values() if s.name.endswith(letter)])
+        expected = collect(alone, "train", SETTINGS)
+        chosen = stats.select(part)
+        assert chosen.names == expected.names
+        assert chosen.subsets() == ("all",)
+        for function in (
+            derive.occupancy_map,
+            derive.class_occupancy_map,
+            derive.region_occupancy,
+            derive.class_region_occupancy,
+            derive.label_entropy,
+        ):
+            np.testing.assert_array_equal(function(stats, part), function(expected))
+            np.testing.assert_array_equal(function(chosen), function(expected))
+        np.testing.assert_allclose(
+            derive.region_snr(stats, "thermal", part), derive.region_snr(expected, "thermal")
+        )
+
+
+def test_an_image_of_another_size_is_one_sentence() -> None:
+    rng = np.random.default_rng(0)
+    dataset = InMemory([random_sample("1D", (24, 32), rng), random_sample("2N", (24, 30), rng)])
+    with pytest.raises(InputError, match=r"'2N' is 24x30 pixels but '1D' is 24x32; .* one size"):
+        collect(dataset, "train", SETTINGS)
+
+
+def test_an_unreadable_file_stops_or_is_left_out(write_mfnet) -> None:
+    root = write_mfnet({"train": ["00001D", "00002N", "00003D"]})
+    (root / "images" / "00001D.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match="00001D.png cannot be decoded"):
+        collect(MFNet(str(root)), "train", SETTINGS)
+    told: list[str] = []
+    skipping = replace(SETTINGS, skip_unreadable=True)
+    stats = collect(MFNet(str(root)), "train", skipping, unreadable=told.append)
+    assert stats.names == ("00002N", "00003D")
+    assert stats.night.tolist() == [True, False]
+    assert len(told) == 1
+    assert stats.occupied.sum() == 2 * 24 * 32
+    for name in ("00002N", "00003D"):
+        (root / "labels" / f"{name}.png").unlink()
+    with pytest.raises(InputError, match="none of the 3 images of mfnet can be read"):
+        collect(MFNet(str(root)), "train", skipping)
+
+
+def test_a_missing_label_is_one_sentence() -> None:
+    sample = random_sample("1D", (24, 32), np.random.default_rng(0))
+    with pytest.raises(InputError, match="'1D' has no label"):
+        collect(InMemory([replace(sample, label=None)]), "train", SETTINGS)
+
+
+@pytest.mark.parametrize("night", [True, False])
+def test_file_round_trip(tmp_path: Path, night: bool) -> None:
+    dataset = memory(["1D", "2N", "3D"] if night else ["a", "b"])
+    stats = collect(dataset, "train", SETTINGS)
+    stats.save(tmp_path / "statistics.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["statistics.npz"]
+    assert_same(SpatialStatistics.load(tmp_path / "statistics.npz"), stats)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "statistics.npz"
+    with pytest.raises(InputError, match="there is no file of statistics"):
+        SpatialStatistics.load(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="is not a readable file of statistics"):
+        SpatialStatistics.load(path)
+    np.savez(path, format=np.array("rgbt counts 1"))
+    with pytest.raises(InputError, match=r"expected the mark 'rgbt spatial statistics 1'"):
+        SpatialStatistics.load(path)
+
+
+def test_sizes_that_disagree_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"labels: expected shape \(40, 3, 4\)"):
+        replace(made(), labels=np.zeros((40, 2, 4), np.int64))
+    with pytest.raises(ValueError, match=r"noise\['std'\]"):
+        replace(made(), noise={"std": np.zeros((40, 2, 2))})

@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.spatial import entry
+from analysis.statistics import derive
+from analysis.statistics.claims import claims
+from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.judging import OPEN
+from tests.commands import Call
+
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
+REAL = SHARED / "realdata" / "mfnet200"
+
+
+def test_command_prints_tables_and_writes_files(call: Call, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "statistics"
+    arguments = ("dataset=mfnet", f"dataset.root={data}", "regions=4", "resamples=100")
+    code, printed, said = call(entry, *arguments, f"out={out}")
+    assert code == 0, said
+    assert "measuring" in said
+    assert "mfnet, split train: 8 images (4 at night) of 48x64, ring4, 0.00 %" in printed
+    for title in (
+        *("sample occupancy rate, % (Eq. 2)", "by class, % of its largest region (Fig. 3)"),
+        *("Laplacian variance (four neighbours, Eq. 3)", "signal to noise (Eq. 4; immerkaer"),
+        *("noise, grey levels (immerkaer", "label entropy, bits (Eq. 5)"),
+        *("claims of SpatialSeg, Sec. III", "how it depends on the estimator of the noise"),
+    ):
+        assert title in printed
+    # One image per part and block would be needed five times.
+    assert OPEN in printed
+    assert "signal to noise is lower in the centre (rgb and thermal, day and night), immerkaer" in (
+        printed
+    )
+    assert "immerkaer, images" in printed.split("how it depends")[1]
+    assert str(out / "statistics.npz") in printed
+    stats = SpatialStatistics.load(out / "statistics.npz")
+    with (out / "regions.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    found = {
+        (row["part"], row["quantity"], row["modality"], row["estimator"], row["average"]): row
+        for row in rows
+        if row["region"] == "4" and not row["class"]
+    }
+    snr = found["night", "snr", "thermal", "wavelet_mad", "images"]
+    expected = derive.region_snr(stats, "thermal", "night", "wavelet_mad", "images")[3]
+    assert float(snr["value"]) == pytest.approx(expected, rel=1e-6)
+    assert snr["images"] == "4"
+    occupancy = found["all", "occupancy", "", "", ""]
+    assert float(occupancy["value"]) == pytest.approx(derive.region_occupancy(stats)[3], rel=1e-6)
+    assert "**signal to noise (Eq. 4; std, images)**" in (out / "statistics.md").read_text()
+
+
+def test_many_regions_become_rows(call: Call, data: Path, tmp_path: Path) -> None:
+    arguments = ("dataset=mfnet", f"dataset.root={data}", "partition=vertical", "regions=20")
+    code, printed, _ = call(entry, *arguments, "split=val", f"out={tmp_path / 'out'}")
+    assert code == 0
+    assert any(line.split()[:1] == ["R20"] for line in printed.splitlines())
+    assert "in the centre" not in printed
+
+
+def test_the_chosen_estimator_is_shown(call: Call, data: Path, tmp_path: Path) -> None:
+    arguments = ("dataset=mfnet", f"dataset.root={data}", f"out={tmp_path / 'out'}", "regions=2")
+    code, printed, _ = call(entry, *arguments, "estimator=std", "average=images", "kernel=eight")
+    assert code == 0
+    assert "signal to noise (Eq. 4; std, images)" in printed
+    assert "Laplacian variance (eight neighbours" in printed
+    assert ", immerkaer, pooled (III" not in printed
+
+
+def test_unreadable_files_can_be_left_out(call: Call, data: Path, tmp_path: Path) -> None:
+    (data / "images" / "00001N.png").write_bytes(b"")
+    arguments = ("dataset=mfnet", f"dataset.root={data}", f"out={tmp_path / 'out'}", "regions=2")
+    code, _, said = call(entry, *arguments)
+    assert code == 2
+    assert "00001N.png cannot be decoded" in said
+    code, printed, said = call(entry, *arguments, "data.on_error=skip")
+    assert code == 0
+    assert "rgbt: left out: " in said
+    assert "7 images (3 at night)" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["partition=rings"], "partition: 'rings' is not a choice; did you mean 'ring'?"),
+        (["regions=0"], "regions must lie in [1, 255], got 0."),
+        (["regions=nine"], "regions must be a whole number, got 'nine'."),
+        (["level=high"], "level must be a number, got 'high'."),
+        (["level=95"], "level must lie in [0.5, 0.999], got 95."),
+        (["blocks=0"], "blocks must lie in [1, 1e+06], got 0."),
+        (["workers=-1"], "workers must lie in [0, 1024], got -1."),
+        (["estimator=wavelet"], "did you mean 'wavelet_mad'?"),
+        (["metric=ring9"], "'metric' means nothing here;"),
+        (["partition=vertical", "aspect=released_3_4"], "aspect=released_3_4 is one of rings"),
+        (["split=trian"], "dataset.splits has no split 'trian'; did you mean 'train'?"),
+        (["data.on_error=ignore"], "'data.on_error': input should be 'raise' or 'skip', got"),
+        (["dataset.rot=x"], "'dataset.rot' is not a key of the configuration"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    call: Call, data: Path, tmp_path: Path, arguments: list[str], sentence: str
+) -> None:
+    out = tmp_path / "out"
+    given = ("dataset=mfnet", f"dataset.root={data}", f"out={out}")
+    code, printed, said = call(entry, *given, *arguments)
+    assert code == 2
+    assert sentence in said
+    assert said.count("\n") == 1
+    assert printed == ""
+    assert not out.exists()
+
+
+def test_help_is_quick() -> None:
+    program = (
+        "import sys; sys.argv = ['spatial', '--help']; import analysis.spatial as s\n"
+        "try: s.entry()\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'torch', 'cv2', 'matplotlib', 'mlflow', 'pandas'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip().endswith("[]")
+    assert "partition, regions  ring, vertical or horizontal" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real pairs")
+def test_real_pairs(call: Call, tmp_path: Path) -> None:
+    """What is beyond doubt on 100 real pairs, against a plain computation of it."""
+    out = tmp_path / "out"
+    arguments = ("dataset=mfnet", f"dataset.root={REAL}", f"out={out}")
+    code, _, said = call(entry, *arguments)
+    assert code == 0, said
+    stats = SpatialStatistics.load(out / "statistics.npz")
+    assert len(stats.names) == 100
+    assert int(stats.night.sum()) == 50
+    verdicts = {claim.key: claim.verdict for claim in claims(stats) if not claim.estimator}
+    assert verdicts["laplacian/modality"] == "holds"
+    assert verdicts["laplacian/day_rgb"] == "holds"
+    map_ = derive.occupancy_map(stats)
+    np.testing.assert_allclose(
+        derive.region_occupancy(stats), [map_[stats.region_map == r].mean() for r in range(9)]
+    )
