@@ -91,6 +91,7 @@ class CellEntry:
         runs: keys of the runs.
         rank: 1 best, 2 second best of the column among ours, else 0.
         published_rank: the same among the printed values.
+        values: of each run, in the order of `runs`; empty: not known. Shown beside the run.
     """
 
     mean: float | None = None
@@ -105,6 +106,7 @@ class CellEntry:
     runs: tuple[str, ...] = ()
     rank: int = 0
     published_rank: int = 0
+    values: tuple[float | None, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,94 @@
+"""The report: ``python -m analysis.report out=report/`` makes one page from the MLflow store.
+
+Progress goes to stderr; where the page is, how large it is and what it holds to stdout.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rgbt.checks import InputError, check_range
+from rgbt.command import composing, plain_command, readable_paths
+
+OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000"}
+
+FEWEST, MOST = 100, 1_000_000
+"""Resamples."""
+
+TOLD = 5
+"""Remarks told on stderr; the page has all."""
+
+
+def main(arguments: dict[str, str], overrides: list[str]) -> int:
+    """Make one page of everything in an MLflow store; it needs no server and no network.
+
+    out        folder; the page is index.html in it
+    runs_dir   folder of runs; its mlflow.db is the store unless tracking.uri says another
+    resamples  of the images, for intervals and p-values
+    overrides of the tracker, such as tracking.uri=http://host:5000 or tracking.experiment=mine
+
+    Every score is computed from the counts of its run. What cannot be read is told here and listed
+    on the page.
+    """
+    resamples = _number(arguments["resamples"])
+    out, runs_dir = (Path(arguments[key]).expanduser() for key in ("out", "runs_dir"))
+    if out.is_file():
+        raise InputError(f"out={out} is a file; give a folder for the page.")
+    tracking = _tracking(runs_dir, overrides)
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from analysis.report.collect import Asked, collect
+    from analysis.report.page import write_page
+    from rgbt.tracking.terminal import place_lines, show, tell
+
+    typed = shlex.join(["python", "-m", "analysis.report", *sys.argv[1:]])
+    with Progress(console=Console(stderr=True)) as progress:
+
+        def track(items: Sequence[Any], what: str) -> Any:
+            return progress.track(items, description=what)
+
+        data = collect(Asked(tracking, runs_dir, resamples, typed), track)
+    out.mkdir(parents=True, exist_ok=True)
+    page = write_page(data, out)
+    for remark in data.remarks[:TOLD]:
+        tell(remark)
+    if len(data.remarks) > TOLD:
+        tell(f"{len(data.remarks) - TOLD} more remarks stand on the page.")
+    run = [table for table in data.tables if table.scale]
+    held = (
+        f"{len(data.runs)} runs, {len(run)} tables with runs, {len(data.tables) - len(run)} "
+        f"published alone, {len(data.studies)} studies"
+    )
+    size = f"{page.stat().st_size / 1e6:.2f} MB"
+    show(place_lines([("page", str(page)), ("size", size), ("holds", held)]))
+    return 0
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal():
+        raise InputError(f"resamples={text}: expected a whole number.")
+    check_range("resamples", int(text), FEWEST, MOST)
+    return int(text)
+
+
+def _tracking(runs_dir: Path, overrides: Sequence[str]) -> Any:
+    """The tracker as the configuration has it."""
+    from rgbt.config import build, check_node, compose
+
+    # Read by hydra; the tracker resolves it like that of a run.
+    every = [*readable_paths([f"runs_dir={os.fspath(runs_dir)}"]), *overrides]
+    with composing(every):
+        config = compose(every)
+    check_node(config.tracking, "tracking")
+    return build(config.tracking)
+
+
+if __name__ == "__main__":
+    plain_command(OWN, main)()

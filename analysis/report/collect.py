@@ -1,0 +1,103 @@
+"""The page's data, read once from the store: runs, tables, studies, masks, differences."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from analysis.report.data import ReportData
+from analysis.report.differences import difference_entries
+from analysis.report.masks import mask_pictures
+from analysis.report.runs import Run, open_run
+from analysis.report.store import StoredRun, read_store
+from analysis.report.studies import study_entries
+from analysis.report.tables import table_entries
+from analysis.report.tables_intervals import Track
+from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.provenance import without_passwords
+
+TITLE = "RGB-thermal segmentation: runs and tables"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the page is made from.
+
+    Attributes:
+        tracking: as the configuration builds it.
+        runs_dir: folder of runs; their files are read there where it has them.
+        resamples: of the images, for intervals and p-values.
+        command: that makes the page again.
+    """
+
+    tracking: Tracking
+    runs_dir: Path
+    resamples: int
+    command: str
+
+
+def collect(asked: Asked, track: Track) -> ReportData:
+    """Read the store; what cannot be read becomes a remark.
+
+    Args:
+        asked: which store, and how.
+        track: shows how far it is.
+
+    Raises:
+        InputError: there is no store, or no such experiment.
+        RunError: the store cannot be reached.
+    """
+    remarks: list[str] = []
+    # Files of a server's store are copied there, and gone with it: counts are read by then.
+    with tempfile.TemporaryDirectory(prefix="rgbt_report_") as copies:
+        stored = [
+            each
+            for tracking in track([asked.tracking], "store")
+            for each in read_store(tracking, asked.runs_dir, Path(copies))
+        ]
+        runs = _open_all(stored, track, remarks)
+        by_key = {run.entry.key: run for run in runs}
+        records = {kind: [r for r in stored if r.kind == kind] for kind in ("table", "study")}
+        tables = table_entries(records["table"], by_key, asked.resamples, track, remarks)
+        studies = study_entries(records["study"], remarks)
+        masks = mask_pictures(runs, track, remarks)
+        differences = difference_entries(runs, asked.resamples, track)
+    if not runs:
+        remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")
+    return ReportData(
+        title=TITLE,
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        store=_address(asked.tracking),
+        command=without_passwords(asked.command),
+        runs=tuple(run.entry for run in runs),
+        tables=tables,
+        studies=studies,
+        masks=masks,
+        differences=differences,
+        remarks=tuple(remarks),
+    )
+
+
+def _open_all(stored: Sequence[StoredRun], track: Track, remarks: list[str]) -> list[Run]:
+    """The runs, newest first; one that the store has twice is taken once."""
+    runs: dict[str, Run] = {}
+    for each in track([one for one in stored if one.kind == "run"], "runs"):
+        key = each.tags.get("rgbt.key", each.run_id)
+        known = runs.get(key)
+        # Of two the newer one is opened first; a finished one is worth more.
+        if known is not None:
+            remarks.append(
+                f"Run {key} is in the store twice ({known.entry.run_id[:8]}, {each.run_id[:8]}); "
+                "one of them is shown, finished before unfinished, newer before older."
+            )
+        if known is None or (each.status == "FINISHED" and known.entry.status != "FINISHED"):
+            runs[key] = open_run(each, remarks)
+    return list(runs.values())
+
+
+def _address(tracking: Tracking) -> str:
+    assert isinstance(tracking, MlflowTracking), "read_store refuses others"
+    return without_passwords(tracking.uri)

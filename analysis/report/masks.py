@@ -1,0 +1,193 @@
+"""Examples of the masks that the runs were trained with, small enough to lie inside the page."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.report.data import Picture
+from analysis.report.runs import Run
+from analysis.report.tables_intervals import Track
+from rgbt.checks import InputError
+
+MOST = 8
+"""Pictures on the page."""
+
+DRAWS = 3
+"""Masks of one masker, side by side."""
+
+WIDTH = 640
+"""Pixels of a picture."""
+
+MOST_BYTES = 30_000
+"""Of an encoded picture: in base64 it becomes a third longer, 40 kB."""
+
+QUALITIES = (80, 60, 40, 20, 5)
+GAP = 4
+SETTINGS = ("sampler", "patch_size", "ratio", "sigma_div", "anchor", "pairing")
+
+
+@dataclass(frozen=True)
+class Masked:
+    """A masker in use.
+
+    Attributes:
+        masker: its node of the configuration.
+        dataset: the node of the data set that its first run saw.
+        groups: methods that were trained with it.
+        runs: their number.
+    """
+
+    masker: Mapping[str, Any]
+    dataset: Mapping[str, Any]
+    groups: tuple[str, ...]
+    runs: int
+
+
+def mask_pictures(runs: Iterable[Run], track: Track, remarks: list[str]) -> tuple[Picture, ...]:
+    """One picture per masker that hides anything, those of the most runs first.
+
+    Args:
+        runs: of the store.
+        track: shows how far it is.
+        remarks: gets a sentence for each that cannot be drawn, and for those beyond `MOST`.
+    """
+    maskers = maskers_in_use(runs)
+    if len(maskers) > MOST:
+        remarks.append(f"Masks of {MOST} maskers are shown; {len(maskers) - MOST} more were used.")
+    pictures = []
+    for masked in track(maskers[:MOST], "masks"):
+        try:
+            pictures.append(picture(masked))
+        except (InputError, OSError) as error:
+            remarks.append(f"Masks of '{masked.groups[0]}' cannot be drawn: {error}")
+    return tuple(pictures)
+
+
+def maskers_in_use(runs: Iterable[Run]) -> list[Masked]:
+    """Distinct maskers, those of the most runs first."""
+    found: dict[str, list[tuple[Run, Mapping[str, Any], Mapping[str, Any]]]] = {}
+    for run in runs:
+        masker, dataset = (_node(run.config, name) for name in ("masker", "dataset"))
+        if masker and dataset and masker.get("sampler") != "none":
+            found.setdefault(json.dumps(masker, sort_keys=True), []).append((run, masker, dataset))
+    maskers = [
+        Masked(
+            masker=users[0][1],
+            dataset=users[0][2],
+            groups=tuple(dict.fromkeys(run.entry.group for run, _, _ in users)),
+            runs=len(users),
+        )
+        for users in found.values()
+    ]
+    return sorted(maskers, key=lambda masked: (-masked.runs, masked.groups))
+
+
+def _node(config: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The settings below `name`, which have no nodes inside."""
+    return {
+        key.removeprefix(f"{name}."): v for key, v in config.items() if key.startswith(f"{name}.")
+    }
+
+
+def picture(masked: Masked) -> Picture:
+    """Draws of one masker: RGB above, thermal below, hidden pixels coloured.
+
+    Raises:
+        InputError: the masker cannot be built or does not fit the images.
+    """
+    from analysis.figures.masks import mask_examples, whole_cells
+
+    masker = _built("masker", masked.masker)
+    sample, source = _sample(masked.dataset)
+    draws = {str(index): masker for index in range(DRAWS)}
+    multiple = whole_cells([int(masked.masker["patch_size"])])
+    examples = mask_examples(sample, draws, multiple, seed=0)
+    columns = [np.vstack([each.rgb, each.thermal]) for each in examples]
+    image = _beside(columns)
+    hidden = [
+        np.mean([getattr(each, name).mean() for each in examples])
+        for name in ("rgb_hidden", "thermal_hidden")
+    ]
+    chosen = ", ".join(
+        f"{name} {masked.masker[name]}" for name in SETTINGS if masked.masker.get(name) is not None
+    )
+    return Picture(
+        title=masked.groups[0],
+        caption=(
+            f"{chosen}; {masked.runs} run{'s' * (masked.runs > 1)}. {DRAWS} draws on {source}, RGB "
+            f"above and thermal below; here {hidden[0]:.0%} of RGB and {hidden[1]:.0%} of thermal "
+            "are hidden."
+        ),
+        address=data_address(image),
+        width=image.shape[1],
+        height=image.shape[0],
+    )
+
+
+def _sample(node: Mapping[str, Any]) -> tuple[Any, str]:
+    """A pair of the data set, or of the embedded one where its files are not here."""
+    from rgbt.config import compose
+
+    try:
+        dataset, where = _built("dataset", node), ""
+        name = dataset.names("val")[0]
+        sample = dataset.read(name)
+    except (InputError, OSError):
+        dataset, where = _built("dataset", _plain(compose([]).dataset)), " of the embedded data set"
+        name = dataset.names("val")[0]
+        sample = dataset.read(name)
+    return sample, f"'{name}'{where}"
+
+
+def _built(name: str, values: Mapping[str, Any]) -> Any:
+    from omegaconf import OmegaConf
+
+    from rgbt.config import build, check_node
+
+    node = OmegaConf.create({name: dict(values)})[name]
+    check_node(node, name)
+    return build(node)
+
+
+def _plain(node: Any) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+
+    plain = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(plain, dict), "a node is a mapping"
+    return {str(key): value for key, value in plain.items()}
+
+
+def _beside(columns: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Columns with a white gap between them, together at most `WIDTH` pixels wide."""
+    import cv2
+
+    height, width = columns[0].shape[:2]
+    target = min(width, (WIDTH - GAP * (len(columns) - 1)) // len(columns))
+    size = (target, round(height * target / width))
+    small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in columns]
+    gap = np.full((size[1], GAP, 3), 255, np.uint8)
+    parts = [part for each in small for part in (each, gap)][:-1]
+    return np.hstack(parts).astype(np.uint8)
+
+
+def data_address(rgb: NDArray[np.uint8]) -> str:
+    """An image (H, W, 3) uint8 as a WebP inside an address of at most 40 kB.
+
+    What does not fit at any quality is halved.
+    """
+    import cv2
+
+    for quality in QUALITIES:
+        done, encoded = cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+        assert done, "OpenCV comes with WebP"
+        if encoded.size <= MOST_BYTES:
+            return "data:image/webp;base64," + base64.b64encode(encoded.tobytes()).decode()
+    half = (max(1, rgb.shape[1] // 2), max(1, rgb.shape[0] // 2))
+    return data_address(cv2.resize(rgb, half, interpolation=cv2.INTER_AREA).astype(np.uint8))

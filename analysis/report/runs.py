@@ -1,0 +1,214 @@
+"""Runs of the store with their scores, recomputed from counts, and their provenance."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+
+from analysis.report.data import RunEntry
+from analysis.report.runs_provenance import (
+    COMMIT_LENGTH,
+    COMMIT_TAG,
+    as_text,
+    commit_of,
+    host_of,
+    read_provenance,
+    repeat_command,
+)
+from analysis.report.store import Files, StoredRun
+from rgbt.checks import InputError
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.scores import iou, miou, summary
+from rgbt.tracking.provenance import without_passwords
+from sweeps.table.cell_points import DEFAULT_SCALE, TAG
+
+SPLIT = "test"
+STUDY_TAG = "rgbt.study/"
+
+ROUNDING = 0.0051
+"""MLflow has two decimals: a larger difference is another number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run, opened.
+
+    Attributes:
+        entry: what the page shows.
+        counts: of the test split; None where there are none.
+        absent: how the run scores a class without pixels.
+        config: dotted key -> value; empty where the store has no configuration.
+        files: its files.
+    """
+
+    entry: RunEntry
+    counts: Counts | None
+    absent: Absent
+    config: Mapping[str, Any]
+    files: Files
+    _evaluations: dict[str, Counts] = field(default_factory=dict)
+
+    def counts_of(self, path: str) -> Counts:
+        """Counts of another evaluation, by the path of their file in the run.
+
+        Raises:
+            InputError: there is no such file, or it is damaged.
+        """
+        if path not in self._evaluations:
+            found = self.files.find(path)
+            if found is None:
+                raise InputError(f"run {self.entry.key} has no {path}.")
+            self._evaluations[path] = _load(found, self.entry.key)
+        return self._evaluations[path]
+
+
+def open_run(stored: StoredRun, remarks: list[str]) -> Run:
+    """Read one run.
+
+    Args:
+        stored: of the kind "run".
+        remarks: gets a sentence for everything that is missing or does not agree.
+    """
+    key = stored.tags.get("rgbt.key", stored.run_id)
+    config = _config(stored, remarks)
+    absent = cast("Absent", config.get("metric.absent", "released"))
+    counts = _counts(stored, key, remarks)
+    scores = {} if counts is None else percent_scores(counts, absent)
+    remarks += _disagreements(key, stored.metrics, scores)
+    processes = read_provenance(stored.files, key, remarks)
+    first = processes[0] if processes else {}
+    command = without_passwords(str(first.get("command") or stored.tags.get("rgbt.command", "")))
+    entry = RunEntry(
+        key=key,
+        name=stored.name,
+        run_id=stored.run_id,
+        status=stored.status,
+        experiment=stored.tags.get("rgbt.experiment", ""),
+        scale=_scale(stored.tags.get("rgbt.group", "")),
+        seed=_seed(stored.tags.get("rgbt.seed", "")),
+        group=stored.tags.get("rgbt.group", ""),
+        studies=tuple(_after(stored.tags, STUDY_TAG)),
+        table_rows=_after(stored.tags, TAG),
+        split=SPLIT if counts is None else counts.split,
+        partition="" if counts is None else counts.partition,
+        classes=() if counts is None else counts.classes,
+        scores=scores,
+        region_ious=() if counts is None else _percents(miou(counts.by_region(), absent)),
+        class_region_ious=() if counts is None else _by_class(counts, absent),
+        images=0 if counts is None else len(counts.names),
+        commit=commit_of(first) or stored.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
+        started=stored.started,
+        seconds=stored.seconds,
+        command=command,
+        repeat=repeat_command(command, config, stored.tags),
+        host=host_of(first),
+        dataset=stored.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
+        config={name: as_text(value) for name, value in config.items()} or dict(stored.params),
+    )
+    return Run(entry=entry, counts=counts, absent=absent, config=config, files=stored.files)
+
+
+def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:
+    """`rgbt.metrics.scores.summary` in percent; variances stay in squared percent points."""
+    scores = summary(counts, absent)
+    return {n: v if n.split("/")[-1] == names.VAR else 100.0 * v for n, v in scores.items()}
+
+
+def _config(stored: StoredRun, remarks: list[str]) -> dict[str, Any]:
+    import yaml
+
+    try:
+        text = stored.files.text("config.yaml")
+        if text is None:
+            raise InputError("there is none")
+        # Resolved when it was written: plain YAML, which its C reader takes in a twentieth of the
+        # time that OmegaConf needs.
+        plain = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        if not isinstance(plain, dict):
+            raise InputError("it is no mapping")
+    except (InputError, yaml.YAMLError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        remarks.append(
+            f"Run '{stored.name}': config.yaml cannot be read ({said}); its parameters are shown."
+        )
+        return {}
+    return dict(_leaves(plain, ""))
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Values by dotted key, lists as they are."""
+    if not isinstance(value, dict):
+        yield path, value
+        return
+    for key, child in value.items():
+        yield from _leaves(child, f"{path}.{key}" if path else str(key))
+
+
+def _counts(stored: StoredRun, key: str, remarks: list[str]) -> Counts | None:
+    path = f"counts_{SPLIT}.npz"
+    try:
+        found = stored.files.find(path)
+        if found is not None:
+            return _load(found, key)
+    except InputError as error:
+        remarks.append(f"Run '{stored.name}' has no scores: {error}")
+        return None
+    if stored.status == "FINISHED":
+        remarks.append(f"Run '{stored.name}' has no scores: its {path} is not in the store.")
+    return None
+
+
+def _load(path: Any, key: str) -> Counts:
+    try:
+        return Counts.load(path)
+    except (ValueError, KeyError) as error:
+        said = str(error).rstrip(".")
+        raise InputError(f"the counts of run {key} cannot be used: {said}.") from error
+
+
+def _disagreements(
+    key: str, told: Mapping[str, float], scores: Mapping[str, float]
+) -> Iterator[str]:
+    """A sentence where MLflow shows other scores than the counts give."""
+    apart = {
+        name: abs(told[name] - score)
+        for name, score in scores.items()
+        if name in told and not math.isnan(score) and abs(told[name] - score) > ROUNDING
+    }
+    if apart:
+        worst = max(apart, key=lambda name: apart[name])
+        yield (
+            f"Run {key}: {len(apart)} scores of its counts are not those in MLflow, such as "
+            f"{worst}: {scores[worst]:.2f}, there {told[worst]:.2f}; the page shows the counts'."
+        )
+
+
+def _scale(group: str) -> str:
+    named = re.findall(r"(?:^|\s)scale=(\w+)", group)
+    return named[-1] if named else DEFAULT_SCALE
+
+
+def _seed(text: str) -> int | None:
+    return int(text) if text.isdecimal() else None
+
+
+def _after(tags: Mapping[str, str], beginning: str) -> dict[str, str]:
+    """Tags that begin so, by what follows."""
+    found = {n.removeprefix(beginning): v for n, v in tags.items() if n.startswith(beginning)}
+    return dict(sorted(found.items()))
+
+
+def _by_class(counts: Counts, absent: Absent) -> tuple[tuple[float, ...], ...]:
+    """K rows of R percents."""
+    return tuple(_percents(row) for row in iou(counts.by_region(), absent).T)
+
+
+def _percents(fractions: Any) -> tuple[float, ...]:
+    return tuple(float(value) for value in 100.0 * np.asarray(fractions))

@@ -1,0 +1,106 @@
+"""How a run was made and how it is made again, from what the run noted when it began."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from analysis.report.store import Files
+from rgbt.checks import InputError
+from rgbt.tracking.provenance import without_passwords
+
+COMMIT_LENGTH = 10
+COMMIT_TAG = "mlflow.source.git.commit"
+
+NOT_REPEATED = re.compile(r"-m|--multirun|runs_dir=|out=|\+*(tracking|hydra)[./=]")
+"""Words of a command that belong to a machine, or to a grid that the run was a point of."""
+
+IS_GRID = re.compile(r"(range|choice|interval|glob)\(")
+
+
+def repeat_command(command: str, config: Mapping[str, Any], tags: Mapping[str, str]) -> str:
+    """The command that makes a run again, on any machine.
+
+    Args:
+        command: as typed; of a grid, the command of the whole grid.
+        config: of the run, by dotted key: says which point of a grid it was.
+        tags: of the run; the group holds what was chosen of other keys.
+
+    Returns:
+        ``python -m rgbt.run`` with the run's own overrides; "" where `command` is another one.
+    """
+    try:
+        words = shlex.split(command)
+    except ValueError:  # cut short by MLflow's limit on a tag
+        return ""
+    if "rgbt.run" not in words:
+        return ""
+    own = [w for w in words[words.index("rgbt.run") + 1 :] if not NOT_REPEATED.match(w)]
+    chosen = dict(word.split("=", 1) for word in tags.get("rgbt.group", "").split() if "=" in word)
+    chosen["experiment"] = tags.get("rgbt.experiment", "")
+    return shlex.join(["python", "-m", "rgbt.run", *(_point(w, config, chosen) for w in own)])
+
+
+def _point(word: str, config: Mapping[str, Any], chosen: Mapping[str, str]) -> str:
+    """An override with the one value that this run had of several."""
+    key, _, value = word.partition("=")
+    if not _is_several(value):
+        return word
+    name = key.lstrip("+~")
+    if name in config:
+        return f"{key}={as_text(config[name])}"
+    found = chosen.get(name) or chosen.get(name.rpartition(".")[2])
+    return f"{key}={found}" if found else word
+
+
+def _is_several(value: str) -> bool:
+    """Whether an override's value is a grid: commas outside of brackets and quotes, a range."""
+    outside = re.sub(r"'[^']*'|\"[^\"]*\"|\[[^\]]*\]|\{[^}]*\}", "", value)
+    return "," in outside or IS_GRID.match(value) is not None
+
+
+def as_text(value: Any) -> str:
+    """A value of the configuration as one types it: ``null``, ``true``, ``[1, 2]``, ``grid``."""
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    return without_passwords(text)
+
+
+def read_provenance(files: Files, key: str, remarks: list[str]) -> list[dict[str, Any]]:
+    """What every process that worked on a run noted, first one first; [] where nothing is known.
+
+    Args:
+        files: of the run.
+        key: of the run.
+        remarks: gets a sentence where the file is damaged, or where the code changed on the way.
+    """
+    try:
+        text = files.text("provenance.json")
+        processes = [] if text is None else json.loads(text)
+        if not isinstance(processes, list):
+            raise InputError("it is no list")
+    except (InputError, json.JSONDecodeError) as error:
+        remarks.append(f"Run {key}: provenance.json cannot be read ({error}).")
+        return []
+    commits = dict.fromkeys(commit_of(process) for process in processes)
+    if len(commits) > 1:
+        told = ", then ".join(commit or "no commit" for commit in commits)
+        remarks.append(f"Run {key} was begun and continued by different code: {told}.")
+    return [dict(process) for process in processes]
+
+
+def commit_of(process: Mapping[str, Any]) -> str:
+    """Git commit of a process, "+" after it for uncommitted changes; "" where there is none."""
+    commit = process.get("git_commit")
+    return f"{commit[:COMMIT_LENGTH]}{'+' if process.get('git_dirty') else ''}" if commit else ""
+
+
+def host_of(process: Mapping[str, Any]) -> str:
+    """Name and devices of the machine: "vm: AMD EPYC, 2 cores"."""
+    if not process.get("host"):
+        return ""
+    gpus = process.get("gpus") or []
+    cpu = f"{process.get('cpu', '')}, {process.get('cpu_usable')} cores"
+    return f"{process['host']}: {', '.join(gpus) or cpu}"

@@ -1,0 +1,277 @@
+"""What an MLflow store holds: runs, tables and studies with their files. Nothing is written."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+from rgbt.checks import InputError, RunError, nearest
+from rgbt.tracking.mlflow_client import ENVIRONMENT
+from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.provenance import without_passwords
+
+PAGE = 500
+"""Runs asked for at a time."""
+
+SQLITE = "sqlite:///"
+REASON_LENGTH = 160
+
+
+@dataclass
+class Files:
+    """Files of one MLflow run: in folders that can be read from here, else fetched from the store.
+
+    Attributes:
+        folders: looked through in this order.
+        fetch: gets a file by its path; None where the folders are all there is. Raises whatever
+            the store raises.
+    """
+
+    folders: Sequence[Path]
+    fetch: Callable[[str], Path | None] | None = None
+    _fetched: dict[str, Path | None] = field(default_factory=dict)
+
+    def find(self, path: str) -> Path | None:
+        """Where the file called `path` can be read; None: there is none.
+
+        Raises:
+            InputError: the store has it and does not give it.
+        """
+        for folder in self.folders:
+            if (folder / path).is_file():
+                return folder / path
+        if self.fetch is None:
+            return None
+        if path not in self._fetched:
+            self._fetched[path] = _guarded(lambda: self._ask(path), f"'{path}' cannot be fetched")
+        return self._fetched[path]
+
+    def text(self, path: str) -> str | None:
+        """The file as text; None: there is none.
+
+        Raises:
+            InputError: it cannot be fetched, or is no text.
+        """
+        found = self.find(path)
+        if found is None:
+            return None
+        try:
+            return found.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{found} cannot be read ({error}).") from error
+
+    def _ask(self, path: str) -> Path | None:
+        assert self.fetch is not None, "find() looks for it first"
+        return self.fetch(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredRun:
+    """One run of MLflow: a training, or the record of a table or study.
+
+    Attributes:
+        run_id: of MLflow.
+        name: as shown.
+        status: "FINISHED", "RUNNING", "FAILED", "KILLED" or "SCHEDULED".
+        started: ISO 8601, UTC; "" where unknown.
+        seconds: from start to end, or None.
+        tags: by name.
+        params: by name, as text.
+        metrics: last value by name, as MLflow has it.
+        files: its files.
+    """
+
+    run_id: str
+    name: str
+    status: str
+    started: str
+    seconds: float | None
+    tags: Mapping[str, str]
+    params: Mapping[str, str]
+    metrics: Mapping[str, float]
+    files: Files
+
+    @property
+    def kind(self) -> str:
+        """What it is: "run", "table" or "study"."""
+        return self.tags.get("kind", "run")
+
+
+def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[StoredRun]:
+    """Everything in the experiment of a store, newest first.
+
+    Args:
+        tracking: as the configuration builds it.
+        runs_dir: folder of runs; files are taken from there where it has them.
+        copies: folder for files that must be fetched.
+
+    Raises:
+        InputError: no MLflow is configured; no such file or experiment.
+        RunError: the store cannot be reached.
+    """
+    if not isinstance(tracking, MlflowTracking):
+        raise InputError(
+            "the report is made from an MLflow store; give one with tracking=mlflow "
+            "tracking.uri=... or runs_dir=..."
+        )
+    uri = tracking.uri
+    _check_exists(uri)
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    from mlflow import MlflowClient
+
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    shown = without_passwords(uri)
+    try:
+        client = MlflowClient(tracking_uri=uri)
+        experiment = client.get_experiment_by_name(tracking.experiment)
+        if experiment is None:
+            known = [each.name for each in client.search_experiments()]
+            raise InputError(
+                f"tracking.experiment={tracking.experiment}: the store {shown} has no such "
+                f"experiment; {nearest(tracking.experiment, known)}."
+            )
+        runs = list(_all_runs(client, experiment.experiment_id))
+    except InputError:
+        raise
+    except Exception as error:  # The border to a store that may fail in any way.
+        raise RunError(
+            f"MLflow at {shown} cannot be read ({_reason(error)}); start its server, or name "
+            "another store with tracking.uri=..."
+        ) from error
+    places = _Places(client, runs_dir, copies, _beside(uri))
+    return [_stored(run, places) for run in runs]
+
+
+def _check_exists(uri: str) -> None:
+    """Refuse a database that is not there: opening it would make an empty one."""
+    path = Path(uri.removeprefix(SQLITE))
+    if uri.startswith(SQLITE) and not path.is_file():
+        raise InputError(
+            f"there is no MLflow store {path}; give the folder of runs with runs_dir=..., or the "
+            "store with tracking.uri=..."
+        )
+
+
+def _beside(uri: str) -> Path | None:
+    """Where a database that was moved with its files has them now."""
+    return Path(uri.removeprefix(SQLITE)).parent / "mlartifacts" if uri.startswith(SQLITE) else None
+
+
+def _all_runs(client: Any, experiment_id: str) -> Iterator[Any]:
+    token = None
+    while True:
+        page = client.search_runs(
+            [experiment_id],
+            max_results=PAGE,
+            order_by=["attributes.start_time DESC", "attributes.run_id ASC"],
+            page_token=token,
+        )
+        yield from page
+        token = page.token
+        if not token:
+            return
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where files of runs may lie.
+
+    Attributes:
+        client: of MLflow.
+        runs_dir: the folder of runs.
+        copies: folder for fetched files.
+        beside: folder of artifacts beside a database, or None.
+    """
+
+    client: Any
+    runs_dir: Path
+    copies: Path
+    beside: Path | None
+
+    def files(self, run: Any) -> Files:
+        """The files of an MLflow run."""
+        run_id, tags = run.info.run_id, run.data.tags
+        folders = [
+            folder for folder in self._run_folders(tags) if _is_same(folder, tags, run.info.status)
+        ]
+        if self.beside is not None:
+            folders.append(self.beside / run_id / "artifacts")
+        address = urlparse(run.info.artifact_uri or "")
+        if address.scheme in ("", "file"):
+            return Files((*folders, Path(unquote(address.path))))
+        return Files(folders, lambda path: self._fetch(run_id, path))
+
+    def _run_folders(self, tags: Mapping[str, str]) -> Iterator[Path]:
+        if "rgbt.key" in tags:
+            yield self.runs_dir / tags["rgbt.key"]
+        if "rgbt.folder" in tags:
+            yield Path(tags["rgbt.folder"])
+
+    def _fetch(self, run_id: str, path: str) -> Path | None:
+        parent = str(PurePosixPath(path).parent)
+        listed = self.client.list_artifacts(run_id, None if parent == "." else parent)
+        if path not in {item.path for item in listed}:
+            return None
+        folder = self.copies / run_id
+        folder.mkdir(parents=True, exist_ok=True)
+        return Path(self.client.download_artifacts(run_id, path, str(folder)))
+
+
+def _is_same(folder: Path, tags: Mapping[str, str], status: str) -> bool:
+    """Whether a run folder holds what MLflow tells: the same configuration on the same images."""
+    import json
+
+    path = folder / "result.json"
+    if not path.is_file():
+        return status != "FINISHED" and (folder / "run.json").is_file()
+    try:
+        result = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return False
+    known = tags.get("rgbt.dataset", "")
+    return isinstance(result, dict) and known in ("", result.get("dataset"))
+
+
+def _stored(run: Any, places: _Places) -> StoredRun:
+    start, end = run.info.start_time, run.info.end_time
+    return StoredRun(
+        run_id=run.info.run_id,
+        name=str(run.info.run_name or ""),
+        status=str(run.info.status),
+        started=_iso(start),
+        seconds=(end - start) / 1000 if start and end else None,
+        tags={name: without_passwords(value) for name, value in run.data.tags.items()},
+        params={name: without_passwords(value) for name, value in run.data.params.items()},
+        metrics=dict(run.data.metrics),
+        files=places.files(run),
+    )
+
+
+def _iso(milliseconds: int | None) -> str:
+    if not milliseconds:
+        return ""
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="seconds")
+
+
+def _guarded(work: Callable[[], Path | None], said: str) -> Path | None:
+    """What `work` on the store answers; what it raises becomes a sentence."""
+    try:
+        return work()
+    except Exception as error:  # The border to a store that may fail in any way.
+        raise InputError(f"{said} from the store ({_reason(error)}).") from error
+
+
+def _reason(error: Exception) -> str:
+    first = (without_passwords(str(error)).splitlines() or [""])[0]
+    short = (
+        first if len(first) <= REASON_LENGTH else first[:REASON_LENGTH].rpartition(" ")[0] + " ..."
+    )
+    return f"{type(error).__name__}: {short}".rstrip(".: ")

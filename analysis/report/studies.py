@@ -1,0 +1,145 @@
+"""Searches, grids and lists of the store: trials and the Pareto front."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+from analysis.report.data import StudyEntry, TrialEntry
+from analysis.report.store import StoredRun
+from rgbt.checks import InputError
+from rgbt.tracking.provenance import without_passwords
+
+TRIALS_FILE = "trials.csv"
+MARKDOWN_FILE = "study.md"
+FIRST = ("trial", "state", "label")
+LAST = ("seconds", "last_step", "runs", "reason")
+COMPLETE = "complete"
+
+OBJECTIVES = re.compile(r"^Kind: (\w+)\. Objectives: (.+)\.$", re.MULTILINE)
+OBJECTIVE = re.compile(r"(highest|lowest) (.+)")
+BEGUN = re.compile(r"^Begun by `(.+)`\.$", re.MULTILINE)
+FIGURES = re.compile(r"\n## [^\n]*\n\n!\[", re.MULTILINE)
+"""Where the figures of a report begin; they are files of their own and not part of the page."""
+
+
+def study_entries(records: Sequence[StoredRun], remarks: list[str]) -> tuple[StudyEntry, ...]:
+    """All studies of the store, by name.
+
+    Args:
+        records: runs of MLflow of the kind "study".
+        remarks: gets a sentence for each that cannot be read.
+    """
+    found = []
+    for stored in records:
+        try:
+            found.append(read_study(stored))
+        except InputError as error:
+            remarks.append(str(error))
+    return tuple(sorted(found, key=lambda each: each.name))
+
+
+def read_study(stored: StoredRun) -> StudyEntry:
+    """Read the record of a study.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    name = stored.tags.get("rgbt.study", stored.name)
+    note = stored.files.text(MARKDOWN_FILE) or stored.tags.get("mlflow.note.content", "")
+    head = OBJECTIVES.search(note)
+    if head is None:
+        raise InputError(
+            f"study '{name}': its {MARKDOWN_FILE} does not name the objectives; "
+            f"`python -m sweeps.study name={name}` records it again."
+        )
+    wanted = [found for text in head.group(2).split(", ") if (found := OBJECTIVE.fullmatch(text))]
+    objectives = tuple(each.group(2) for each in wanted)
+    maximize = tuple(each.group(1) == "highest" for each in wanted)
+    text = stored.files.text(TRIALS_FILE)
+    if text is None:
+        raise InputError(
+            f"study '{name}' has no {TRIALS_FILE} in the store; "
+            f"`python -m sweeps.study name={name}` records it again."
+        )
+    begun = BEGUN.search(note)
+    return StudyEntry(
+        name=name,
+        kind=stored.tags.get("rgbt.study.kind", head.group(1)),
+        objectives=objectives,
+        maximize=maximize,
+        trials=_trials(text, name, objectives, maximize),
+        note=without_passwords(FIGURES.split(note)[0].strip() + "\n"),
+        command=without_passwords(begun.group(1)) if begun else "",
+    )
+
+
+def _trials(
+    text: str, name: str, objectives: tuple[str, ...], maximize: tuple[bool, ...]
+) -> tuple[TrialEntry, ...]:
+    reader = csv.DictReader(io.StringIO(text))
+    header = list(reader.fieldnames or ())
+    missing = [column for column in (*FIRST, *objectives, *LAST) if column not in header]
+    if missing:
+        raise InputError(f"study '{name}': its {TRIALS_FILE} lacks the column '{missing[0]}'.")
+    # Parameters stand between the label and the first score, see `sweeps.report.tables`.
+    params = header[len(FIRST) : header.index(objectives[0])]
+    lines = list(reader)
+    try:
+        values = [tuple(_numbers(line, objectives)) for line in lines]
+        return tuple(_entries(lines, values, params, pareto_front(values, maximize)))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"study '{name}': its {TRIALS_FILE} is damaged ({error}).") from error
+
+
+def _numbers(line: Mapping[str, str], objectives: Sequence[str]) -> Iterator[float]:
+    """The objectives of a complete trial, else nothing."""
+    if line["state"] != COMPLETE:
+        return
+    for name in objectives:
+        yield float(line[name] or math.nan)
+
+
+def _entries(
+    lines: Sequence[Mapping[str, str]],
+    values: Sequence[tuple[float, ...]],
+    params: Sequence[str],
+    front: set[int],
+) -> Iterator[TrialEntry]:
+    for place, line in enumerate(lines):
+        chosen = {name: line[name] for name in params if line[name] != ""}
+        yield TrialEntry(
+            number=int(line["trial"]),
+            state=line["state"],
+            params=chosen or {"point": line["label"]},
+            values=values[place],
+            on_front=place in front,
+            runs=tuple(line["runs"].split()),
+        )
+
+
+def pareto_front(values: Sequence[tuple[float, ...]], maximize: Sequence[bool]) -> set[int]:
+    """Places of the points that no other point beats: as good in all and better in one objective.
+
+    Args:
+        values: of each trial, one per objective; () or with NaN: no point.
+        maximize: by objective, whether more is better.
+    """
+    signs = [1.0 if up else -1.0 for up in maximize]
+    points = {
+        place: tuple(sign * value for sign, value in zip(signs, each, strict=True))
+        for place, each in enumerate(values)
+        if each and all(map(math.isfinite, each))
+    }
+    return {
+        place
+        for place, point in points.items()
+        if not any(_beats(other, point) for other in points.values())
+    }
+
+
+def _beats(other: Sequence[float], point: Sequence[float]) -> bool:
+    return other != point and all(o >= p for o, p in zip(other, point, strict=True))

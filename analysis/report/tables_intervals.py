@@ -1,0 +1,123 @@
+"""Intervals of table cells: every set of runs is resampled once, for all of its scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from analysis.report.data import Uncertainty
+from analysis.report.runs import Run
+from analysis.uncertainty import Interval, Resampling, compare, estimate
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+
+Track = Callable[[Sequence[Any], str], Iterable[Any]]
+"""Goes over a sequence and shows how far it is: (sequence, what is done)."""
+
+OWN = ""
+"""Path of the evaluation that a run makes itself."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Counts that scores are taken from.
+
+    Attributes:
+        keys: of the runs, one per seed.
+        paths: of the evaluation in each run, `OWN` for the run's own; two: the first less the
+            second.
+        absent: how a class without pixels scores.
+    """
+
+    keys: tuple[str, ...]
+    paths: tuple[str, ...]
+    absent: Absent
+
+
+@dataclass(frozen=True)
+class Found:
+    """An interval, and what it is over; without one, why there is none."""
+
+    interval: Interval | None
+    covers: Uncertainty
+    reason: str = ""
+
+
+@dataclass
+class Intervals:
+    """What is asked for, then what was found.
+
+    Attributes:
+        runs: by key.
+        asked: source -> metrics.
+        found: the intervals by source and metric, after `compute`.
+    """
+
+    runs: Mapping[str, Run]
+    asked: dict[Source, dict[str, None]] = field(default_factory=dict)
+    found: dict[tuple[Source, str], Found] = field(default_factory=dict)
+
+    def ask(self, source: Source, metric: str) -> None:
+        """Ask for the interval of a score."""
+        self.asked.setdefault(source, {})[metric] = None
+
+    def compute(self, resamples: int, track: Track) -> None:
+        """Find every interval that was asked for.
+
+        Args:
+            resamples: of the images.
+            track: shows how far it is.
+        """
+        for source in track(list(self.asked), "intervals"):
+            metrics = tuple(self.asked[source])
+            settings = Resampling(resamples=resamples, absent=source.absent)
+            try:
+                counts = [self._counts(source.keys, path) for path in source.paths]
+                found = _resampled(counts, metrics, settings)
+            except InputError as error:
+                found = dict.fromkeys(metrics, Found(None, "none", str(error)))
+            self.found |= {(source, metric): each for metric, each in found.items()}
+
+    def _counts(self, keys: Sequence[str], path: str) -> list[Counts]:
+        return [counts_of(self.runs[key], path) for key in keys]
+
+
+def counts_of(run: Run, path: str) -> Counts:
+    """Counts of one evaluation of a run.
+
+    Raises:
+        InputError: it has none.
+    """
+    if path != OWN:
+        return run.counts_of(path)
+    if run.counts is None:
+        raise InputError(f"run {run.entry.key} has no counts.")
+    return run.counts
+
+
+def _resampled(
+    counts: Sequence[Sequence[Counts]], metrics: Sequence[str], settings: Resampling
+) -> dict[str, Found]:
+    """Intervals of scores, or of the difference of two evaluations of the same runs."""
+    if len(counts) == 1:
+        estimates = estimate(counts[0], metrics, settings)
+        return {
+            metric: _covering(each.images, each.both, each.said)
+            for metric, each in estimates.items()
+        }
+    first, second = counts
+    # The same trainings stand on both sides: how they spread over seeds cancels, images do not.
+    compared = compare(second, first, metrics, settings)
+    return {
+        each.metric: _covering(each.images, None, compared.said) for each in compared.differences
+    }
+
+
+def _covering(images: Interval | None, both: Interval | None, said: str) -> Found:
+    if both is not None:
+        return Found(both, "images and seeds")
+    if images is not None:
+        return Found(images, "images")
+    return Found(None, "none", f"no interval: {said} are too few.")

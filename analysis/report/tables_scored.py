@@ -1,0 +1,154 @@
+"""Recorded tables scored again: every value from the counts of the runs that the record names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+from analysis.report.runs import Run
+from analysis.report.tables_files import NOTHING, Recorded
+from analysis.report.tables_intervals import OWN, Source, counts_of
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
+from sweeps.table.cells import evaluation_of, metric_of
+from sweeps.table.scoring import Scored, score
+from sweeps.table.table import Column, Row, Table
+
+AGREES = 1e-4
+"""A recorded mean has six digits: a larger difference is another number."""
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A run as `sweeps.table.scoring` reads one."""
+
+    key: str
+    commit: str | None
+    run: Run
+
+    def counts(self, evaluation: Any = None) -> Counts:
+        """Counts of an evaluation."""
+        return counts_of(self.run, OWN if evaluation is None else path_of(evaluation))
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What became of a cell's run, as `sweeps.table.scoring` reads it."""
+
+    state: str
+    reason: str = ""
+    found: tuple[_Opened, ...] = ()
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A recorded table with its file, scored."""
+
+    recorded: Recorded
+    scored: Scored
+
+
+def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> Scored:
+    """Means, ranks and orders from the counts of the runs that the record names.
+
+    Args:
+        recorded: the record.
+        table: its file as it is now.
+        runs: by key.
+    """
+    labels = {row.label for row in table.rows}
+    places: dict[tuple[str, int], _Outcome] = {}
+    for label in recorded.rows():
+        keys = recorded.keys_of(label)
+        if not keys or label not in labels:
+            continue
+        outcomes = _by_seed(keys, recorded.seeds, runs)
+        places |= {(label, seed): outcome for seed, outcome in outcomes.items()}
+    return score(recorded.name, table, cast("Any", places), scale=recorded.scale)
+
+
+def _by_seed(
+    keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, Run]
+) -> dict[int, _Outcome]:
+    """What became of every seed of a row; a run that is not here stands for a seed without one."""
+    outcomes = {seed: _Outcome("failed", "not finished") for seed in seeds}
+    here = {seed: key for key in keys if key in runs and (seed := runs[key].entry.seed) is not None}
+    rest = [seed for seed in seeds if seed not in here]
+    gone = zip(rest, (key for key in keys if key not in runs), strict=False)
+    return outcomes | {seed: _outcome(key, runs.get(key)) for seed, key in [*here.items(), *gone]}
+
+
+def _outcome(key: str, run: Run | None) -> _Outcome:
+    if run is None:
+        return _Outcome("missing", f"run {key} is not in the store")
+    return _Outcome("finished", found=(_Opened(key, run.entry.commit or None, run),))
+
+
+def path_of(evaluation: Any) -> str:
+    """Path of the counts of `sweeps.points.Evaluation` inside a run."""
+    regions = evaluation.regions.replace(" ", "-")
+    return f"evaluations/table_{evaluation.modality}_{regions}.npz"
+
+
+def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | None:
+    """Source and metric of a cell's interval; None for cells without a value from counts."""
+    table, place = draft.scored.table, (row.label, column.name)
+    cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NOTHING)
+    if cell is None or not cell.seeds or cell.seeds < line.seeds:
+        return None
+    names = (column.name,) if column.minus is None else column.minus
+    columns = [each for name in names for each in table.columns if each.name == name]
+    metrics = {metric_of(each, row) for each in columns if each.metric is not None}
+    if len(metrics) != 1 or len(columns) != len(names):
+        return None  # the difference of two different scores
+    asked = (evaluation_of(each, table) for each in columns)
+    paths = tuple(OWN if each is None else path_of(each) for each in asked)
+    # Of the runs of the row those that the value is a mean of: all of them, see the check above.
+    keys = cell.keys if cell.seeds == len(cell.keys) else ()
+    return (Source(keys, paths, table.absent), metrics.pop()) if keys else None
+
+
+def values_of(
+    draft: Draft, row: Row, column: Column, runs: Mapping[str, Run]
+) -> tuple[float | None, ...]:
+    """The score of each run of a cell, in the order of its keys; None: it has none."""
+    keys = draft.recorded.lines.get((row.label, column.name), NOTHING).keys
+    if column.needs is not None:
+        return ()
+    return tuple(_value(draft.scored.table, row, column, runs.get(key)) for key in keys)
+
+
+def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | None:
+    if run is None:
+        return None
+    if column.minus is not None:
+        sides = [each for name in column.minus for each in table.columns if each.name == name]
+        first, second = (_value(table, row, side, run) for side in sides)
+        return None if first is None or second is None else first - second
+    evaluation = evaluation_of(column, table)
+    path = OWN if evaluation is None else path_of(evaluation)
+    try:
+        return value(metric_of(column, row), counts_of(run, path), table.absent)
+    except InputError:  # the reason stands in the cell
+        return None
+
+
+def changed(draft: Draft) -> list[str]:
+    """A sentence where counts give other means than were recorded with the table."""
+    apart = [
+        (place, cell.mean, line.mean)
+        for place, cell in draft.scored.cells.items()
+        if (line := draft.recorded.lines.get(place, NOTHING)).mean is not None
+        and cell.seeds == line.seeds
+        and not abs(cell.mean - line.mean) <= AGREES
+    ]
+    if not apart:
+        return []
+    (row, column), now, then = apart[0]
+    return [
+        f"Table '{draft.recorded.name}' ({draft.recorded.scale}): {len(apart)} cells are not as "
+        f"recorded, such as {row}, {column}: {now:.2f} from counts, {then:.2f} recorded; its "
+        "command records it again."
+    ]

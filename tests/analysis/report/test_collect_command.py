@@ -1,0 +1,112 @@
+"""`python -m analysis.report` as a user calls it; the store itself is tested in test_collect."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from analysis.report import collect, page
+from analysis.report.__main__ import OWN, main
+from analysis.report.data import ReportData
+from rgbt.command import plain_command
+from rgbt.tracking.mlflow_store import MlflowTracking
+from tests.commands import Call, assert_one_sentence
+
+EMPTY = ReportData(
+    title="t",
+    made="",
+    store="sqlite",
+    command="",
+    runs=(),
+    tables=(),
+    studies=(),
+    masks=(),
+    differences=(),
+    remarks=tuple(f"Remark {number}." for number in range(7)),
+)
+
+
+def entry() -> None:
+    plain_command(OWN, main)()
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What was asked of the store, which is not read; the page is one line."""
+    told: list[Any] = []
+
+    def fake(wanted: Any, track: Any) -> ReportData:
+        told.append(wanted)
+        assert list(track([1, 2], "something")) == [1, 2]
+        return EMPTY
+
+    def write(data: ReportData, out: Path) -> Path:
+        (out / "index.html").write_text("page")
+        return out / "index.html"
+
+    monkeypatch.setattr(collect, "collect", fake)
+    monkeypatch.setattr(page, "write_page", write)
+    return told
+
+
+def test_it_says_where_the_page_is_and_what_it_holds(
+    call: Call, tmp_path: Path, asked: list[Any]
+) -> None:
+    out, runs = tmp_path / "new" / "report", tmp_path / "runs"
+    uri = "tracking.uri=http://me:secret@host:5000"
+    code, said, err = call(entry, f"out={out}", f"runs_dir={runs}", "resamples=300", uri)
+    assert code == 0
+    assert f"page   {out}/index.html" in said
+    assert "holds  0 runs, 0 tables with runs, 0 published alone, 0 studies" in said
+    assert err.count("rgbt: Remark ") == 5
+    assert "2 more remarks stand on the page." in err
+    (wanted,) = asked
+    assert isinstance(wanted.tracking, MlflowTracking)
+    assert wanted.tracking.uri == "http://me:secret@host:5000"
+    assert (wanted.runs_dir, wanted.resamples) == (runs, 300)
+    assert wanted.command.startswith("python -m analysis.report out=")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["resamples=many"], "resamples=many: expected a whole number."),
+        (["resamples=10"], "resamples must lie in [100, 1e+06], got 10."),
+        (["tracking.url=x"], "'tracking.url'"),
+        (["tracking=none"], "made from an MLflow store"),
+        ([], "there is no MLflow store"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    call: Call, tmp_path: Path, words: list[str], sentence: str
+) -> None:
+    out = tmp_path / "report"
+    code, _, err = call(entry, f"out={out}", f"runs_dir={tmp_path}", *words)
+    assert code == 2
+    assert sentence in err
+    assert not out.exists()
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "report").write_text("")
+    code, _, err = call(entry, f"out={tmp_path / 'report'}")
+    assert code == 2
+    assert_one_sentence(err, "is a file; give a folder for the page")
+
+
+@pytest.mark.slow
+def test_help_does_not_wait_for_libraries() -> None:
+    code = (
+        "import sys; sys.argv = ['report', '--help']; import analysis.report.__main__ as m\n"
+        "from rgbt.command import plain_command\n"
+        "try: plain_command(m.OWN, m.main)()\n"
+        "except SystemExit: pass\n"
+        "print({'torch', 'mlflow', 'matplotlib', 'pandas'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "usage: [out=report]" in done.stdout
+    assert done.stdout.strip().endswith("set()")

@@ -1,0 +1,311 @@
+"""Parts of the page's data that need no store: commands, fronts, choices, masks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.report import masks
+from analysis.report.data import RunEntry
+from analysis.report.differences import Choice, Side, find_pairs, load_choices
+from analysis.report.masks import data_address, mask_pictures, maskers_in_use
+from analysis.report.runs import Run
+from analysis.report.runs_provenance import commit_of, host_of, read_provenance, repeat_command
+from analysis.report.store import Files, StoredRun
+from analysis.report.studies import pareto_front, read_study
+from analysis.report.tables_files import read_recorded, reproduce_command
+from rgbt.checks import InputError
+from rgbt.config import compose, flatten
+from rgbt.metrics.counts import Counts
+from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
+
+
+def stored(files: Files, **tags: str) -> StoredRun:
+    return StoredRun(
+        run_id="id",
+        name="made",
+        status="FINISHED",
+        started="",
+        seconds=None,
+        tags={name.replace("__", "."): value for name, value in tags.items()},
+        params={},
+        metrics={},
+        files=files,
+    )
+
+
+def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) -> Run:
+    """A run with that configuration, by dotted key."""
+    entry = RunEntry(
+        key=f"k{seed}",
+        name="",
+        run_id="",
+        status="FINISHED",
+        experiment="grbm",
+        scale="demo",
+        seed=seed,
+        group=str(config.get("group", "grbm")),
+        studies=(),
+        table_rows={},
+        split="test",
+        partition="ring2",
+        classes=(),
+        scores={},
+        region_ious=(),
+        class_region_ious=(),
+        images=12,
+        commit="",
+        started="",
+        seconds=None,
+        command="",
+        repeat="",
+        host="",
+        dataset="",
+        config={},
+    )
+    return Run(
+        entry=entry,
+        counts=counts or counts_of(seed),
+        absent="released",
+        config={"seed": seed, **config},
+        files=Files(()),
+    )
+
+
+GRID = {"rgbt.group": "grbm model=mask2former_tiny lr=0.1", "rgbt.experiment": "grbm"}
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (
+            "/venv/bin/python -m rgbt.run scale=demo runs_dir=/tmp/t3 +experiment=crm seed=2",
+            "python -m rgbt.run scale=demo +experiment=crm seed=2",
+        ),
+        (
+            "python -m rgbt.run +experiment=crm tracking=none tracking.uri=http://h:1 out=x "
+            "hydra/sweeper=basic hydra.sweeper.workers=2",
+            "python -m rgbt.run +experiment=crm",
+        ),
+        (
+            "python -m rgbt.run -m +experiment=crm,grbm masker.sigma_div=1,2 seed='range(0,3)' "
+            "model=a,mask2former_tiny optimizer.lr=0.1,0.2",
+            "python -m rgbt.run +experiment=grbm masker.sigma_div=2.0 seed=1 "
+            "model=mask2former_tiny optimizer.lr=0.1",
+        ),
+        (
+            "python -m rgbt.run 'model.rates=[1,2]' 'name=\"a, b\"'",
+            "python -m rgbt.run 'model.rates=[1,2]' 'name=\"a, b\"'",
+        ),
+        ("python -m pytest tests", ""),
+        ("python -m rgbt.run 'cut", ""),
+        ("", ""),
+    ],
+)
+def test_a_run_is_repeated_with_its_own_overrides(command: str, expected: str) -> None:
+    config = {"seed": 1, "masker.sigma_div": 2.0}
+    assert repeat_command(command, config, GRID) == expected
+
+
+def test_a_machine_is_named_by_its_devices() -> None:
+    assert host_of({"host": "desk", "gpus": ["H100", "H100"], "cpu": "x"}) == "desk: H100, H100"
+    assert host_of({}) == ""
+
+
+def test_a_commit_says_whether_it_was_clean() -> None:
+    assert commit_of({"git_commit": "0123456789abc", "git_dirty": True}) == "0123456789+"
+    assert commit_of({"git_commit": "0123456789abc", "git_dirty": False}) == "0123456789"
+    assert commit_of({"git_commit": None, "git_dirty": None}) == ""
+
+
+def test_a_run_continued_by_other_code_is_told(tmp_path: Path) -> None:
+    remarks: list[str] = []
+    text = '[{"git_commit": "aaa"}, {"git_commit": "bbb", "git_dirty": true}]'
+    processes = read_provenance(files_of(tmp_path, provenance__json=text), "k", remarks)
+    assert len(processes) == 2
+    assert remarks == ["Run k was begun and continued by different code: aaa, then bbb+."]
+
+
+@pytest.mark.parametrize("text", ["{", "{}"])
+def test_damaged_provenance_is_told(tmp_path: Path, text: str) -> None:
+    remarks: list[str] = []
+    assert read_provenance(files_of(tmp_path, provenance__json=text), "k", remarks) == []
+    assert "provenance.json cannot be read" in remarks[0]
+
+
+def test_a_front_holds_what_nothing_beats() -> None:
+    values = [(1.0, 5.0), (2.0, 6.0), (1.5, 7.0), (), (math.nan, 0.0), (2.0, 6.0)]
+    assert pareto_front(values, (True, False)) == {0, 1, 5}
+    assert pareto_front(values, (True, True)) == {1, 2, 5}
+    assert pareto_front([(1.0,), (3.0,), (3.0,)], (True,)) == {1, 2}
+    assert pareto_front([(1.0,), (3.0,)], (False,)) == {0}
+
+
+MARKDOWN = "# Study s\n\nKind: grid. Objectives: highest test/mIoU.\n"
+TRIALS = (
+    "trial,state,label,test/mIoU,seconds,last_step,runs,reason\n0,complete,a=1,5.5,1,2,k1 k2,\n"
+)
+
+
+def test_a_point_without_parameters_is_called_by_its_label(tmp_path: Path) -> None:
+    files = files_of(tmp_path, study__md=MARKDOWN, trials__csv=TRIALS)
+    study = read_study(stored(files, rgbt__study="s", rgbt__study__kind="grid"))
+    (trial,) = study.trials
+    assert (trial.params, trial.values, trial.runs) == ({"point": "a=1"}, (5.5,), ("k1", "k2"))
+    assert study.command == ""
+
+
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        ({}, "does not name the objectives"),
+        ({"study__md": MARKDOWN}, "has no trials.csv"),
+        ({"study__md": MARKDOWN, "trials__csv": "trial,state\n"}, "lacks the column 'label'"),
+        (
+            {"study__md": MARKDOWN, "trials__csv": TRIALS.replace("5.5", "high")},
+            "is damaged",
+        ),
+        (
+            {"study__md": MARKDOWN, "trials__csv": TRIALS.splitlines()[0] + "\n0,complete\n"},
+            "is damaged",
+        ),
+    ],
+)
+def test_a_damaged_study_is_one_sentence(
+    tmp_path: Path, texts: dict[str, str], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        read_study(stored(files_of(tmp_path, **texts), rgbt__study="s"))
+
+
+HEADER = "table,row,column,mean,sd,n,published,difference,reason,runs\n"
+
+
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        ({}, "has no table.csv in the store"),
+        ({"table__csv": "table,row\n"}, "lacks the column 'column'"),
+        ({"table__csv": HEADER + "t,A,x,high,,1,,,,k\n"}, "is damaged"),
+        ({"table__csv": HEADER + "t,A,x\n"}, "is damaged"),
+    ],
+)
+def test_a_damaged_table_is_one_sentence(
+    tmp_path: Path, texts: dict[str, str], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        read_recorded(stored(files_of(tmp_path, **texts)))
+
+
+@pytest.mark.parametrize(
+    ("seeds", "words"),
+    [
+        ((0, 1, 2), "seeds=3"),
+        ((0,), "seeds=1"),
+        ((0, 4), "seeds=0,4"),
+        ((4,), "'seeds=[4]'"),
+    ],
+)
+def test_a_table_is_run_with_its_seeds(seeds: tuple[int, ...], words: str) -> None:
+    assert reproduce_command("own/t", seeds, "demo") == (
+        f"python -m sweeps.reproduce table=own/t {words} scale=demo"
+    )
+
+
+def composed(choice: Choice, side: Side) -> dict[str, Any]:
+    assert side.setting is not None
+    return flatten(compose([*choice.base, side.setting]))
+
+
+@pytest.mark.parametrize("choice", load_choices(), ids=lambda choice: choice.topic)
+def test_choices_are_settings_that_differ_in_their_keys_alone(choice: Choice) -> None:
+    paper = composed(choice, choice.paper)
+    assert {key: paper[key] for key in choice.paper.values} == choice.paper.values
+    if choice.released.setting is None:
+        return
+    released = composed(choice, choice.released)
+    apart = {key for key in {*paper, *released} if paper.get(key) != released.get(key)}
+    assert apart == choice.paper.values.keys() == choice.released.values.keys()
+    assert {key: released[key] for key in apart} == choice.released.values
+
+
+CHOICE = Choice("t", "s", (), Side("a.x=1", {"a.x": 1}, ""), Side("a.x=2", {"a.x": 2}, ""))
+
+
+def test_pairs_differ_by_the_choice_and_what_is_no_part_of_a_run() -> None:
+    same = {"model.width": 4, "tracking.uri": "here", "dataset.root": "/a"}
+    elsewhere = {"model.width": 4.0, "tracking.uri": "there", "dataset.root": "/b"}
+    paper = [run_of({"a.x": 1, **same}, seed) for seed in (1, 0)]
+    released = [run_of({"a.x": 2, **elsewhere}, seed) for seed in (0, 1)]
+    other = run_of({"a.x": 2, "model.width": 5})
+    neither = run_of({"a.x": 3, **same})
+    (pair,) = find_pairs(CHOICE, [*paper, *released, other, neither])
+    assert pair.paper == (paper[1], paper[0])
+    assert pair.released == tuple(released)
+    assert find_pairs(CHOICE, [*paper, other]) == []
+
+
+def test_runs_on_other_images_are_no_pair() -> None:
+    from dataclasses import replace
+
+    elsewhere = replace(counts_of(0), dataset="others")
+    runs = [run_of({"a.x": 1}), run_of({"a.x": 2}, counts=elsewhere)]
+    assert find_pairs(CHOICE, runs) == []
+
+
+def masked_config(**changed: Any) -> dict[str, Any]:
+    masker = {**MASKER, **changed}
+    nodes = {"masker": masker, "dataset": DATASET}
+    return {f"{node}.{key}": v for node, values in nodes.items() for key, v in values.items()}
+
+
+def quiet(items: Any, what: str) -> Any:
+    return items
+
+
+def test_maskers_are_told_apart_by_their_settings() -> None:
+    runs = [
+        run_of({**masked_config(), "group": "one"}, 0),
+        run_of({**masked_config(sigma_div=2.0), "group": "two"}, 0),
+        run_of({**masked_config(sigma_div=2.0), "group": "two"}, 1),
+        run_of({**masked_config(sampler="none"), "group": "plain"}),
+        run_of({"group": "unknown"}),
+    ]
+    found = maskers_in_use(runs)
+    assert [(each.groups, each.runs) for each in found] == [(("two",), 2), (("one",), 1)]
+    assert found[0].masker["sigma_div"] == 2.0
+
+
+def test_masks_of_a_data_set_that_is_elsewhere_are_drawn_on_the_embedded_one() -> None:
+    config = masked_config()
+    away = {"dataset._target_": "rgbt.data.mfnet.MFNet", "dataset.root": "/nowhere"}
+    gone = {key: v for key, v in config.items() if not key.startswith("dataset.")} | away
+    remarks: list[str] = []
+    (picture,) = mask_pictures([run_of(gone)], quiet, remarks)
+    assert "of the embedded data set" in picture.caption
+    assert remarks == []
+
+
+def test_a_masker_that_cannot_be_built_is_told() -> None:
+    remarks: list[str] = []
+    runs = [run_of(masked_config(sampler="guess"))]
+    assert mask_pictures(runs, quiet, remarks) == ()
+    assert remarks[0].startswith("Masks of 'grbm' cannot be drawn: ")
+
+
+def test_more_maskers_than_fit_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(masks, "MOST", 1)
+    remarks: list[str] = []
+    runs = [run_of(masked_config(sigma_div=float(div))) for div in (1, 2, 4)]
+    assert len(mask_pictures(runs, quiet, remarks)) == 1
+    assert remarks == ["Masks of 1 maskers are shown; 2 more were used."]
+
+
+def test_pictures_stay_small_whatever_they_show() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (320, 640, 3), dtype=np.uint8)
+    assert len(data_address(noise)) <= 4 * masks.MOST_BYTES / 3 + 30
+    assert data_address(np.zeros((8, 8, 3), np.uint8)).startswith("data:image/webp;base64,")

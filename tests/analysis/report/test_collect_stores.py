@@ -1,0 +1,48 @@
+"""Stores that cannot be read: one sentence each, and nothing is made where nothing was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from analysis.report.store import StoredRun, read_store
+from analysis.report.tables_scored import path_of
+from rgbt.checks import InputError, RunError
+from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from sweeps.running.found import Found
+from tests.analysis.report.stores import RGB, RGB_FILE
+
+
+def read(runs_dir: Path, uri: str | None = None) -> list[StoredRun]:
+    given: dict[str, Any] = {"artifact_uri": None, "experiment": "rgbt", "runs_dir": str(runs_dir)}
+    return read_store(MlflowTracking(uri, **given), runs_dir, runs_dir)
+
+
+def test_a_store_that_is_not_there_is_refused_and_not_made(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"there is no MLflow store .*mlflow\.db"):
+        read(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_that_does_not_answer_is_one_sentence(tmp_path: Path) -> None:
+    uri = "http://me:secret@127.0.0.1:9"
+    with pytest.raises(RunError, match=r"^MLflow at http://me:\*\*\*@127\.0\.0\.1:9 cannot"):
+        read(tmp_path, uri)
+
+
+def test_a_file_that_is_no_database_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "mlflow.db").write_text("no database")
+    with pytest.raises(RunError, match="cannot be read"):
+        read(tmp_path)
+
+
+def test_without_mlflow_there_is_nothing_to_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="made from an MLflow store"):
+        read_store(NoTracking(), tmp_path, tmp_path)
+
+
+def test_evaluations_lie_where_sweeps_puts_them(tmp_path: Path) -> None:
+    assert Found("k", tmp_path).counts_file(RGB) == tmp_path / path_of(RGB)
+    assert path_of(RGB) == RGB_FILE
