@@ -20,6 +20,11 @@ class Evaluation:
     modality: str = "default"
     regions: str = "as trained"
 
+    @property
+    def path(self) -> str:
+        """Path of its counts inside the run folder, and among the run's files in MLflow."""
+        return f"evaluations/table_{self.modality}_{self.regions.replace(' ', '-')}.npz"
+
 
 @dataclass(frozen=True)
 class Point:

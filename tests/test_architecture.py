@@ -97,7 +97,7 @@ ANALYSIS_ROOMS = {
 }
 """Folders of analysis, and which others each of them knows; its commands join them."""
 
-PUBLISHED = ("sweeps.table", "sweeps.report.data")
+PUBLISHED = ("sweeps.table", "sweeps.points", "sweeps.report.data")
 """What of the sweeps the report may import: the papers' tables as data, and studies read."""
 
 PARENTS = {"sweeps.report"}

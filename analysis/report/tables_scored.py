@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 from analysis.report.runs import Run
 from analysis.report.tables_files import NOTHING, Recorded
@@ -12,6 +11,7 @@ from analysis.report.tables_intervals import OWN, Source, counts_of
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from sweeps.points import Evaluation
 from sweeps.table.cells import evaluation_of, metric_of
 from sweeps.table.scoring import Scored, score
 from sweeps.table.table import Column, Row, Table
@@ -28,9 +28,9 @@ class _Opened:
     commit: str | None
     run: Run
 
-    def counts(self, evaluation: Any = None) -> Counts:
+    def counts(self, evaluation: Evaluation | None = None) -> Counts:
         """Counts of an evaluation."""
-        return counts_of(self.run, OWN if evaluation is None else path_of(evaluation))
+        return counts_of(self.run, OWN if evaluation is None else evaluation.path)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> Sc
             continue
         outcomes = _by_seed(keys, recorded.seeds, runs)
         places |= {(label, seed): outcome for seed, outcome in outcomes.items()}
-    return score(recorded.name, table, cast("Any", places), scale=recorded.scale)
+    return score(recorded.name, table, places, scale=recorded.scale)
 
 
 def _by_seed(
@@ -86,12 +86,6 @@ def _outcome(key: str, run: Run | None) -> _Outcome:
     return _Outcome("finished", found=(_Opened(key, run.entry.commit or None, run),))
 
 
-def path_of(evaluation: Any) -> str:
-    """Path of the counts of `sweeps.points.Evaluation` inside a run."""
-    regions = evaluation.regions.replace(" ", "-")
-    return f"evaluations/table_{evaluation.modality}_{regions}.npz"
-
-
 def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | None:
     """Source and metric of a cell's interval; None for cells without a value from counts."""
     table, place = draft.scored.table, (row.label, column.name)
@@ -104,7 +98,7 @@ def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | Non
     if len(metrics) != 1 or len(columns) != len(names):
         return None  # the difference of two different scores
     asked = (evaluation_of(each, table) for each in columns)
-    paths = tuple(OWN if each is None else path_of(each) for each in asked)
+    paths = tuple(OWN if each is None else each.path for each in asked)
     # Of the runs of the row those that the value is a mean of: all of them, see the check above.
     keys = cell.keys if cell.seeds == len(cell.keys) else ()
     return (Source(keys, paths, table.absent), metrics.pop()) if keys else None
@@ -128,7 +122,7 @@ def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | N
         first, second = (_value(table, row, side, run) for side in sides)
         return None if first is None or second is None else first - second
     evaluation = evaluation_of(column, table)
-    path = OWN if evaluation is None else path_of(evaluation)
+    path = OWN if evaluation is None else evaluation.path
     try:
         return value(metric_of(column, row), counts_of(run, path), table.absent)
     except InputError:  # the reason stands in the cell

@@ -95,8 +95,7 @@ class Found:
         """Where the counts lie, whether they are there yet or not."""
         if evaluation is None:
             return self.folder / "counts_test.npz"
-        regions = evaluation.regions.replace(" ", "-")
-        return self.folder / "evaluations" / f"table_{evaluation.modality}_{regions}.npz"
+        return self.folder / evaluation.path
 
 
 def in_percent(name: str, value: float) -> float:

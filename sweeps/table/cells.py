@@ -6,15 +6,14 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from sweeps.points import Evaluation
 from rgbt.metrics.named import value
+from sweeps.points import Evaluation
 
 if TYPE_CHECKING:
-    from sweeps.running.lists import Outcome
     from sweeps.table.table import Column, Row, Table
 
 NO_VALUE = "no value"
@@ -25,6 +24,43 @@ Place = tuple[str, str]
 
 Value = float | str
 """A score, or why there is none."""
+
+
+class ScoredRun(Protocol):
+    """A finished run, here or in the store."""
+
+    @property
+    def key(self) -> str:
+        """Its config key."""
+        ...
+
+    @property
+    def commit(self) -> str | None:
+        """Git commit of the code that made it."""
+        ...
+
+    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+        """Counts of the test split; InputError where they are missing or not readable."""
+        ...
+
+
+class CellRun(Protocol):
+    """What became of a row's run with one seed."""
+
+    @property
+    def state(self) -> str:
+        """ "finished", or a word that says why not."""
+        ...
+
+    @property
+    def reason(self) -> str:
+        """Why it is not finished, or ""."""
+        ...
+
+    @property
+    def found(self) -> Sequence[ScoredRun]:
+        """The finished run, or nothing."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -64,7 +100,7 @@ def is_counted(column: Column) -> bool:
     return column.metric is not None
 
 
-def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[Place, Cell]:
+def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[Place, Cell]:
     """The cells of one row; columns that cannot be computed have none.
 
     Args:
@@ -83,7 +119,7 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[P
     return cells
 
 
-def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
+def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
     """Every column's value of one run."""
     counts: dict[Evaluation | None, Counts | str] = {}
     values: dict[str, Value] = {}
@@ -100,7 +136,7 @@ def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
     return values
 
 
-def _counts(outcome: Outcome, evaluation: Evaluation | None) -> Counts | str:
+def _counts(outcome: CellRun, evaluation: Evaluation | None) -> Counts | str:
     if outcome.state != "finished" or not outcome.found:
         return outcome.reason or outcome.state
     try:
@@ -126,7 +162,7 @@ def _less(first: Value, second: Value) -> Value:
     return second if isinstance(second, str) else first - second
 
 
-def _mark(outcome: Outcome, found: Value) -> str:
+def _mark(outcome: CellRun, found: Value) -> str:
     if not isinstance(found, str):
         return ""
     return NO_VALUE if outcome.state == "finished" else outcome.state

@@ -11,11 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sweeps.table.cells import Cell, Place, is_counted, metric_of, row_cells
 from rgbt.metrics.named import parse
+from sweeps.table.cells import Cell, CellRun, Place, is_counted, metric_of, row_cells
 
 if TYPE_CHECKING:
-    from sweeps.running.lists import Outcome
     from sweeps.table.table import Column, Row, Table
 
 MIN_ROWS = 3
@@ -86,7 +85,7 @@ def check_metrics(table: Table, rows: Iterable[Row]) -> None:
 
 
 def score(
-    name: str, table: Table, runs: Mapping[tuple[str, int], Outcome], *, scale: str
+    name: str, table: Table, runs: Mapping[tuple[str, int], CellRun], *, scale: str
 ) -> Scored:
     """Compute every cell of the rows that were run.
 

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from analysis.report.store import StoredRun, read_store
-from analysis.report.tables_scored import path_of
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from sweeps.running.found import Found
@@ -44,5 +43,5 @@ def test_without_mlflow_there_is_nothing_to_read(tmp_path: Path) -> None:
 
 
 def test_evaluations_lie_where_sweeps_puts_them(tmp_path: Path) -> None:
-    assert Found("k", tmp_path).counts_file(RGB) == tmp_path / path_of(RGB)
-    assert path_of(RGB) == RGB_FILE
+    assert Found("k", tmp_path).counts_file(RGB) == tmp_path / RGB.path
+    assert RGB.path == RGB_FILE
