@@ -1,0 +1,110 @@
+"""SpatialSeg, Fig. 3: where the samples of each class lie, beside the mIoU of each region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.figures.style import (
+    APART,
+    PAGE,
+    new_figure,
+    readable,
+    region_axis,
+    series_style,
+    styled,
+)
+from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.derive import class_region_occupancy, normalised
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.scores import miou
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class ClassRegions:
+    """Shares of classes over the regions.
+
+    Attributes:
+        classes: K - 1 names, without the background.
+        partition: name of the regions.
+        shares: (K - 1, R) occupancy in percent of the region where the class is most frequent;
+            NaN for a class that occurs nowhere.
+        method: whose IoU `miou` is, or None.
+        miou: (R,) percent, or None.
+    """
+
+    classes: tuple[str, ...]
+    partition: str
+    shares: NDArray[np.float64]
+    method: str | None
+    miou: NDArray[np.float64] | None
+
+
+def class_regions(
+    statistics: SpatialStatistics,
+    part: str = "all",
+    method: tuple[str, Counts] | None = None,
+    absent: Absent = "released",
+) -> ClassRegions:
+    """The series of Fig. 3.
+
+        share_kr = 100 SOR_kr / max_r SOR_kr
+
+    Args:
+        statistics: of a data set; the paper cuts it into nine rings.
+        part: "all", "day" or "night".
+        method: label and counts of a method over the same regions; None: no mIoU is drawn. The
+            mean is over all classes with the background, which the paper does not state.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+
+    Raises:
+        InputError: counts over other regions, or a part that the data set does not hold.
+    """
+    shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
+    scores = None
+    if method is not None:
+        label, counts = method
+        if counts.partition != statistics.partition:
+            raise InputError(
+                f"methods: '{label}' was counted over {counts.partition} but the statistics over "
+                f"{statistics.partition}; score or measure with one partition."
+            )
+        scores = 100 * miou(counts.by_region(), absent)
+    return ClassRegions(
+        classes=tuple(statistics.classes[1:]),
+        partition=statistics.partition,
+        shares=shares,
+        method=None if method is None else method[0],
+        miou=scores,
+    )
+
+
+@styled
+def draw(data: ClassRegions) -> Figure:
+    """One line per class, and the mIoU as a thick black line, all in percent on one axis."""
+    figure = new_figure(PAGE, 2.8)
+    axes = figure.subplots()
+    places = np.arange(1, data.shares.shape[1] + 1)
+    for index, (name, shares) in enumerate(zip(data.classes, data.shares, strict=True)):
+        missing = " (none)" if np.isnan(shares).all() else ""
+        axes.plot(places, shares, label=readable(name) + missing, **series_style(index))
+    if data.miou is not None:
+        line = {"color": APART, "linewidth": 2.2, "marker": "*", "markersize": 7}
+        axes.plot(places, data.miou, label=f"mIoU ({data.method})", **line)  # type: ignore[arg-type]
+    region_axis(axes, len(places), f"region ({data.partition})")
+    axes.set(ylim=(0, 105))
+    axes.set_ylabel("SOR, percent of the class's\nlargest region" + _and_iou(data))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
+    return figure
+
+
+def _and_iou(data: ClassRegions) -> str:
+    return "" if data.miou is None else "; mIoU (%)"

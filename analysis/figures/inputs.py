@@ -1,0 +1,245 @@
+"""What was given on the command line to make a figure from, opened when a figure asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, check_choice, nearest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from omegaconf import DictConfig
+
+    from analysis.predictions.maps import PixelMaps
+    from analysis.statistics.data import SpatialStatistics
+    from rgbt.data.mfnet import MFNet
+    from rgbt.metrics.counts import Counts
+    from rgbt.metrics.metric import Regions
+
+
+@dataclass(frozen=True)
+class Given:
+    """The arguments of one figure.
+
+    Attributes:
+        figure: its name.
+        values: key -> text, those alone that were given.
+        overrides: of the configuration: ``dataset=...``, ``metric=...``.
+        metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
+    """
+
+    figure: str
+    values: Mapping[str, str]
+    overrides: tuple[str, ...]
+    metric: str
+
+    def need(self, key: str, what: str) -> str:
+        """The text of a key.
+
+        Raises:
+            InputError: it was not given; `what` says what it would be.
+        """
+        if key not in self.values:
+            raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
+        return self.values[key]
+
+    def get(self, key: str, default: str) -> str:
+        """The text of a key, or `default`."""
+        return self.values.get(key, default)
+
+    def choice(self, key: str, known: Sequence[str]) -> str:
+        """One of `known`; the first where the key was not given."""
+        value = self.get(key, known[0])
+        check_choice(key, value, known)
+        return value
+
+    def number(self, key: str, default: int) -> int:
+        """A whole number of at least 1 (a seed: at least 0)."""
+        least = 0 if key == "seed" else 1
+        return _whole(key, self.get(key, str(default)), least)
+
+    def fraction(self, key: str, default: float) -> float:
+        """A number such as 0.95."""
+        text = self.get(key, str(default))
+        try:
+            return float(text)
+        except ValueError as error:
+            raise InputError(
+                f"{key} must be a number such as {default:g}, got '{text}'."
+            ) from error
+
+    def numbers(self, key: str, default: Sequence[int]) -> tuple[int, ...]:
+        """Whole numbers of at least 1, with commas between them."""
+        text = self.get(key, ",".join(map(str, default)))
+        return tuple(_whole(key, each, 1) for each in text.split(","))
+
+    def named(self, key: str, what: str) -> dict[str, str]:
+        """Label -> place, of ``label:place,label:place``; without a label the place's last name.
+
+        Raises:
+            InputError: not given, an empty entry, or a label twice.
+        """
+        found: dict[str, str] = {}
+        for entry in self.need(key, what).split(","):
+            label, colon, place = entry.strip().partition(":")
+            place = place if colon else label
+            label = label if colon else Path(place).name
+            if not label or not place:
+                raise InputError(f"{key}={self.values[key]}: expected label:place, got '{entry}'.")
+            if label in found:
+                raise InputError(f"{key}: two entries are called '{label}'; give other labels.")
+            found[label] = place
+        return found
+
+    @property
+    def has_dataset(self) -> bool:
+        """Whether a data set was chosen."""
+        return any(word.startswith("dataset=") for word in self.overrides)
+
+    @cached_property
+    def config(self) -> DictConfig:
+        """The configuration, with the partition of the figure unless another one was given."""
+        from rgbt.command import composing
+        from rgbt.config import compose
+
+        chosen = any(word.startswith("metric=") for word in self.overrides)
+        words = [*([] if chosen else [f"metric={self.metric}"]), *self.overrides]
+        with composing(words):
+            return compose(words)
+
+    @cached_property
+    def dataset(self) -> MFNet:
+        """The data set.
+
+        Raises:
+            InputError: none was chosen.
+        """
+        if not self.has_dataset:
+            raise InputError(
+                f"figure={self.figure} needs dataset=..., for example dataset=mfnet "
+                "dataset.root=/data/MFNet."
+            )
+        made: MFNet = self._built("dataset")
+        return made
+
+    @cached_property
+    def regions(self) -> Regions:
+        """The partition."""
+        made: Regions = self._built("metric")
+        return made
+
+    def _built(self, node: str) -> Any:
+        from rgbt.config import build, check_node
+
+        check_node(self.config[node], node)
+        return build(self.config[node])
+
+    def names(self, number: int) -> tuple[str, ...]:
+        """The images of ``names=``, or the first `number` of the split.
+
+        Raises:
+            InputError: a name that the split lacks, or fewer images than asked for.
+        """
+        split = self.get("split", "test")
+        listed = self.dataset.names(split)
+        if "names" not in self.values:
+            if len(listed) < number:
+                raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
+            return listed[:number]
+        chosen = tuple(self.values["names"].split(","))
+        for name in chosen:
+            if name not in listed:
+                near = nearest(name, listed[:20])
+                raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
+        return chosen
+
+    def maps(self) -> PixelMaps:
+        """The pixel maps of ``maps=``, a file or a folder of `analysis.score`."""
+        from analysis.predictions.maps import PixelMaps
+
+        what = "the folder (or its maps.npz) that python -m analysis.score wrote"
+        return PixelMaps.load(_file(self.need("maps", what), "maps.npz"))
+
+    def statistics(self) -> SpatialStatistics:
+        """Those of ``statistics=``, a file or a folder of `analysis.spatial`, or of ``dataset=``.
+
+        Raises:
+            InputError: neither or both were given.
+        """
+        from analysis.statistics.data import SpatialStatistics
+
+        if ("statistics" in self.values) == self.has_dataset:
+            raise InputError(
+                f"figure={self.figure} needs statistics=..., the folder that python -m "
+                "analysis.spatial wrote, or dataset=... to measure one now (not both)."
+            )
+        if self.has_dataset:
+            return self._measured()
+        return SpatialStatistics.load(_file(self.values["statistics"], "statistics.npz"))
+
+    def _measured(self) -> SpatialStatistics:
+        from analysis.statistics.collect import Settings, collect
+
+        split = self.get("split", "train")
+        settings = Settings(regions=self.regions)
+        with progress("measuring", len(self.dataset.names(split))) as advance:
+            return collect(self.dataset, split, settings, advance)
+
+    def counts(self, key: str, partition: str) -> dict[str, Counts]:
+        """Label -> counts over a partition, of the folders or files that `key` names."""
+        what = "label:folder of what python -m analysis.score wrote, with commas between methods"
+        named = self.named(key, what)
+        return {label: open_counts_file(_path(place), partition) for label, place in named.items()}
+
+
+def open_counts_file(place: Path, partition: str) -> Counts:
+    """The counts over `partition` of a folder of `analysis.score`, or a file of counts.
+
+    Raises:
+        InputError: there are none.
+    """
+    from rgbt.metrics.counts import Counts
+
+    if not place.is_dir():
+        return Counts.load(place)
+    path = place / f"counts_{partition}.npz"
+    if not path.is_file():
+        there = ", ".join(sorted(each.name for each in place.glob("counts*.npz"))) or "no counts"
+        raise InputError(
+            f"{place} lacks {path.name} (it holds {there}); score the predictions over that "
+            "partition with python -m analysis.score."
+        )
+    return Counts.load(path)
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
+    """A bar on stderr; yields what to call after each of `total` steps."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True)) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda: bar.advance(task)
+
+
+def _whole(key: str, text: str, least: int) -> int:
+    if not text.strip().isdecimal() or int(text) < least:
+        raise InputError(f"{key} must be whole numbers of at least {least}, got '{text}'.")
+    return int(text)
+
+
+def _file(text: str, name: str) -> Path:
+    """A file, or the one called `name` in a folder that the other commands wrote."""
+    path = _path(text)
+    return path / name if path.is_dir() else path
+
+
+def _path(text: str) -> Path:
+    return Path(text).expanduser()

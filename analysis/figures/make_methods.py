@@ -1,0 +1,134 @@
+"""From arguments to figures of methods: qualitative panels, heat maps and profiles by region."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from analysis.figures.inputs import Given, progress
+from rgbt.checks import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from analysis.figures.panels import ReadPrediction
+    from analysis.figures.profiles import Profile
+    from analysis.predictions.images import Reader
+    from rgbt.metrics.counts import Counts
+
+ABSENT = ("released", "exclude")
+PREDICTIONS = "label:folder of predicted label images, with commas between methods"
+
+
+def panel(given: Given) -> Figure:
+    """Images, ground truth and predictions."""
+    from analysis.figures import panels
+    from analysis.predictions.images import Format, Reader
+    from rgbt.tracking.terminal import tell
+
+    folders = {
+        label: Path(place).expanduser()
+        for label, place in given.named("methods", PREDICTIONS).items()
+    }
+    layout = given.choice("layout", panels.LAYOUTS)
+    form: Any = given.choice("format", get_args(Format))
+    dataset = given.dataset
+    reader = Reader(dataset.classes, dataset.palette, form)
+    rule = given.choice("pick", panels.RULES)
+    if "names" in given.values and ("pick" in given.values or "rows" in given.values):
+        raise InputError("names= says which images are shown; leave pick= and rows= out.")
+    if rule == "largest_difference":
+        names = _most_different(given, folders, form)
+    else:
+        names = given.names(given.number("rows", 4))
+    suffix = given.get("suffix", "")
+    readers = {label: _reading(folder, reader, suffix) for label, folder in folders.items()}
+    made = panels.panel(dataset, readers, names, given.regions)
+    for row in made.rows:
+        scores = zip(made.methods, row.mious, strict=True)
+        tell(f"{row.name}: " + ", ".join(f"{label} mIoU {each:.1f}" for label, each in scores))
+    return panels.draw(made, layout)
+
+
+def _most_different(given: Given, folders: dict[str, Path], form: Any) -> tuple[str, ...]:
+    from analysis.figures.panels import image_mious, most_different
+    from analysis.predictions.scoring import Options, score_folder
+
+    split = given.get("split", "test")
+    options = Options(partitions=("ring",), regions=1, form=form, suffix=given.get("suffix", ""))
+    mious = {}
+    with progress("comparing", len(folders) * len(given.dataset.names(split))) as advance:
+        for label, folder in folders.items():
+            (counts,) = score_folder(folder, given.dataset, split, options, advance).counts
+            mious[label] = image_mious(counts)
+    return most_different(mious, given.dataset.names(split), given.number("rows", 4))
+
+
+def _reading(folder: Path, reader: Reader, suffix: str) -> ReadPrediction:
+    def read(name: str) -> Any:
+        path = folder / f"{name}{suffix}.png"
+        if not path.is_file():
+            raise InputError(
+                f"methods: there is no prediction {path}; name a folder that holds NAME{suffix}.png"
+                " for every image shown, or other images with names=..."
+            )
+        return reader.read(path)
+
+    return read
+
+
+def region_heat(given: Given) -> Figure:
+    """Regions painted by their mIoU."""
+    from analysis.figures import profiles, regions
+
+    height, times, width = given.get("size", "480x640").partition("x")
+    if not (times and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise InputError(f"size must be HEIGHTxWIDTH in pixels, got '{given.get('size', '')}'.")
+    absent: Any = given.choice("absent", ABSENT)
+    methods = [
+        profiles.means_only(label, seeds, absent) for label, seeds in _methods(given).items()
+    ]
+    return regions.draw_heat(regions.region_heat(methods, (int(height), int(width))))
+
+
+def region_profile(given: Given) -> Figure:
+    """MIoU over the regions with bands."""
+    from analysis.figures.profiles import draw_profiles
+
+    return draw_profiles(_profiles(given))
+
+
+def _profiles(given: Given) -> list[Profile]:
+    from analysis.figures.profiles import BANDS, profile
+    from analysis.uncertainty import Resampling
+
+    band: Any = given.choice("band", BANDS)
+    blocks: Any = given.get("blocks", "auto")
+    absent: Any = given.choice("absent", ABSENT)
+    settings = Resampling(
+        resamples=given.number("resamples", 10_000),
+        level=given.fraction("level", 0.95),
+        blocks=int(blocks) if blocks.isdecimal() else blocks,
+        absent=absent,
+    )
+    methods = _methods(given)
+    made = []
+    with progress("resampling", len(methods)) as advance:
+        for label, seeds in methods.items():
+            made.append(profile(label, seeds, settings, band))
+            advance()
+    return made
+
+
+def _methods(given: Given) -> dict[str, list[Counts]]:
+    """Label -> counts of its seeds; entries with one label are seeds of one method."""
+    from analysis.results import open_counts
+
+    text = given.need("runs", "runs, groups or files of counts, with commas; label:run names one")
+    runs_dir, split = Path(given.get("runs_dir", "runs")).expanduser(), given.get("split", "test")
+    found: dict[str, list[Counts]] = {}
+    for word in text.split(","):
+        label, colon, place = word.strip().partition(":")
+        for stored in open_counts(place if colon else label, runs_dir, split):
+            found.setdefault(label if colon else stored.label, []).append(stored.counts)
+    return found

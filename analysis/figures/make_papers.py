@@ -1,0 +1,156 @@
+"""From arguments to single figures of the papers, each read from `Given`.
+
+Everything heavy is imported when a figure is made, so that the list of figures is there at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.figures.inputs import Given
+from rgbt.checks import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ABSENT = ("released", "exclude")
+PARTS = ("all", "day", "night")
+STRIPS_AND_RINGS = ("vertical", "horizontal", "ring")
+
+
+def spatialseg_fig1(given: Given) -> Figure:
+    """Heat maps of IoU and of sample occupancy."""
+    from analysis.figures import maps
+
+    heats = []
+    has_statistics = "statistics" in given.values or given.has_dataset
+    if "maps" not in given.values and not has_statistics:
+        raise InputError(
+            f"figure={given.figure} needs maps=... (folder of python -m analysis.score) for the "
+            "IoU, statistics=... (of python -m analysis.spatial) or dataset=... for the sample "
+            "occupancy, or both."
+        )
+    if "maps" in given.values:
+        heats.append(maps.iou_heat(given.maps(), given.regions))
+    if has_statistics:
+        part = given.choice("part", PARTS)
+        heats.append(maps.occupancy_heat(given.statistics(), given.regions, part))
+    return maps.draw_heats(heats)
+
+
+def spatialseg_fig2(given: Given) -> Figure:
+    """IoU, accuracy and occupancy over three partitions."""
+    from analysis.figures import trends
+    from analysis.figures.maps import occupancy_over
+    from rgbt.metrics.metric import Regions
+
+    regions, absent = given.number("regions", 5), given.choice("absent", ABSENT)
+    counts = {each: given.counts("methods", f"{each}{regions}") for each in STRIPS_AND_RINGS}
+    statistics = given.statistics()
+    hw = statistics.region_map.shape
+    series = []
+    for partition, methods in counts.items():
+        aspect = "image" if partition == "ring" else None
+        chosen: Any = {"partition": partition, "aspect": aspect, "absent": absent}
+        region_map = Regions(regions=regions, **chosen).map((hw[0], hw[1]))
+        occupancy = occupancy_over(statistics, region_map)
+        series.append(trends.trend(partition, occupancy, methods, chosen["absent"]))
+    return trends.draw(series)
+
+
+def spatialseg_fig3(given: Given) -> Figure:
+    """Occupancy of each class, and mIoU, by region."""
+    from analysis.figures import classes
+
+    statistics = given.statistics()
+    method = None
+    if "methods" in given.values:
+        methods = given.counts("methods", statistics.partition)
+        if len(methods) != 1:
+            raise InputError(f"methods: {given.figure} shows one method, got {len(methods)}.")
+        method = next(iter(methods.items()))
+    absent: Any = given.choice("absent", ABSENT)
+    return classes.draw(
+        classes.class_regions(statistics, given.choice("part", PARTS), method, absent)
+    )
+
+
+def spatialseg_fig4(given: Given) -> Figure:
+    """A partition over a heat map or an image."""
+    from analysis.figures import maps
+    from analysis.predictions.maps import iou_map
+    from analysis.statistics.derive import occupancy_map
+
+    sources = [key for key in ("maps", "statistics") if key in given.values]
+    if len(sources) + given.has_dataset != 1:
+        raise InputError(
+            f"figure={given.figure} needs one picture: maps=... (folder of python -m "
+            "analysis.score), statistics=... (of python -m analysis.spatial), or dataset=... for "
+            "its first image or that of names=..."
+        )
+    picture: Any
+    if given.has_dataset:
+        picture = given.dataset.read(given.names(1)[0]).rgb
+    elif sources == ["maps"]:
+        picture = iou_map(given.maps())
+    else:
+        picture = occupancy_map(given.statistics())
+    region_map = given.regions.map((picture.shape[0], picture.shape[1]))
+    return maps.draw_regions(maps.RegionPicture(picture, region_map, given.regions.name))
+
+
+def spatialseg_fig5(given: Given) -> Figure:
+    """Laplacian variance by region."""
+    from analysis.figures import image_quality
+    from analysis.statistics.resampling import Blocks
+
+    statistics = given.statistics()
+    return image_quality.draw(image_quality.laplacian_series(statistics, Blocks(statistics)))
+
+
+def spatialseg_fig6(given: Given) -> Figure:
+    """Signal-to-noise ratio by region."""
+    from analysis.figures import image_quality
+    from analysis.statistics.derive import AVERAGES
+    from analysis.statistics.measure import ESTIMATORS
+    from analysis.statistics.resampling import Blocks
+
+    estimator, average = given.choice("estimator", ESTIMATORS), given.choice("average", AVERAGES)
+    statistics = given.statistics()
+    series = image_quality.snr_series(statistics, Blocks(statistics), estimator, average)
+    return image_quality.draw(series)
+
+
+def temporal_fig5(given: Given) -> Figure:
+    """TC and CA by class."""
+    from analysis.figures import consistency
+
+    path = given.need("scores", "a CSV file with the columns class,variant,tc,ca (percent)")
+    return consistency.draw(
+        consistency.class_consistency(consistency.read_scores(Path(path).expanduser()))
+    )
+
+
+def multihead_fig3(given: Given) -> Figure:
+    """Gradients of two losses."""
+    from analysis.figures import gradients
+
+    del given  # analytic: made from nothing
+    return gradients.draw(gradients.gradient_curves())
+
+
+def crm_fig5(given: Given) -> Figure:
+    """Masks on a pair of images."""
+    from analysis.figures import masks
+    from rgbt.config import build, check_node, compose
+
+    patches = given.numbers("patches", masks.PATCHES)
+    sample = given.dataset.read(given.names(1)[0])
+    maskers = {}
+    for title, overrides in masks.masker_overrides(patches).items():
+        node = compose(overrides).masker
+        check_node(node, "masker")
+        maskers[title] = build(node)
+    multiple = masks.whole_cells(patches)
+    return masks.draw(masks.mask_examples(sample, maskers, multiple, given.number("seed", 0)))

@@ -1,0 +1,239 @@
+"""SpatialSeg, Figs. 1 and 4: heat maps over pixel positions, and the regions drawn on a picture.
+
+The paper does not state how large its "centre" and its "edge" are. Here they are the innermost and
+the outermost ring of the partition, which stands in the figure and can be changed with ``metric=``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.figures.style import (
+    COLUMN,
+    MAP_COLOURS,
+    PAGE,
+    draw_borders,
+    new_figure,
+    number,
+    show_image,
+    styled,
+)
+from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.derive import occupancy_map, occupancy_of
+from rgbt.checks import InputError
+from rgbt.metrics.metric import Regions
+from rgbt.metrics.scores import class_mean
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from analysis.predictions.maps import PixelMaps
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """A value at every pixel position, and the three numbers of Fig. 1.
+
+    Attributes:
+        what: "IoU" or "sample occupancy".
+        source: what it is of: a method, or a data set with its split.
+        values: (H, W) in 0..1; NaN: nothing to score at that position.
+        centre: of the innermost region, 0..1.
+        edge: of the outermost region.
+        whole: of the whole image.
+        region_map: (H, W) region of every pixel.
+        partition: its name.
+    """
+
+    what: str
+    source: str
+    values: NDArray[np.float64]
+    centre: float
+    edge: float
+    whole: float
+    region_map: NDArray[np.uint8]
+    partition: str
+
+
+@dataclass(frozen=True)
+class RegionPicture:
+    """A partition over a picture, Fig. 4.
+
+    Attributes:
+        picture: (H, W) in 0..1 for a heat map, or (H, W, 3) uint8.
+        region_map: (H, W) region of every pixel.
+        partition: its name.
+    """
+
+    picture: NDArray[Any]
+    region_map: NDArray[np.uint8]
+    partition: str
+
+
+def iou_heat(maps: PixelMaps, regions: Regions) -> HeatMap:
+    """Pixel-level IoU, mean over classes (Fig. 1a).
+
+    The three numbers are not means over pixels of the map: intersections and unions are added up
+    over the pixels of a region first, as for every regional IoU of the tables. The map itself
+    leaves classes out that never occur at a pixel, see `analysis.predictions.maps.iou_map`.
+
+    Args:
+        maps: intersections and unions of a method's predictions.
+        regions: a partition into rings, and how a class counts that a ring lacks.
+
+    Raises:
+        InputError: a partition that has no centre.
+    """
+    from analysis.predictions.maps import iou_map
+
+    region_map = ring_map(regions, maps.intersection.shape[1:])
+
+    def pooled(chosen: NDArray[np.bool_]) -> float:
+        right = maps.intersection[:, chosen].sum(1, dtype=np.int64)
+        either = maps.union[:, chosen].sum(1, dtype=np.int64)
+        nothing = 0.0 if regions.absent == "released" else np.nan
+        ious = np.where(either > 0, right / np.maximum(either, 1), nothing)
+        return float(class_mean(ious))
+
+    return HeatMap(
+        what="IoU",
+        source=maps.name,
+        values=iou_map(maps),
+        centre=pooled(region_map == 0),
+        edge=pooled(region_map == regions.regions - 1),
+        whole=pooled(np.ones_like(region_map, bool)),
+        region_map=region_map,
+        partition=regions.name,
+    )
+
+
+def occupancy_heat(statistics: SpatialStatistics, regions: Regions, part: str = "all") -> HeatMap:
+    """Sample occupancy rate (Fig. 1b; Eq. 1), with its mean over rings (Eq. 2).
+
+    Args:
+        statistics: of a data set, with any partition.
+        regions: a partition into rings.
+        part: "all", "day" or "night".
+
+    Raises:
+        InputError: a partition that has no centre, or a part that the data set does not hold.
+    """
+    values = occupancy_map(statistics, part)
+    region_map = ring_map(regions, values.shape)
+    by_region = occupancy_over(statistics, region_map, part)
+    whole = occupancy_over(statistics, np.zeros_like(region_map), part)
+    return HeatMap(
+        what="sample occupancy",
+        source=f"{statistics.dataset}, {statistics.split}" + ("" if part == "all" else f", {part}"),
+        values=values,
+        centre=float(by_region[0]),
+        edge=float(by_region[-1]),
+        whole=float(whole[0]),
+        region_map=region_map,
+        partition=regions.name,
+    )
+
+
+def occupancy_over(
+    statistics: SpatialStatistics, region_map: NDArray[np.uint8], part: str = "all"
+) -> NDArray[np.float64]:
+    """Sample occupancy rate (Eq. 2) over any regions, also others than were measured.
+
+    Args:
+        statistics: hold, at every pixel, how many images have which class there.
+        region_map: (H, W) region of every pixel.
+        part: "all", "day" or "night".
+
+    Returns:
+        (R,) in 0..1, as `analysis.statistics.derive.region_occupancy` for the measured regions.
+    """
+    occupied = statistics.select(part).occupied.sum(0)
+    index = region_map.ravel()
+    pixels = [np.bincount(index, of_class.ravel()) for of_class in occupied]
+    return occupancy_of(np.stack(pixels, axis=1))
+
+
+def ring_map(regions: Regions, image_hw: Sequence[int]) -> NDArray[np.uint8]:
+    """The map of a partition that has a centre.
+
+    Raises:
+        InputError: it has none.
+    """
+    if regions.partition != "ring":
+        raise InputError(
+            f"metric.partition={regions.partition} has no centre and no edge; use rings, for "
+            "example metric=ring5."
+        )
+    return regions.map((image_hw[0], image_hw[1]))
+
+
+@styled
+def draw_heats(heats: Sequence[HeatMap]) -> Figure:
+    """One panel per map with its three numbers, and one scale from 0 to 1 for all (Fig. 1)."""
+    wide = len(heats) > 1
+    height, width = heats[0].values.shape
+    panel = (PAGE - 0.8) / len(heats) if wide else COLUMN - 0.6
+    figure = new_figure(PAGE if wide else COLUMN, panel * height / width + 0.62)
+    panels = figure.subplots(1, len(heats), squeeze=False)[0]
+    for index, (axes, heat) in enumerate(zip(panels, heats, strict=True)):
+        shown = show_image(axes, heat.values, cmap=MAP_COLOURS, vmin=0, vmax=1)
+        # The borders of centre and edge alone: 0 centre, 1 between, 2 edge.
+        is_edge = heat.region_map == heat.region_map.max()
+        draw_borders(axes, (heat.region_map > 0).astype(np.uint8) + is_edge)
+        letter = f"({'ab'[index]}) " if wide else ""
+        axes.set_title(f"{letter}{heat.what}: {heat.source}")
+        axes.set_xlabel(_three_numbers(heat), fontsize=7)
+    figure.colorbar(shown, ax=list(panels), shrink=0.8, pad=0.015)  # type: ignore[arg-type]
+    return figure
+
+
+def _three_numbers(heat: HeatMap) -> str:
+    numbers = (("centre", heat.centre), ("edge", heat.edge), ("image", heat.whole))
+    text = ", ".join(f"{name} {100 * value:.1f} %" for name, value in numbers)
+    return f"{text}\ncentre, edge: inner and outer region of {heat.partition}"
+
+
+@styled
+def draw_regions(data: RegionPicture) -> Figure:
+    """The regions numbered from 1 over the picture (Fig. 4)."""
+    height, width = data.region_map.shape
+    is_map = data.picture.ndim == 2
+    figure = new_figure(COLUMN, (COLUMN - (0.5 if is_map else 0.1)) * height / width + 0.1)
+    axes = figure.subplots()
+    how = {"cmap": MAP_COLOURS, "vmin": 0, "vmax": 1} if is_map else {}
+    shown = show_image(axes, data.picture, **how)
+    draw_borders(axes, data.region_map)
+    for index, place in enumerate(number_beside(data.region_map)):
+        if place is not None:
+            number(axes, place, str(index + 1))
+    if is_map:
+        figure.colorbar(shown, ax=axes, shrink=0.9, pad=0.02)  # type: ignore[arg-type]
+    return figure
+
+
+def number_beside(region_map: NDArray[np.uint8]) -> list[tuple[int, int] | None]:
+    """(row, column) for the number of each region; None for an empty one.
+
+    Rings are numbered on their right side: images are wider than high, and so are rings there.
+    """
+    from rgbt.tracking.pictures import number_places
+
+    places = number_places(region_map.astype(np.int64), int(region_map.max()) + 1)
+    row, middle = region_map.shape[0] // 2, region_map.shape[1] // 2
+    for region in range(len(places)):
+        if is_around(region_map, region):
+            columns = np.flatnonzero(region_map[row, middle:] == region)
+            places[region] = (row, middle + round(float(columns.mean())))
+    return places
+
+
+def is_around(region_map: NDArray[np.uint8], region: int) -> bool:
+    """Whether a region lies on both sides of the image's centre but not on it: an outer ring."""
+    row, middle = region_map.shape[0] // 2, region_map.shape[1] // 2
+    line = region_map[row] == region
+    return bool(line[:middle].any() and line[middle:].any() and not line[middle])

@@ -1,0 +1,160 @@
+"""CRM, Fig. 5: examples of masks, a square and patches of several sizes, on one pair of images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.figures.style import PAGE, new_figure, pack, show_image, styled
+from rgbt.checks import InputError
+
+if TYPE_CHECKING:
+    import torch
+    from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from rgbt.types import Sample
+
+PATCHES = (8, 16, 32, 64)
+"""Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b)."""
+
+STRIDE = 32
+"""Maskers cut images whose sides are multiples of this; others they would pad with black."""
+
+HIDDEN = (150, 190, 230)
+"""Colour of a hidden pixel: a grey one would be lost in a thermal image."""
+
+
+class MaskPair(NamedTuple):
+    """Cells (B, h, w) that are hidden, as a masker returns them."""
+
+    rgb: Tensor
+    thermal: Tensor
+
+
+class DrawsMasks(Protocol):
+    """A masker, see `rgbt.types.Masker`."""
+
+    def __call__(
+        self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
+    ) -> MaskPair:
+        """Cells of RGB and of thermal that are hidden."""
+        ...
+
+
+@dataclass(frozen=True)
+class MaskExample:
+    """One mask on a pair of images.
+
+    Attributes:
+        title: above its column.
+        rgb: (H, W, 3) uint8, hidden pixels in the colour `HIDDEN`.
+        thermal: the same, grey elsewhere.
+        rgb_hidden: (H, W) bool.
+        thermal_hidden: (H, W) bool.
+    """
+
+    title: str
+    rgb: NDArray[np.uint8]
+    thermal: NDArray[np.uint8]
+    rgb_hidden: NDArray[np.bool_]
+    thermal_hidden: NDArray[np.bool_]
+
+
+def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
+    """Title -> what chooses the masker of each column of Fig. 5: a square, then the patches.
+
+    The pairing is the complementary one: what one image hides, the other shows.
+    """
+    square = ("masker=square", "masker.pairing=comp")
+    each = ("masker=crm", "masker.pairing=comp")
+    by_size = {f"{size} x {size} pixels": (*each, f"masker.patch_size={size}") for size in patches}
+    return {"square": square, **by_size}
+
+
+def mask_examples(
+    sample: Sample, maskers: Mapping[str, DrawsMasks], multiple: int, seed: int
+) -> tuple[MaskExample, ...]:
+    """The pair under each mask.
+
+    The images are cut around their centre to whole cells: 64 pixels do not divide 480.
+
+    Args:
+        sample: a pair of the data set.
+        maskers: title -> masker.
+        multiple: number of pixels that every cell divides.
+        seed: every mask is drawn from it and its place among the maskers.
+
+    Raises:
+        InputError: the images are smaller than one cell.
+    """
+    import torch
+
+    from rgbt.randomness import torch_generator
+
+    rgb, thermal = (_cut(image, multiple, sample.name) for image in (sample.rgb, sample.thermal))
+    height, width = thermal.shape
+    centre = torch.tensor([[height // 2, width // 2]])
+    examples = []
+    for index, (title, masker) in enumerate(maskers.items()):
+        pair = masker((height, width), centre, torch_generator(seed, "figure masks", index))
+        hidden = [_pixels(cells[0].numpy(), (height, width)) for cells in (pair.rgb, pair.thermal)]
+        shown = [_hide(image, each) for image, each in zip((rgb, thermal), hidden, strict=True)]
+        examples.append(MaskExample(title, shown[0], shown[1], hidden[0], hidden[1]))
+    return tuple(examples)
+
+
+def whole_cells(patches: Sequence[int]) -> int:
+    """Number of pixels that all patch sizes and the stride of the networks divide.
+
+    Raises:
+        InputError: a size that is not positive.
+    """
+    if min(patches) < 1:
+        raise InputError(f"patches must be positive numbers of pixels, got {min(patches)}.")
+    return math.lcm(STRIDE, *patches)
+
+
+def _cut(image: NDArray[np.uint8], multiple: int, name: str) -> NDArray[np.uint8]:
+    """The largest centred part whose sides are multiples of `multiple`."""
+    sides = [length // multiple * multiple for length in image.shape[:2]]
+    if min(sides) == 0:
+        raise InputError(
+            f"'{name}' has {image.shape[0]}x{image.shape[1]} pixels, less than cells of {multiple} "
+            "need; give smaller ones, for example patches=8,16."
+        )
+    top, left = ((length - side) // 2 for length, side in zip(image.shape, sides, strict=False))
+    return image[top : top + sides[0], left : left + sides[1]]
+
+
+def _pixels(cells: NDArray[np.bool_], image_hw: tuple[int, int]) -> NDArray[np.bool_]:
+    side = (image_hw[0] // cells.shape[0], image_hw[1] // cells.shape[1])
+    return np.kron(cells, np.ones(side, bool))
+
+
+def _hide(image: NDArray[np.uint8], hidden: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    shown = image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+    shown[hidden] = HIDDEN
+    return shown
+
+
+@styled
+def draw(examples: Sequence[MaskExample]) -> Figure:
+    """One column per mask; RGB above, thermal below."""
+    height, width = examples[0].thermal_hidden.shape
+    cell = (PAGE - 0.2) / len(examples)
+    figure = new_figure(PAGE, 2 * (cell * height / width + 0.02) + 0.18)
+    pack(figure)
+    axes = figure.subplots(2, len(examples), squeeze=False)
+    for column, example in enumerate(examples):
+        show_image(axes[0, column], example.rgb)
+        show_image(axes[1, column], example.thermal)
+        axes[0, column].set_title(example.title)
+    axes[0, 0].set_ylabel("RGB")
+    axes[1, 0].set_ylabel("thermal")
+    return figure

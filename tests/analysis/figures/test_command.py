@@ -1,0 +1,227 @@
+"""The command: the list, what each figure needs, and one file per figure."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from analysis.figures.__main__ import OF_FIGURES, OWN, main
+from analysis.figures.catalogue import FIGURES
+from analysis.predictions.scoring import Options, score_folder
+from rgbt.command import plain_command
+from rgbt.data.mfnet import MFNet
+from tests.analysis.figures.drawn import counts, statistics, strips
+from tests.commands import Call
+
+ENTRY = plain_command(OWN, main)
+NAMES = [f"{index:05d}{'DN'[index % 2]}" for index in range(12)]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a data set, predictions of two methods, their scores, and statistics."""
+    folder = tmp_path_factory.mktemp("made")
+    _write_dataset(folder / "mf")
+    dataset = MFNet(str(folder / "mf"))
+    for method, shift in (("a", 0), ("b", 1)):
+        (folder / method).mkdir()
+        for index, name in enumerate(NAMES):
+            label = dataset.read(name).label
+            assert label is not None
+            wrong = (label + shift * (np.arange(96) < index)) % 9
+            cv2.imwrite(str(folder / method / f"{name}.png"), wrong.astype(np.uint8))
+        scored = score_folder(folder / method, dataset, "test", Options(regions=5, threads=1))
+        for each in scored.counts:
+            each.save(folder / method / f"counts_{each.partition}.npz")
+        assert scored.maps is not None
+        scored.maps.save(folder / method / "maps.npz")
+    labels = np.random.default_rng(0).integers(0, 3, (20, 64, 96), dtype=np.uint8)
+    night = np.arange(20) % 2 == 0
+    statistics(labels, strips(5, "ring"), night).save(folder / "statistics.npz")
+    (folder / "scores.csv").write_text("class,variant,tc,ca\ncar,(G),60,50\n")
+    return folder
+
+
+def _write_dataset(root: Path) -> None:
+    rng = np.random.default_rng(0)
+    for folder in ("images", "labels"):
+        (root / folder).mkdir(parents=True)
+    for split in ("train", "test"):
+        (root / f"{split}.txt").write_text("\n".join(NAMES))
+    for name in NAMES:
+        pair = rng.integers(0, 256, (64, 96, 4), dtype=np.uint8)
+        cv2.imwrite(str(root / "images" / f"{name}.png"), pair)
+        label = np.kron(rng.integers(0, 9, (4, 6), dtype=np.uint8), np.ones((16, 16), np.uint8))
+        cv2.imwrite(str(root / "labels" / f"{name}.png"), label)
+
+
+def arguments(figure: str, folder: Path) -> list[str]:
+    """What draws `figure` from the files of `made`."""
+    given = {
+        "dataset": ["dataset=mfnet", f"dataset.root={folder / 'mf'}"],
+        "map folder": [f"maps={folder / 'a'}"],
+        "statistics": [f"statistics={folder / 'statistics.npz'}"],
+        "statistics folder": [f"statistics={folder}"],
+        "methods": [f"methods=A:{folder / 'a'},B:{folder / 'b'}"],
+        "one": [f"methods=A:{folder / 'a'}"],
+        "scores": [f"scores={folder / 'scores.csv'}"],
+        "runs": [
+            f"runs=A:{folder / 'a' / 'counts_ring5.npz'},B:{folder / 'b' / 'counts_ring5.npz'}"
+        ],
+        "fast": ["resamples=100", "blocks=none"],
+        "different": ["pick=largest_difference", "rows=2"],
+        "columns": ["layout=columns", "names=00003N,00004D"],
+        "patches": ["patches=8,16"],
+    }
+    needed = {
+        "spatialseg/fig1": ("map folder", "statistics folder"),
+        "spatialseg/fig2": ("methods", "statistics"),
+        "spatialseg/fig3": ("one", "statistics"),
+        "spatialseg/fig4": ("dataset",),
+        "spatialseg/fig5": ("statistics",),
+        "spatialseg/fig6": ("dataset",),
+        "spatialseg/fig8": ("dataset", "methods", "different"),
+        "spatialseg/fig9": ("dataset", "methods"),
+        "temporal/fig5": ("scores",),
+        "temporal/fig6": ("dataset", "methods", "columns"),
+        "crm/fig4": ("dataset", "one"),
+        "crm/fig5": ("dataset", "patches"),
+        "multihead/fig3": (),
+        "regions/heat": ("runs",),
+        "regions/profile": ("runs", "fast"),
+    }
+    return [word for name in needed[figure] for word in given[name]]
+
+
+SAME = ("spatialseg/fig9", "crm/fig4")
+"""Drawn by the same lines as spatialseg/fig8, from other data."""
+
+
+@pytest.mark.parametrize(
+    "figure",
+    [pytest.param(each, marks=pytest.mark.slow if each in SAME else ()) for each in FIGURES],
+)
+def test_every_figure_is_drawn(call: Call, made: Path, tmp_path: Path, figure: str) -> None:
+    out = tmp_path / "drawn" / "figure.svg"
+    code, said, err = call(ENTRY, f"figure={figure}", f"out={out}", *arguments(figure, made))
+    assert (code, said.strip()) == (0, str(out)), err
+    assert "<svg" in out.read_text()[:1000]
+
+
+def test_largest_difference_takes_the_images_that_differ_most(
+    call: Call, made: Path, tmp_path: Path
+) -> None:
+    words = arguments("spatialseg/fig8", made)
+    _, _, err = call(ENTRY, "figure=spatialseg/fig8", f"out={tmp_path / 'f.png'}", *words)
+    lines = [line for line in err.splitlines() if "mIoU" in line]
+    # Method b is wrong in as many columns as the number in the name.
+    assert [line.split()[1] for line in lines] == ["00011N:", "00010D:"]
+    assert "A mIoU 100.0" in lines[0]
+
+
+def test_lists_every_figure_with_what_it_needs(call: Call) -> None:
+    code, out, _ = call(ENTRY)
+    assert code == 0
+    for name, entry in FIGURES.items():
+        (line,) = [line for line in out.splitlines() if line.split()[:1] == [name]]
+        assert entry.shows in line
+        assert entry.needs in line
+    assert "no command writes yet" in out
+
+
+def test_keys_of_figures_are_keys_of_the_command() -> None:
+    used = {key for entry in FIGURES.values() for key in entry.keys}
+    assert used == set(OF_FIGURES)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["figure=spatialseg/fig7", "out=f.pdf"], "did you mean 'spatialseg/fig"),
+        (["figure=spatialseg/fig5"], "'out' has no value"),
+        (["figure=spatialseg/fig5", "out=f.jpg"], "ends in .pdf, .svg or .png, got '.jpg'"),
+        (["figure=spatialseg/fig5", "out=f.pdf"], "needs statistics=..., the folder"),
+        (["figure=spatialseg/fig1", "out=f.pdf"], "needs maps=..."),
+        (["figure=spatialseg/fig2", "out=f.pdf"], "needs methods=..., label:folder"),
+        (["figure=spatialseg/fig4", "out=f.pdf"], "needs one picture: maps=..."),
+        (["figure=spatialseg/fig8", "out=f.pdf"], "needs methods=..., label:folder of predicted"),
+        (["figure=spatialseg/fig8", "out=f.pdf", "methods=a:b"], "needs dataset=..."),
+        (["figure=crm/fig5", "out=f.pdf"], "needs dataset=..."),
+        (["figure=temporal/fig5", "out=f.pdf"], "needs scores=..., a CSV file"),
+        (["figure=regions/heat", "out=f.pdf"], "needs runs=..."),
+        (["figure=regions/heat", "out=f.pdf", "size=big"], "size must be HEIGHTxWIDTH"),
+        (["figure=multihead/fig3", "out=f.pdf", "maps=m.npz"], "'maps' has no effect on figure="),
+        (["figure=multihead/fig3", "out=f.pdf", "metric=ring9"], "'metric' has no effect on"),
+        (["figure=spatialseg/fig2", "out=f.pdf", "methods=a:x,a:y"], "two entries are called 'a'"),
+        (["figure=spatialseg/fig2", "out=f.pdf", "methods=a:"], "expected label:place, got 'a:'"),
+        (
+            ["figure=spatialseg/fig2", "out=f.pdf", "regions=0", "methods=a:x"],
+            "at least 1, got '0'",
+        ),
+        (["figure=spatialseg/fig6", "out=f.pdf", "estimator=median"], "estimator: 'median' is not"),
+        (["figure=spatialseg/fig5", "out=f.pdf", "statistics=no.npz"], "no file of statistics"),
+        (["figure=spatialseg/fig1", "out=f.pdf", "maps=no.npz"], "no file of pixel maps 'no.npz'"),
+        (["maps=m.npz"], "'maps' needs the name of a figure"),
+    ],
+)
+def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentence: str) -> None:
+    code, out, err = call(ENTRY, *words)
+    assert (code, out) == (2, "")
+    assert sentence in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("figure", "change", "sentence"),
+    [
+        ("spatialseg/fig5", ["dataset=mfnet"], "(not both)"),
+        ("spatialseg/fig4", ["names=00099D"], "split 'test' has no image '00099D'"),
+        ("spatialseg/fig8", ["names=00001N"], "leave pick= and rows= out"),
+        ("spatialseg/fig9", ["rows=13"], "rows=13, but split 'test' has 12 images"),
+        ("spatialseg/fig9", ["suffix=_pred"], "no prediction"),
+        ("spatialseg/fig2", ["regions=3"], "lacks counts_vertical3.npz (it holds counts_h"),
+        ("spatialseg/fig1", ["metric=vertical5"], "no centre and no edge"),
+        ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
+        ("regions/profile", ["level=high"], "level must be a number such as 0.95, got 'high'"),
+        ("regions/profile", ["band=seeds"], "band=seeds needs at least two seeds, but 'A' has one"),
+    ],
+)
+def test_input_that_does_not_fit(
+    call: Call, made: Path, tmp_path: Path, figure: str, change: list[str], sentence: str
+) -> None:
+    words = [*arguments(figure, made), *change]
+    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
+    assert code == 2
+    assert sentence in " ".join(err.split())
+
+
+def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Path) -> None:
+    for name in ("s0", "s1"):
+        rng = np.random.default_rng(len(name))
+        counts(rng.integers(1, 9, (20, 2, 2, 2))).save(tmp_path / f"{name}.npz")
+    runs = ",".join(f"ours:{tmp_path / name}.npz" for name in ("s0", "s1"))
+    out = tmp_path / "f.svg"
+    words = [f"runs={runs}", f"out={out}", "resamples=100", "blocks=none"]
+    code, _, err = call(ENTRY, "figure=regions/profile", *words)
+    assert code == 0, err
+    assert "2 seeds, 20 images" in out.read_text()
+
+
+def test_help_does_not_wait_for_heavy_libraries() -> None:
+    script = (
+        "import sys; sys.argv = ['x', '--help']\n"
+        "from analysis.figures.__main__ import OWN, main\n"
+        "from rgbt.command import plain_command\n"
+        "try:\n    plain_command(OWN, main)()\nexcept SystemExit:\n    pass\n"
+        "print([m for m in ('torch', 'matplotlib', 'mlflow', 'pandas', 'cv2') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip().endswith("[]")
+    assert "figure       name" in done.stdout

@@ -1,0 +1,94 @@
+"""SpatialSeg, Figs. 5 and 6."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.figures.image_quality import draw, laplacian_series, snr_series
+from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.resampling import Blocks
+from rgbt.checks import InputError
+from tests.analysis.figures.drawn import statistics, strips, texts
+
+LABELS = np.zeros((40, 4, 6), np.uint8)
+NIGHT = np.arange(40) >= 20
+
+
+@pytest.fixture
+def measured() -> SpatialStatistics:
+    """See `drawn.statistics` for its values."""
+    return statistics(LABELS, strips(3), NIGHT)
+
+
+def blocks(stats: SpatialStatistics) -> Blocks:
+    return Blocks(stats, size=2, resamples=400)
+
+
+def test_laplacian_by_hand(measured: SpatialStatistics) -> None:
+    """Mean over images n of 10 (m + 1) (n + 1) + r: n + 1 averages 20.5, 10.5, 30.5."""
+    data = laplacian_series(measured, blocks(measured))
+    means = {"all": 205, "day": 105, "night": 305}
+    for part, mean in means.items():
+        np.testing.assert_allclose(data.values["rgb", part], mean + np.arange(3))
+        np.testing.assert_allclose(data.values["thermal", part], 2 * mean + np.arange(3))
+    assert data.images == {"all": 40, "day": 20, "night": 20}
+    assert not data.is_log
+
+
+def test_snr_by_hand(measured: SpatialStatistics) -> None:
+    """Pooled: mean of 100 + n over (m + 1) (r + 1)."""
+    data = snr_series(measured, blocks(measured), "immerkaer", "pooled")
+    np.testing.assert_allclose(data.values["rgb", "all"], 119.5 / np.array([1, 2, 3]), rtol=1e-5)
+    np.testing.assert_allclose(
+        data.values["thermal", "night"], 129.5 / np.array([2, 4, 6]), rtol=1e-5
+    )
+    other = snr_series(measured, blocks(measured), "std", "images")
+    np.testing.assert_allclose(other.values["rgb", "day"], np.full(3, 109.5 / 20), rtol=1e-5)
+    assert "std" in other.measure
+
+
+def test_intervals_hold_the_value_and_are_wider_for_fewer_images(
+    measured: SpatialStatistics,
+) -> None:
+    data = laplacian_series(measured, blocks(measured))
+    for key, (low, high) in data.bands.items():
+        assert (low < data.values[key]).all()
+        assert (data.values[key] < high).all()
+    few = measured.chosen("day") & (np.arange(40) % 2 == 0)
+    fewer = statistics(LABELS[few], strips(3), None)
+    assert fewer.laplacian.shape[0] == 10
+    relative = [
+        float(np.log(series.bands["rgb", "all"][1] / series.bands["rgb", "all"][0])[0])
+        for series in (data, laplacian_series(fewer, Blocks(fewer, size=1, resamples=400)))
+    ]
+    assert relative[1] > relative[0] > 0
+
+
+def test_a_single_image_has_no_interval_and_is_drawn(tmp_path: Path) -> None:
+    single = statistics(LABELS[:1], strips(3), None)
+    data = laplacian_series(single, blocks(single))
+    assert list(data.values) == [("rgb", "all"), ("thermal", "all")]
+    assert np.isnan(data.bands["rgb", "all"]).all()
+    assert "RGB, all" in texts(draw(data), tmp_path)
+
+
+def test_far_modalities_get_a_logarithmic_axis(measured: SpatialStatistics, tmp_path: Path) -> None:
+    measured.noise["immerkaer"][:, 0] *= 20
+    data = snr_series(measured, blocks(measured), "immerkaer", "pooled")
+    assert data.is_log
+    figure = draw(data)
+    assert figure.axes[0].get_yscale() == "log"
+    found = texts(figure, tmp_path)
+    assert {
+        f"{name}, {part}" for name in ("RGB", "thermal") for part in ("all", "day", "night")
+    } <= set(found)
+    assert "signal-to-noise ratio (immerkaer)" in found
+    assert "(all 40, day 20, night 20)" in found
+
+
+def test_unknown_estimator(measured: SpatialStatistics) -> None:
+    with pytest.raises(InputError, match="did you mean 'immerkaer'"):
+        snr_series(measured, blocks(measured), "imerkaer", "pooled")

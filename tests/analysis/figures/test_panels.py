@@ -1,0 +1,107 @@
+"""Qualitative panels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.figures.panels import (
+    Panel,
+    draw,
+    image_mious,
+    most_different,
+    panel,
+)
+from analysis.figures.style import save
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+from tests.analysis.figures.drawn import counts, strips, texts
+
+NAMES = ["00001D", "00002N"]
+RINGS = strips(4, "ring")
+
+
+@pytest.fixture
+def dataset(write_mfnet) -> MFNet:
+    return MFNet(str(write_mfnet({"test": NAMES}, hw=(24, 32))))
+
+
+def made(dataset: MFNet, names: list[str] = NAMES, **methods) -> Panel:
+    return panel(dataset, methods, names, RINGS)
+
+
+def right(dataset: MFNet):
+    return lambda name: dataset.read(name).label
+
+
+def test_rows_hold_the_images_and_their_scores(dataset: MFNet) -> None:
+    def wrong(name: str) -> np.ndarray:
+        return (dataset.read(name).label + 1) % 9
+
+    found = made(dataset, ours=right(dataset), theirs=wrong)
+    assert [row.name for row in found.rows] == NAMES
+    assert found.rows[1].mious == (100, 0)
+    np.testing.assert_array_equal(found.rows[0].rgb, dataset.read("00001D").rgb)
+    np.testing.assert_array_equal(found.rows[0].predictions[0], found.rows[0].label)
+    # The innermost of four rings takes half of each side.
+    assert found.box == (slice(6, 18), slice(8, 24))
+
+
+@pytest.mark.parametrize("layout", ["rows", "columns"])
+def test_draws_titles_names_classes_and_a_box_on_every_picture(
+    dataset: MFNet, tmp_path: Path, layout: str
+) -> None:
+    figure = draw(made(dataset, ours=right(dataset)), layout)
+    found = texts(figure, tmp_path)
+    assert {"RGB", "thermal", "ground truth", "ours", *NAMES, "car", "car stop"} <= set(found)
+    assert len(figure.axes) == 8
+    for axes in figure.axes:
+        assert axes.patches[-1].get_bbox().bounds == (7.5, 5.5, 16, 12)
+
+
+def test_ours_is_painted_in_the_colours_of_the_data_set(dataset: MFNet) -> None:
+    figure = draw(made(dataset, names=NAMES[:1], ours=right(dataset)))
+    shown = figure.axes[3].images[0].get_array()
+    label = dataset.read("00001D").label
+    np.testing.assert_array_equal(shown, np.array(dataset.palette, np.uint8)[label])
+
+
+def test_pdf_holds_the_pixels_as_they_are(dataset: MFNet, tmp_path: Path) -> None:
+    save(draw(made(dataset, names=NAMES[:1], ours=right(dataset))), tmp_path / "f.pdf")
+    content = (tmp_path / "f.pdf").read_bytes()
+    assert content.count(b"/Width 32") == 4
+    assert content.count(b"/Height 24") == 4
+
+
+def test_other_sizes_are_refused(dataset: MFNet) -> None:
+    with pytest.raises(InputError, match="the prediction of '00001D' by 'ours' is 2x2 pixels"):
+        made(dataset, ours=lambda _: np.zeros((2, 2), np.uint8))
+
+
+def test_strips_have_no_centre(dataset: MFNet) -> None:
+    with pytest.raises(InputError, match="no centre to put a box on"):
+        panel(dataset, {"ours": right(dataset)}, NAMES, strips(5))
+
+
+def test_miou_of_images_is_over_the_classes_that_occur() -> None:
+    matrices = np.zeros((2, 1, 3, 3), int)
+    matrices[0, 0, :2, :2] = [[3, 1], [0, 0]]  # IoU 3/4, and 0 for a class that is only predicted
+    found = image_mious(counts(matrices, "ring1", ("a", "b")))
+    assert found["a"] == pytest.approx(37.5)
+    assert np.isnan(found["b"])
+
+
+def test_largest_difference_between_first_and_last() -> None:
+    mious = {
+        "A": {"x": 10, "y": 50, "z": 0, "w": float("nan")},
+        "B": {"x": 99, "y": 99, "z": 99, "w": 99},
+        "C": {"x": 30, "y": 10, "z": 20, "w": 90},
+    }
+    names = ("w", "x", "y", "z")
+    assert most_different(mious, names, 3) == ("y", "x", "z")
+    with pytest.raises(InputError, match="rows=4, but there are only 3 images"):
+        most_different(mious, names, 4)
+    with pytest.raises(InputError, match="compares two methods"):
+        most_different({"A": mious["A"]}, names, 1)
