@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError, check_choice, nearest
+from analysis.arguments import decimal, refuse_others, whole
+from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
@@ -56,9 +57,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from analysis.uncertainty.sentence import sentence
     from rgbt.tracking.terminal import rich_table, show
 
-    if overrides:
-        key = overrides[0].partition("=")[0]
-        raise InputError(f"'{key}' is not a key of this command; {nearest(key, OWN)}.")
+    refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
     opened = [
         open_counts(arguments[side], arguments["runs_dir"], arguments["split"]) for side in "ab"
@@ -84,16 +83,16 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     """
     from typing import cast
 
-    from analysis.uncertainty.settings import Method, NamedBlocks, Resampling
+    from analysis.uncertainty.settings import MOST, Method, NamedBlocks, Resampling
     from rgbt.metrics.metric import Absent
 
     blocks = arguments["blocks"]
     return Resampling(
-        resamples=int(_number("resamples", arguments["resamples"])),
-        level=_number("level", arguments["level"]),
+        resamples=whole("resamples", arguments["resamples"], 100, MOST),
+        level=decimal("level", arguments["level"], "0.95"),
         method=cast(Method, arguments["method"]),
         blocks=int(blocks) if blocks.isdecimal() else cast(NamedBlocks, blocks),
-        seed=int(_number("seed", arguments["seed"])),
+        seed=whole("seed", arguments["seed"], 0, 2**31),
         absent=cast(Absent, arguments["absent"]),
     )
 
@@ -182,13 +181,6 @@ def _p(value: float) -> str:
     if value != value:
         return "-"
     return "<0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def _number(key: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{key}={text}: expected a number.") from None
 
 
 def _write(out: Path, grid: Grid, said: str, comparison: Comparison) -> None:

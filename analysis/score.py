@@ -10,8 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from rgbt.checks import InputError, check_choice, check_range
-from rgbt.command import composing, plain_command
+from analysis.arguments import dataset_of, decimal, refuse_others, whole
+from rgbt.checks import InputError, check_choice
+from rgbt.command import plain_command
 from rgbt.metrics.names import MIOU
 from rgbt.metrics.regions import MAX_REGIONS
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from analysis.predictions.scoring import Options, Scored
     from analysis.predictions.table import ScoreTable
     from analysis.uncertainty import Resampling
-    from rgbt.data.mfnet import MFNet
     from rgbt.metrics.counts import Counts
 
 OF_A_FOLDER = {
@@ -165,34 +165,12 @@ def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
 
     from analysis.predictions.scoring import score_folder
 
-    dataset, options = _dataset(overrides), _options(arguments)
+    refuse_others(overrides, ("dataset",), list(OWN))
+    dataset, options = dataset_of(overrides), _options(arguments)
     folder, split = Path(arguments["predictions"]), arguments["split"]
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("counting", total=len(dataset.names(split)))
         return score_folder(folder, dataset, split, options, lambda: progress.advance(task))
-
-
-def _dataset(overrides: list[str]) -> MFNet:
-    from rgbt.config import build, check_node, compose
-    from rgbt.data.mfnet import MFNet
-
-    for word in overrides:
-        key = word.lstrip("+~").partition("=")[0]
-        if key.split(".")[0] != "dataset":
-            raise InputError(
-                f"'{key}' has no effect on a score; expected dataset=... or dataset.<key>=..., or "
-                f"one of {', '.join(OWN)}."
-            )
-    with composing(overrides):
-        node = compose(overrides).dataset
-        check_node(node, "dataset")
-        dataset = build(node)
-    if not isinstance(dataset, MFNet):
-        raise InputError(
-            f"dataset: expected a data set in MFNet's layout, got {type(dataset).__name__}; choose "
-            "dataset=mfnet or dataset=synth."
-        )
-    return dataset
 
 
 def _options(arguments: dict[str, str]) -> Options:
@@ -203,9 +181,9 @@ def _options(arguments: dict[str, str]) -> Options:
     words: dict[str, Any] = {key: arguments[key] for key in ("missing", "resize", "suffix", "name")}
     return Options(
         partitions=tuple(each for each in PARTITIONS if partition in ("all", each)),
-        regions=_whole_number(arguments, "regions", 1, MAX_REGIONS),
+        regions=whole("regions", arguments["regions"], 1, MAX_REGIONS),
         form=cast(Any, arguments["format"]),  # Options refuses other words
-        threads=_whole_number(arguments, "threads", 0, MAX_THREADS),
+        threads=whole("threads", arguments["threads"], 0, MAX_THREADS),
         **words,
     )
 
@@ -236,13 +214,10 @@ def _stored(arguments: dict[str, str], overrides: list[str]) -> list[tuple[str, 
 def _resampling(arguments: dict[str, str]) -> Resampling | None:
     from analysis.uncertainty import Resampling
 
-    resamples = _whole_number(arguments, "resamples", 0, 1_000_000)
+    resamples = whole("resamples", arguments["resamples"], 0, 1_000_000)
     if resamples == 0:
         return None
-    try:
-        level = float(arguments["level"])
-    except ValueError as error:
-        raise InputError(f"level={arguments['level']}: expected a number such as 0.95.") from error
+    level = decimal("level", arguments["level"], "0.95")
     blocks = arguments["blocks"]
     drawn: Any = int(blocks) if blocks.isdecimal() else blocks  # Resampling refuses other words
     return Resampling(resamples=resamples, level=level, blocks=drawn)
@@ -270,14 +245,6 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
         f"({settings.method}, {settings.resamples} resamples of {drawn})."
     )
     return with_intervals(table, found, said)
-
-
-def _whole_number(arguments: dict[str, str], key: str, low: int, high: int) -> int:
-    text = arguments[key]
-    if not text.isdecimal():
-        raise InputError(f"{key}={text}: expected a whole number from {low} to {high}.")
-    check_range(key, int(text), low, high)
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError, check_choice, check_range, nearest
-from rgbt.command import composing, plain_command
+from analysis.arguments import decimal, refuse_others, whole
+from rgbt.checks import InputError, check_choice
+from rgbt.command import built, plain_command
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.collect import DataSet, Settings
@@ -32,6 +33,9 @@ OWN: dict[str, str | None] = {
     "workers": "0",
     "out": "",
 }
+MOST = 1_000_000
+"""What a count may be."""
+
 OVERRIDES = ("dataset", "data.on_error")
 """What of the configuration counts here; another key is refused."""
 
@@ -53,8 +57,8 @@ def main(values: dict[str, str], overrides: list[str]) -> None:
     blocks              neighbouring images that are resampled together
     resamples, level, seed  of the intervals
     workers             threads; 0: one per core
-    out                 folder for statistics.npz, regions.csv and statistics.md;
-                        default: spatial/<data set>-<split>-<regions>
+    out                 folder for statistics.npz (what analysis.figures draws), regions.csv and
+                        statistics.md; without one, the tables are shown only
 
     All estimators and averages are measured; the last table shows what depends on them.
     """
@@ -62,18 +66,18 @@ def main(values: dict[str, str], overrides: list[str]) -> None:
     from rgbt.tracking.terminal import place_lines, show
 
     _check_words(values)
-    numbers = {key: _whole(values, key) for key in ("blocks", "resamples", "seed")}
-    level = _number(values, "level")
+    numbers = {key: whole(key, values[key], 0, MOST) for key in ("blocks", "resamples", "seed")}
+    level = decimal("level", values["level"], "0.95")
     check_resampling(numbers["blocks"], numbers["resamples"], level)
     settings, dataset = _settings(values, overrides)
-    name = f"{dataset.name}-{values['split']}-{settings.regions.name}"
-    folder = Path(values["out"] or f"spatial/{name}")
     dataset.names(values["split"])  # a split that is not there is said before a folder is made
-    folder.mkdir(parents=True, exist_ok=True)
+    if values["out"]:
+        Path(values["out"]).mkdir(parents=True, exist_ok=True)
     stats = _collect(dataset, values["split"], settings)
     found = claims(stats, level=level, **numbers)
     _print(stats, found, (values["estimator"], values["average"]), level)
-    show(place_lines(_write(stats, found, values, folder)))
+    if values["out"]:
+        show(place_lines(_write(stats, found, values, Path(values["out"]))))
 
 
 def _check_words(values: dict[str, str]) -> None:
@@ -90,23 +94,15 @@ def _check_words(values: dict[str, str]) -> None:
 
 def _settings(values: dict[str, str], overrides: list[str]) -> tuple[Settings, DataSet]:
     from analysis.statistics.collect import Settings
-    from rgbt.config import build, check_node, compose
 
-    for word in overrides:
-        key = word.lstrip("+~").partition("=")[0]
-        if not any(key == known or key.startswith(f"{known}.") for known in OVERRIDES):
-            raise InputError(f"'{key}' means nothing here; {nearest(key, [*OWN, *OVERRIDES])}.")
-    with composing(overrides):
-        config = compose(overrides)
-        check_node(config.dataset, "dataset")
-        check_node(config.data, "data")
+    refuse_others(overrides, OVERRIDES, list(OWN))
     settings = Settings(
         regions=_regions(values),
         kernel=values["kernel"],
-        workers=_whole(values, "workers"),
-        skip_unreadable=config.data.on_error == "skip",
+        workers=whole("workers", values["workers"], 0, 1024),
+        skip_unreadable=built("data", overrides).on_error == "skip",
     )
-    return settings, build(config.dataset)
+    return settings, built("dataset", overrides)
 
 
 def _regions(values: dict[str, str]) -> Regions:
@@ -116,8 +112,7 @@ def _regions(values: dict[str, str]) -> Regions:
     partition, aspect = values["partition"], values["aspect"]
     if partition != "ring" and aspect != "image":
         raise InputError(f"aspect={aspect} is one of rings; leave it out with {partition} strips.")
-    regions = _whole(values, "regions")
-    check_range("regions", regions, 1, MAX_REGIONS)
+    regions = whole("regions", values["regions"], 1, MAX_REGIONS)
     return Regions(
         partition=partition,  # type: ignore[arg-type]  # checked in `_check_names`
         regions=regions,
@@ -171,7 +166,7 @@ def _write(
 
     chosen = values["estimator"], values["average"]
     ways = sorted({_way(claim) for claim in found if claim.estimator}, key=lambda w: w != chosen)
-    text = tables.markdown(stats, found, ways, _number(values, "level"))
+    text = tables.markdown(stats, found, ways, decimal("level", values["level"], "0.95"))
     stats.save(folder / "statistics.npz")
     write_atomic(folder / "regions.csv", tables.to_csv(stats).encode())
     write_atomic(folder / "statistics.md", text.encode())
@@ -181,20 +176,6 @@ def _write(
 
 def _way(claim: Claim) -> tuple[str, str]:
     return claim.estimator, claim.average
-
-
-def _whole(values: dict[str, str], key: str) -> int:
-    try:
-        return int(values[key])
-    except ValueError:
-        raise InputError(f"{key} must be a whole number, got '{values[key]}'.") from None
-
-
-def _number(values: dict[str, str], key: str) -> float:
-    try:
-        return float(values[key])
-    except ValueError:
-        raise InputError(f"{key} must be a number, got '{values[key]}'.") from None
 
 
 entry = plain_command(OWN, main)

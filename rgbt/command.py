@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -24,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
-from rgbt.config import check, compose, conf_dir, register_resolvers
+from rgbt.config import build, check, check_node, compose, conf_dir, register_resolvers
 
 Main = Callable[[DictConfig], int | None]
 
@@ -167,6 +168,22 @@ def composing(overrides: Sequence[str]) -> Iterator[None]:
         yield
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(_hydra_sentence(error, overrides)) from error
+
+
+def built(node: str, overrides: Sequence[str]) -> Any:
+    """The object that one node of the configuration describes, for commands that need no more.
+
+    Args:
+        node: its key, e.g. "dataset" or "tracking".
+        overrides: as they were typed.
+
+    Raises:
+        InputError: overrides that Hydra refuses, or settings that the constructor does.
+    """
+    with composing(overrides):
+        config = compose(overrides)
+        check_node(config[node], node)
+        return build(config[node])
 
 
 def _hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:

@@ -10,10 +10,10 @@ import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
-from rgbt.command import composing, plain_command, readable_paths
+from rgbt.command import built, plain_command, readable_paths
 from rgbt.tracking.provenance import without_passwords
 from sweeps.running.storage import JOURNAL, load_study, open_storage, study_names
 
@@ -49,7 +49,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         known = ", ".join(study_names(storage)) or "none"
         raise InputError(f"give the study with name=...; the storage holds: {known}.")
     study = load_study(arguments["name"], storage)
-    tracking = _tracking(runs_dir, overrides)
+    tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
     out = Path(arguments["out"] or study_folder(runs_dir, study.study_name))
     links = report(study, out, tracking)
     show_places([*links, ("dashboard", dashboard_command(place, runs_dir))])
@@ -169,17 +169,6 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
             f"there is no file of studies {path}; give the folder of runs with runs_dir=... or the "
             "storage with storage=..."
         )
-
-
-def _tracking(runs_dir: Path, overrides: Sequence[str]) -> Any:
-    """The tracker as the configuration has it."""
-    from rgbt.config import build, check_node, compose
-
-    every = [*readable_paths([f"runs_dir={runs_dir}"]), *overrides]
-    with composing(every):
-        config = compose(every)
-    check_node(config.tracking, "tracking")
-    return build(config.tracking)
 
 
 def show_places(places: Sequence[Link]) -> None:

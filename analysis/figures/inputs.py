@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from analysis.arguments import decimal, whole
 from rgbt.checks import InputError, check_choice, nearest
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from rgbt.data.mfnet import MFNet
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Regions
+
+MOST = 1_000_000
+"""What a count may be."""
 
 
 @dataclass(frozen=True)
@@ -62,22 +66,17 @@ class Given:
     def number(self, key: str, default: int) -> int:
         """A whole number of at least 1 (a seed: at least 0)."""
         least = 0 if key == "seed" else 1
-        return _whole(key, self.get(key, str(default)), least)
+        return whole(key, self.get(key, str(default)), least, MOST)
 
     def fraction(self, key: str, default: float) -> float:
         """A number such as 0.95."""
         text = self.get(key, str(default))
-        try:
-            return float(text)
-        except ValueError as error:
-            raise InputError(
-                f"{key} must be a number such as {default:g}, got '{text}'."
-            ) from error
+        return decimal(key, text, f"{default:g}")
 
     def numbers(self, key: str, default: Sequence[int]) -> tuple[int, ...]:
         """Whole numbers of at least 1, with commas between them."""
         text = self.get(key, ",".join(map(str, default)))
-        return tuple(_whole(key, each, 1) for each in text.split(","))
+        return tuple(whole(key, each, 1, MOST) for each in text.split(","))
 
     def named(self, key: str, what: str) -> dict[str, str]:
         """Label -> place, of ``label:place,label:place``; without a label the place's last name.
@@ -227,12 +226,6 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
-
-
-def _whole(key: str, text: str, least: int) -> int:
-    if not text.strip().isdecimal() or int(text) < least:
-        raise InputError(f"{key} must be whole numbers of at least {least}, got '{text}'.")
-    return int(text)
 
 
 def _file(text: str, name: str) -> Path:

@@ -143,14 +143,11 @@ def multihead_fig3(given: Given) -> Figure:
 def crm_fig5(given: Given) -> Figure:
     """Masks on a pair of images."""
     from analysis.figures import masks
-    from rgbt.config import build, check_node, compose
+    from rgbt.command import built
 
     patches = given.numbers("patches", masks.PATCHES)
     sample = given.dataset.read(given.names(1)[0])
-    maskers = {}
-    for title, overrides in masks.masker_overrides(patches).items():
-        node = compose(overrides).masker
-        check_node(node, "masker")
-        maskers[title] = build(node)
+    chosen = masks.masker_overrides(patches).items()
+    maskers = {title: built("masker", overrides) for title, overrides in chosen}
     multiple = masks.whole_cells(patches)
     return masks.draw(masks.mask_examples(sample, maskers, multiple, given.number("seed", 0)))

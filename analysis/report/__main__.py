@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rgbt.checks import InputError, check_range
-from rgbt.command import composing, plain_command, readable_paths
+from analysis.arguments import whole
+from rgbt.checks import InputError
+from rgbt.command import built, plain_command, readable_paths
 
 OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000"}
 
@@ -35,11 +36,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     Every score is computed from the counts of its run. What cannot be read is told here and listed
     on the page.
     """
-    resamples = _number(arguments["resamples"])
+    resamples = whole("resamples", arguments["resamples"], FEWEST, MOST)
     out, runs_dir = (Path(arguments[key]).expanduser() for key in ("out", "runs_dir"))
     if out.is_file():
         raise InputError(f"out={out} is a file; give a folder for the page.")
-    tracking = _tracking(runs_dir, overrides)
+    # Read by Hydra; the tracker resolves the folder like that of a run.
+    place = readable_paths([f"runs_dir={os.fspath(runs_dir)}"])
+    tracking = built("tracking", [*place, *overrides])
 
     from rich.console import Console
     from rich.progress import Progress
@@ -69,25 +72,6 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     size = f"{page.stat().st_size / 1e6:.2f} MB"
     show(place_lines([("page", str(page)), ("size", size), ("holds", held)]))
     return 0
-
-
-def _number(text: str) -> int:
-    if not text.isdecimal():
-        raise InputError(f"resamples={text}: expected a whole number.")
-    check_range("resamples", int(text), FEWEST, MOST)
-    return int(text)
-
-
-def _tracking(runs_dir: Path, overrides: Sequence[str]) -> Any:
-    """The tracker as the configuration has it."""
-    from rgbt.config import build, check_node, compose
-
-    # Read by hydra; the tracker resolves it like that of a run.
-    every = [*readable_paths([f"runs_dir={os.fspath(runs_dir)}"]), *overrides]
-    with composing(every):
-        config = compose(every)
-    check_node(config.tracking, "tracking")
-    return build(config.tracking)
 
 
 if __name__ == "__main__":

@@ -49,12 +49,12 @@ class CellRun(Protocol):
 
     @property
     def state(self) -> str:
-        """ "finished", or a word that says why not."""
+        """How far it is: "finished", or a word that says why not."""
         ...
 
     @property
     def reason(self) -> str:
-        """Why it is not finished, or ""."""
+        """Why it is not finished, else empty."""
         ...
 
     @property

@@ -178,7 +178,7 @@ def test_stored_counts_are_scored(
     [
         ((), "expected one of predictions=folder and counts=run, got neither"),
         (("predictions=a", "counts=b"), "got predictions and counts"),
-        (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect on a score"),
+        (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect here"),
         (("predictions=a", "dataset=mfnte"), "did you mean 'mfnet'"),
         (("predictions=a", "dataset=mfnet"), "dataset.root"),
         (("predictions=a", "resamples=many"), "resamples=many: expected a whole number"),

@@ -161,7 +161,7 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         (["figure=spatialseg/fig2", "out=f.pdf", "methods=a:"], "expected label:place, got 'a:'"),
         (
             ["figure=spatialseg/fig2", "out=f.pdf", "regions=0", "methods=a:x"],
-            "at least 1, got '0'",
+            "regions must lie in [1, 1e+06], got 0",
         ),
         (["figure=spatialseg/fig6", "out=f.pdf", "estimator=median"], "estimator: 'median' is not"),
         (["figure=spatialseg/fig5", "out=f.pdf", "statistics=no.npz"], "no file of statistics"),
@@ -187,7 +187,7 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
         ("spatialseg/fig2", ["regions=3"], "lacks counts_vertical3.npz (it holds counts_h"),
         ("spatialseg/fig1", ["metric=vertical5"], "no centre and no edge"),
         ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
-        ("regions/profile", ["level=high"], "level must be a number such as 0.95, got 'high'"),
+        ("regions/profile", ["level=high"], "level=high: expected a number such as 0.95"),
         ("regions/profile", ["band=seeds"], "band=seeds needs at least two seeds, but 'A' has one"),
     ],
 )
