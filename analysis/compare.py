@@ -27,7 +27,7 @@ OWN = {
     "missing": "refuse",
     "level": "0.95",
     "resamples": "10000",
-    "method": "bca",
+    "method": "percentile",
     "blocks": "auto",
     "absent": "released",
     "seed": "0",
@@ -46,12 +46,14 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     metrics   mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night
     missing   refuse, or leave_out: compare the images that both hold
     level     of the intervals;  resamples: their number;  seed: of the draws
-    method    bca or percentile: how intervals over images are taken from the resamples
+    method    percentile or bca: how intervals over images are taken from the resamples
     blocks    images drawn together: auto, none, sequence, or a number of neighbouring frames
     absent    released: a class without a pixel scores 0; exclude: it is left out of means
     split     of runs
     out       folder for comparison.md and comparison.csv
     """
+    from rich.markup import escape
+
     from analysis.results import label_of, open_counts
     from analysis.uncertainty import compare
     from analysis.uncertainty.sentence import sentence
@@ -64,12 +66,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     ]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
-    comparison = compare(a, b, metrics_of(arguments["metrics"], a[0]), settings)
+    comparison = compare(a, b, metrics_of(arguments["metrics"], [*a, *b]), settings)
     labels = _labels([label_of(each) for each in opened])
     grid = comparison_grid(comparison, labels)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
-    show(said + "\n" + remark(settings))
+    show(escape(said + "\n" + remark(settings)))
     if arguments["out"]:
         _write(Path(arguments["out"]), grid, said, comparison)
     return 0
@@ -97,14 +99,23 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     )
 
 
-def metrics_of(text: str, counts: Counts) -> list[str]:
-    """The metrics asked for; "auto": mIoU, Var, every region, and mIoU by day and by night."""
+def metrics_of(text: str, every: Sequence[Counts]) -> list[str]:
+    """The metrics asked for; "auto": mIoU, Var, every region, and mIoU by day and by night.
+
+    Day and night where all counts tell them apart and hold enough images of them.
+    """
+    from analysis.uncertainty.blocks import FEWEST
     from rgbt.metrics import names
 
     if text != "auto":
         return [word.strip() for word in text.split(",")]
-    regions = [names.region(number + 1) for number in range(counts.counts.shape[1])]
-    parts = [names.subset(part, names.MIOU) for part in counts.parts()]
+    regions = [names.region(number + 1) for number in range(every[0].counts.shape[1])]
+    told = [counts.parts() for counts in every]
+    parts = [
+        names.subset(part, names.MIOU)
+        for part in (names.DAY, names.NIGHT)
+        if all(part in each and len(each[part].names) >= FEWEST for each in told)
+    ]
     return [names.MIOU, names.VAR, *regions, *parts]
 
 
@@ -156,7 +167,7 @@ def _counts(
     if {each.path for each in opened[0]} & {each.path for each in opened[1]}:
         raise InputError("a and b hold the same counts; a method is compared with another one.")
     if missing == "leave_out":
-        before = max(len(counts.names) for seeds in methods for counts in seeds)
+        before = len({name for seeds in methods for counts in seeds for name in counts.names})
         methods = common(methods)
         left = before - len(methods[0][0].names)
         if left:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,8 @@ def label_of(stored: tuple[Stored, ...]) -> str:
 
 
 def _words(text: str) -> list[str]:
-    words = [word.strip() for word in text.split(",")]
+    # Not at the commas of "grbm train_sizes=[240,480]".
+    words = [word.strip() for word in re.split(r",(?![^\[]*\])", text)]
     if not all(words):
         raise InputError(
             f"'{text}': expected runs, files of counts or a group, with commas between them."
@@ -78,14 +80,14 @@ def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
         return [Stored(path.stem, "", None, path.resolve(), Counts.load(path))]
-    if path.is_dir() and not (path / "config.yaml").is_file():
-        return [_of_scores(path)]
     grouped = _of_group(word, runs_dir)
     if grouped:
         return [_of_run(folder, split) for folder in grouped]
+    if _is_folder(path) and not (path / "config.yaml").is_file():
+        return [_of_scores(path)]
     try:
         folder = find_run(word, runs_dir)
-    except InputError as error:
+    except (InputError, OSError) as error:  # OSError: longer than a file's name may be
         groups = sorted({_tag(run, GROUP) for run in _runs(runs_dir)} - {""})
         known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
         raise InputError(
@@ -93,6 +95,13 @@ def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
             f"counts (.npz){known}."
         ) from error
     return [_of_run(RunFolder(folder), split)]
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # longer than a file's name may be
+        return False
 
 
 def _of_scores(folder: Path) -> Stored:

@@ -71,11 +71,11 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     from rich.text import Text
 
     from rgbt.tracking.files import write_atomic
-    from rgbt.tracking.terminal import show
+    from rgbt.tracking.terminal import rich_table, show
     from sweeps.report.data import importances, read
     from sweeps.report.figures import draw
     from sweeps.report.records import record
-    from sweeps.report.tables import tables, terminal_table, trials_csv
+    from sweeps.report.tables import tables, trials_csv
 
     data = read(study)
     shares = importances(data)
@@ -86,7 +86,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     text = markdown(data, grids, said)
     write_atomic(out / "study.md", (text + gallery(pictures)).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
-    show(Group(*map(terminal_table, grids), Text("\n".join(said))))
+    show(Group(*map(rich_table, grids), Text("\n".join(said))))
     drawn = [picture.path for picture in pictures if picture.path is not None]
     links = record(
         tracking,

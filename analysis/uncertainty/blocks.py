@@ -61,12 +61,12 @@ def make_blocks(
     if choice == "sequence":
         blocks = _joined(len(names), sequences, f"{len(sequences)} sequences")
     else:
-        longest = max(map(len, sequences))
         length = choice if isinstance(choice, int) else _automatic(series, sequences)
         if length <= 1:
             return _singles(len(names))
-        pieces = [piece for each in sequences for piece in _cut(each, min(length, longest))]
-        said = f"{len(pieces)} blocks of up to {length} neighbouring frames"
+        pieces = [piece for each in sequences for piece in _cut(each, length)]
+        largest = max(map(len, pieces))
+        said = f"{len(pieces)} blocks of up to {largest} neighbouring frames"
         blocks = _joined(len(names), pieces, said)
     if blocks.count < FEWEST:
         raise InputError(
@@ -106,7 +106,7 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     if last == 0:
         return 1
     steps = np.arange(1, min(2 * last, covered) + 1)
-    weights = np.minimum(1.0, 2.0 * (1.0 - steps / steps[-1])) if len(steps) > 1 else np.ones(1)
+    weights = np.minimum(1.0, 2.0 * (1.0 - steps / steps[-1]))
     long_run = lags[0] + 2.0 * (weights * lags[steps]).sum()
     slope = 2.0 * (weights * steps * lags[steps]).sum()
     if long_run <= 0:

@@ -19,11 +19,12 @@ from analysis.uncertainty.intervals import (
     student_p,
     swap_p,
     together,
+    widest,
 )
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import Asked
+from rgbt.metrics.named import Asked, parse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +114,9 @@ def compare(
             )
         described[group[0].part] = images
         found |= {difference.metric: difference for difference in _differences(images, group)}
-    ordered = [found[metric] for metric in metrics]
+    ordered = [found[metric] for metric in dict.fromkeys(metrics)]
     corrected = holm([difference.p for difference in ordered])
-    main = described[min(described, key=lambda part: part is not None)]
+    main = described[parse(metrics[0]).part]
     return Comparison(
         differences=tuple(
             replace(difference, p_corrected=p)
@@ -154,9 +155,10 @@ def _with_intervals(
     if around is None or spread is None:
         return replace(plain, images=around)
     whole = together(image_spread(images, resampled[0]), spread)
+    used = widest(settings.level, whole, spread)
     return replace(
         plain,
         images=around,
-        both=student(value, whole, settings.level),
-        p_both=student_p(value, whole),
+        both=student(value, used, settings.level),
+        p_both=student_p(value, used),
     )

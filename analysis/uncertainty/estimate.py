@@ -17,6 +17,7 @@ from analysis.uncertainty.intervals import (
     over_seeds,
     student,
     together,
+    widest,
 )
 from analysis.uncertainty.settings import Resampling
 from rgbt.metrics.counts import Counts
@@ -97,9 +98,8 @@ def estimate_of(images: Images, points: Values, resampled: Values, without: Valu
     if spread is not None:
         trainings = student(value, spread, level)
         if around is not None:
-            whole = student(value, together(image_spread(images, resampled), spread), level)
-            # Two or three seeds: Satterthwaite's degrees of freedom alone cover too rarely.
-            both = max(whole, trainings, key=lambda interval: interval.half)
+            whole = together(image_spread(images, resampled), spread)
+            both = student(value, widest(level, whole, spread), level)
     return Estimate(
         value=value,
         sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),

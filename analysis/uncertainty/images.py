@@ -118,8 +118,8 @@ class Images:
         draw: Callable[[np.random.Generator, int], list[NDArray[np.float64]]],
     ) -> list[Scores]:
         parts: list[list[Scores]] = [[] for _ in self.methods]
-        for number, size in enumerate(_chunks(self.settings.resamples)):
-            rng = numpy_generator(self.settings.seed, purpose, number)
+        rng = numpy_generator(self.settings.seed, purpose)
+        for size in _chunks(self.settings.resamples):
             for part, summed in zip(parts, draw(rng, size), strict=True):
                 part.append(self._scores(asked, summed).mean(1))
         return [np.concatenate(part, axis=1) for part in parts]
@@ -216,6 +216,11 @@ def _like(first: Counts, other: Counts) -> Counts:
             "score both on one split, or take missing=leave_out to compare what both hold."
         )
     same = other if other.names == first.names else other.select(first.names)
+    if None not in (first.night, same.night) and first.night != same.night:
+        raise InputError(
+            "the counts do not agree about which images were taken at night; score both on one "
+            "data set."
+        )
     labelled = [each.counts.sum(-1).astype(np.int64) for each in (first, same)]
     unequal = np.flatnonzero((labelled[0] != labelled[1]).any((1, 2)))
     if len(unequal):
@@ -236,10 +241,11 @@ def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
     shared = set(every[0].names).intersection(*(counts.names for counts in every))
     kept = [name for name in every[0].names if name in shared]
     if not kept:
-        other = next(counts for counts in every if not set(counts.names) & set(every[0].names))
+        name = every[0].names[0]
+        other = next(counts for counts in every if name not in counts.names)
         raise InputError(
-            f"no image is in all counts, '{other.names[0]}' for one is not in the first; "
-            f"{nearest(other.names[0], every[0].names[:10])}."
+            f"no image is in all counts, '{name}' for one is not in those of split "
+            f"'{other.split}'; {nearest(name, other.names[:10])}."
         )
     return [[counts.select(kept) for counts in seeds] for seeds in methods]
 

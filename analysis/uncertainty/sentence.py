@@ -5,6 +5,7 @@ from __future__ import annotations
 from analysis.uncertainty.compare import Comparison, Difference
 from analysis.uncertainty.intervals import Interval
 from rgbt.metrics import names
+from rgbt.metrics.named import parse
 
 
 def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
@@ -25,31 +26,41 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
         f"{100 * comparison.level:g} % interval of the difference {_ends(found.interval)}, "
         f"{_p(found.p)}"
     )
-    basis = _basis(found, comparison)
+    basis, limit = _basis(found, comparison), _limit(found)
+    start = f"As trained here, the {found.metric}" if limit else f"The {found.metric}"
     more = "higher" if found.value > 0 else "lower"
     size = f"{abs(found.value):.2f}{_unit(found)}"
     if is_told:
-        said = f"The {found.metric} of {label_b} is {size} {more} than that of {label_a}"
-        return f"{said} ({scores}; {evidence}), {basis}."
+        said = f"{start} of {label_b} is {size} {more} than that of {label_a}"
+        return f"{said} ({scores}; {evidence}), {basis}{limit}."
+    here = "As trained here, a" if limit else "A"
     return (
-        f"A difference in {found.metric} between {label_b} and {label_a} is not shown ({scores}; "
-        f"{evidence}), {basis}; with this much, one below about {found.interval.half:.2f}"
-        f"{_unit(found)} cannot be seen."
+        f"{here} difference in {found.metric} between {label_b} and {label_a} is not shown "
+        f"({scores}; {evidence}), {basis}{limit}; with this much, one below about "
+        f"{found.interval.half:.2f}{_unit(found)} cannot be seen."
     )
 
 
 def _basis(found: Difference, comparison: Comparison) -> str:
-    """What was drawn anew, and what was not."""
+    """What was drawn anew."""
     images = f"{comparison.images} images"
     if "blocks" in comparison.said or "sequences" in comparison.said:
         images += f" in {comparison.said}"
-    a, b = found.a.seeds, found.b.seeds
-    trainings = f"{a} trainings each" if a == b else f"{a} and {b} trainings"
+    return f"over {images}" if found.both is None else f"over {_trainings(found)} and {images}"
+
+
+def _limit(found: Difference) -> str:
+    """What was not drawn anew and may be all there is to the difference."""
     if found.both is not None:
-        return f"over {trainings} and {images}"
-    if a == b == 1:
-        return f"over {images}, one training each: how much trainings differ is not in it"
-    return f"over {images}, {trainings}: how much trainings differ is not in it"
+        return ""
+    return f"; with {_trainings(found)}, it says nothing about other trainings of the two"
+
+
+def _trainings(found: Difference) -> str:
+    a, b = found.a.seeds, found.b.seeds
+    if a == b:
+        return "one training each" if a == 1 else f"{a} trainings each"
+    return f"{a} and {b} trainings"
 
 
 def _ends(interval: Interval) -> str:
@@ -61,5 +72,5 @@ def _p(value: float) -> str:
 
 
 def _unit(found: Difference) -> str:
-    is_variance = found.metric.endswith(names.VAR)
+    is_variance = parse(found.metric).score == names.VAR
     return "" if is_variance else " points"

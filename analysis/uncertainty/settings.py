@@ -22,8 +22,8 @@ class Resampling:
     Attributes:
         resamples: number of resamples, 100..`MOST`.
         level: share of intervals that shall hold the true value, 0.5..0.999.
-        method: of intervals over images. "bca": bias-corrected and accelerated (Efron, 1987);
-            "percentile": quantiles of the resampled scores.
+        method: of intervals over images. "percentile": quantiles of the resampled scores; "bca":
+            bias-corrected and accelerated (Efron, 1987).
         blocks: what is drawn together, because neighbouring frames show nearly the same:
             "none" single images; a number: that many neighbours; "sequence": whole sequences (names
             that are equal but for the frame number); "auto": as many neighbours as the scores of
@@ -37,7 +37,7 @@ class Resampling:
 
     resamples: int = 10_000
     level: float = 0.95
-    method: Method = "bca"
+    method: Method = "percentile"
     blocks: NamedBlocks | int = "auto"
     seed: int = 0
     absent: Absent = "released"

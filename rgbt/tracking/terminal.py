@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich import box
 from rich.console import Console, Group, RenderableType
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -24,11 +25,13 @@ def tell(sentence: str) -> None:
 
 def rich_table(grid: Grid) -> Table:
     """A grid as a rich table: labels left, numbers right."""
-    table = Table(title=grid.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table = Table(
+        title=escape(grid.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
+    )
     for index, name in enumerate(grid.header):
-        table.add_column(name, justify="right" if index else "left", no_wrap=True)
+        table.add_column(escape(name), justify="right" if index else "left", no_wrap=True)
     for row in grid.rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table
 
 

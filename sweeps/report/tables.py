@@ -14,7 +14,6 @@ from sweeps.report.data import Importances, StudyData, pruning, short_names, sho
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
-    from rich.table import Table
 
 TOP = 10
 """Rows of the table of best trials of one objective."""
@@ -125,16 +124,6 @@ def markdown_table(grid: Grid) -> str:
     """A grid in Markdown; a bar in a reason or label must not begin a column."""
     rows = tuple(tuple(cell.replace("|", "\\|") for cell in row) for row in grid.rows)
     return Grid(grid.title, grid.header, rows).to_markdown()
-
-
-def terminal_table(grid: Grid) -> Table:
-    """A grid for the terminal; brackets in a reason or label are no markup of rich."""
-    from rich.markup import escape
-
-    from rgbt.tracking.terminal import rich_table
-
-    rows = tuple(tuple(map(escape, row)) for row in grid.rows)
-    return rich_table(Grid(escape(grid.title), tuple(map(escape, grid.header)), rows))
 
 
 def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_label: bool) -> Grid:

@@ -29,7 +29,7 @@ def test_examples_run(
     assert re.search(r"mIoU +\d+\.\d\d +\d+\.\d\d to +\d+\.\d\d", scores)
     # A larger shift is a worse prediction, on every image.
     assert re.search(r"mIoU +-\d+\.\d\d .* p = 0\.00\d", comparison)
-    assert re.search(r"The mIoU of theirs is .* points lower than that of mine", comparison)
+    assert re.search(r"the mIoU of theirs is .* points lower than that of mine", comparison)
 
 
 def test_there_are_three_examples() -> None:

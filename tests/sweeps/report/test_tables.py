@@ -15,6 +15,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import TrialState, create_trial
 from rich.console import Console
 
+from rgbt.tracking.terminal import rich_table
 from sweeps import attributes
 from sweeps.report.data import importances, pruning, read, short_names
 from sweeps.report.tables import (
@@ -23,7 +24,6 @@ from sweeps.report.tables import (
     importance_grid,
     markdown_table,
     tables,
-    terminal_table,
     trials_csv,
     trials_grid,
 )
@@ -161,7 +161,7 @@ def test_brackets_and_bars_of_a_reason_are_shown_as_they_are() -> None:
     grid = failed_grid(read(study))
     assert "[red] a \\| b [/x] | 0" in markdown_table(grid)
     console = Console(width=200, file=io.StringIO(), record=True)
-    console.print(terminal_table(grid))
+    console.print(rich_table(grid))
     assert "[red] a | b [/x]" in console.export_text()
 
 

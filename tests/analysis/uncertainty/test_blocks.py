@@ -1,0 +1,212 @@
+"""Which images are drawn together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from analysis.uncertainty.blocks import FEWEST, Blocks, block_length, make_blocks
+from rgbt.checks import InputError
+
+NOTHING = np.empty((0, 0))
+
+
+def members(blocks: Blocks, names: list[str]) -> set[frozenset[str]]:
+    assert blocks.index.shape == (len(names),)
+    assert set(blocks.index.tolist()) == set(range(blocks.count))
+    return {
+        frozenset(np.array(names)[blocks.index == number].tolist())
+        for number in range(blocks.count)
+    }
+
+
+def mfnet(count: int, letter: str = "D") -> list[str]:
+    return [f"{number:05d}{letter}" for number in range(1, count + 1)]
+
+
+def autoregressive(rng: np.random.Generator, count: int, keeps: float) -> np.ndarray:
+    values = rng.normal(size=count)
+    for place in range(1, count):
+        values[place] += keeps * values[place - 1]
+    return values
+
+
+def politis_white(series: np.ndarray) -> int:
+    """The circular block length of one series, loop by loop from the paper's Section 3.2.
+
+    But for the window, whose m is the last of the lags 1, 2, ... that are all correlated more than
+    1.96 / sqrt(n). The formula has no meaning where the estimated spectrum at 0 is not positive: 1.
+    """
+    n = len(series)
+    centred = series - series.mean()
+    r_hat = [sum(centred[i] * centred[i + k] for i in range(n - k)) / n for k in range(n)]
+    most = math.ceil(math.sqrt(n)) + 5
+    m = 0
+    while m < most and r_hat[m + 1] / r_hat[0] > 1.96 / math.sqrt(n):
+        m += 1
+    if m == 0:
+        return 1
+    big_m = min(2 * m, most)
+
+    def flat_top(t: float) -> float:
+        return 1.0 if abs(t) <= 0.5 else max(0.0, 2 * (1 - abs(t)))
+
+    lags = range(-big_m, big_m + 1)
+    g_hat = sum(flat_top(k / big_m) * abs(k) * r_hat[abs(k)] for k in lags)
+    g_zero = sum(flat_top(k / big_m) * r_hat[abs(k)] for k in lags)
+    if g_zero <= 0:
+        return 1
+    d_hat = 4 / 3 * g_zero**2
+    length = (2 * g_hat**2 / d_hat) ** (1 / 3) * n ** (1 / 3)
+    return int(min(max(1, math.ceil(length)), n // 3))
+
+
+@pytest.mark.parametrize("keeps", [0.0, 0.3, 0.6, 0.9, -0.5])
+@pytest.mark.parametrize("count", [60, 393])
+def test_length_is_that_of_the_paper(keeps: float, count: int):
+    for seed in range(4):
+        series = autoregressive(np.random.default_rng(seed), count, keeps)
+        assert block_length(series, [np.arange(count)]) == politis_white(series)
+
+
+def test_length_of_correlated_neighbours_is_longer():
+    rngs = [np.random.default_rng(seed) for seed in range(20)]
+    noise = [block_length(rng.normal(size=300), [np.arange(300)]) for rng in rngs]
+    alike = [block_length(autoregressive(rng, 300, 0.8), [np.arange(300)]) for rng in rngs]
+    assert np.median(noise) <= 2
+    assert np.median(alike) >= 8
+
+
+def test_length_does_not_see_over_the_end_of_a_sequence():
+    """The same values, in sequences of one image each: no neighbours, nothing correlated."""
+    series = autoregressive(np.random.default_rng(0), 300, 0.9)
+    assert block_length(series, [np.arange(300)]) > 5
+    assert block_length(series, [np.array([place]) for place in range(300)]) == 1
+
+
+def test_length_reads_the_order_of_the_frames():
+    series = autoregressive(np.random.default_rng(0), 300, 0.9)
+    order = np.random.default_rng(1).permutation(300)
+    shuffled = np.empty(300)
+    shuffled[order] = series  # frame i lies at order[i]
+    assert block_length(shuffled, [order]) == block_length(series, [np.arange(300)])
+
+
+def test_length_of_little():
+    assert block_length(np.full(50, 3.0), [np.arange(50)]) == 1
+    assert block_length(np.array([1.0]), [np.arange(1)]) == 1
+    assert block_length(np.arange(6.0), [np.arange(6)]) <= 2
+
+
+# Blocks by names.
+
+
+def test_single_images():
+    blocks = make_blocks(mfnet(12), "none", NOTHING)
+    assert blocks.said == "12 single images"
+    assert members(blocks, mfnet(12)) == {frozenset([name]) for name in mfnet(12)}
+    assert make_blocks(mfnet(12), 1, NOTHING).said == "12 single images"
+
+
+def test_few_single_images_are_left_to_the_caller():
+    assert make_blocks(mfnet(3), "none", NOTHING).count == 3
+
+
+def test_neighbours_by_number_whatever_the_order_of_names():
+    names = mfnet(40)
+    np.random.default_rng(0).shuffle(names)
+    blocks = make_blocks(names, 4, NOTHING)
+    expected = {frozenset(mfnet(40)[start : start + 4]) for start in range(0, 40, 4)}
+    assert members(blocks, names) == expected
+    assert blocks.said == "10 blocks of up to 4 neighbouring frames"
+
+
+def test_numbers_are_compared_as_numbers():
+    names = [f"frame{number}" for number in range(1, 25)]  # frame10 sorts before frame2 as text
+    blocks = make_blocks(sorted(names), 2, NOTHING)
+    expected = {frozenset(names[start : start + 2]) for start in range(0, 24, 2)}
+    assert members(blocks, sorted(names)) == expected
+
+
+def test_day_and_night_are_two_sequences():
+    names = mfnet(30, "D") + mfnet(30, "N")
+    blocks = make_blocks(names, 5, NOTHING)
+    assert blocks.count == 12
+    for block in members(blocks, names):
+        assert len({name[-1] for name in block}) == 1
+
+
+def test_sequences_of_kp():
+    names = [
+        f"set{s:02d}_V{v:03d}_I{frame:05d}"
+        for s in (0, 6)
+        for v in range(6)
+        for frame in range(1, 40, 19)
+    ]
+    blocks = make_blocks(names, "sequence", NOTHING)
+    assert blocks.said == "12 sequences"
+    expected = {
+        frozenset(name for name in names if name.startswith(f"set{s:02d}_V{v:03d}_"))
+        for s in (0, 6)
+        for v in range(6)
+    }
+    assert members(blocks, names) == expected
+
+
+def test_pieces_do_not_cross_sequences_and_are_nearly_equal():
+    names = [f"V{v}_I{frame:03d}" for v in range(4) for frame in range(11)]
+    blocks = make_blocks(names, 4, NOTHING)
+    sizes = sorted(len(block) for block in members(blocks, names))
+    assert sizes == [3] * 4 + [4] * 8
+    for block in members(blocks, names):
+        assert len({name[:2] for name in block}) == 1
+
+
+def test_blocks_longer_than_a_sequence_are_the_sequences():
+    names = [f"V{v:02d}_I{frame}" for v in range(12) for frame in range(3)]
+    longer, whole = (make_blocks(names, choice, NOTHING) for choice in (500, "sequence"))
+    assert members(longer, names) == members(whole, names)
+    assert "500" not in longer.said  # no block holds so many
+
+
+def test_auto_without_numbers_draws_single_images():
+    names = ["a", "b", "c3"]
+    assert make_blocks(names, "auto", NOTHING).said == "3 single images"
+
+
+def test_auto_takes_the_longest_of_the_scores():
+    rng = np.random.default_rng(0)
+    noise, alike = rng.normal(size=300), autoregressive(rng, 300, 0.8)
+    length = block_length(alike, [np.arange(300)])
+    blocks = make_blocks(mfnet(300), "auto", np.stack([noise, alike]))
+    assert length > block_length(noise, [np.arange(300)])
+    assert blocks.count == math.ceil(300 / length)
+    assert make_blocks(mfnet(300), "auto", rng.normal(size=(1, 300))).count > blocks.count
+
+
+def test_auto_leaves_enough_blocks():
+    ramp = np.arange(40.0)[None]
+    assert block_length(ramp[0], [np.arange(40)]) > 4
+    assert make_blocks(mfnet(40), "auto", ramp).count == FEWEST
+    assert make_blocks(mfnet(7), "auto", np.arange(7.0)[None]).said == "7 single images"
+
+
+# Refusals.
+
+
+@pytest.mark.parametrize("choice", ["sequence", 5])
+def test_names_without_numbers(choice):
+    names = [*mfnet(20), "final"]
+    with pytest.raises(InputError, match=f"blocks={choice}: the name 'final' holds no frame"):
+        make_blocks(names, choice, NOTHING)
+
+
+def test_too_few_blocks():
+    with pytest.raises(InputError, match="blocks=20: 100 images make 5 blocks of up to 20"):
+        make_blocks(mfnet(100), 20, NOTHING)
+    names = mfnet(100, "D") + mfnet(100, "N")
+    with pytest.raises(InputError, match="blocks=sequence: 200 images make 2 sequences"):
+        make_blocks(names, "sequence", NOTHING)
+    assert make_blocks(mfnet(100), 10, NOTHING).count == FEWEST

@@ -1,0 +1,345 @@
+"""Resampled counts against loops over images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.uncertainty import Resampling
+from analysis.uncertainty import images as room
+from analysis.uncertainty.images import Images, common, prepare
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import parse, value
+from tests.analysis.uncertainty.simulated import CLASSES, Population, counts_of
+
+METRICS = ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "class/cone/region/1")
+ASKED = [parse(metric) for metric in METRICS]
+FEW = Resampling(resamples=100, blocks="none")
+
+
+def drawn(images: int = 14, trainings: int = 2, seed: int = 0, **changes) -> list[Counts]:
+    array = Population(**changes).draw(np.random.default_rng(seed), images, trainings)
+    return [counts_of(each) for each in array]
+
+
+def weighted(counts: Counts, weights: np.ndarray) -> Counts:
+    """The counts with every image repeated, as a user would do it."""
+    names = [
+        name for name, weight in zip(counts.names, weights, strict=True) for _ in range(weight)
+    ]
+    return counts.select(names)
+
+
+def looped(seeds: list[Counts], weights: np.ndarray, absent: str = "released") -> list[float]:
+    """Mean over seeds of each metric, one training and one image at a time."""
+    by_seed = [
+        [value(metric, weighted(each, weights), absent) for metric in METRICS] for each in seeds
+    ]
+    return np.mean(by_seed, axis=0).tolist()
+
+
+def recorded(monkeypatch: pytest.MonkeyPatch, method: str) -> list[np.ndarray]:
+    """Arrays that the generators of `images` return from now on."""
+    kept: list[np.ndarray] = []
+    make = room.numpy_generator
+
+    class Recorder:
+        def __init__(self, *arguments):
+            self.rng = make(*arguments)
+
+        def __getattr__(self, name: str):
+            def call(*arguments, **keywords):
+                found = getattr(self.rng, name)(*arguments, **keywords)
+                if name == method:
+                    kept.append(found)
+                return found
+
+            return call
+
+    monkeypatch.setattr(room, "numpy_generator", Recorder)
+    return kept
+
+
+# Sums.
+
+
+def test_points_are_the_scores_of_each_seed():
+    seeds = drawn()
+    (points,) = prepare([seeds], ASKED[0], FEW).points(ASKED)
+    expected = [[value(metric, each, "released") for each in seeds] for metric in METRICS]
+    np.testing.assert_allclose(points, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("blocks", [1, 3, 7])
+def test_block_sums_are_exact_in_any_order_of_names(blocks: int):
+    rng = np.random.default_rng(0)
+    array = rng.integers(0, 2**31 - 1, (70, 2, 4, 4)).astype(np.int32)
+    order = rng.permutation(70)
+    counts = counts_of(array)
+    shuffled = counts.select([counts.names[place] for place in order])
+    images = prepare([[shuffled]], ASKED[0], replace(FEW, blocks=blocks))
+    ours = images.methods[0][0].reshape(-1, 2, 4, 4)
+    assert ours.shape[0] == images.blocks.count
+    for number in range(images.blocks.count):
+        inside = [shuffled.names[p] for p in np.flatnonzero(images.blocks.index == number)]
+        direct = np.zeros((2, 4, 4), object)  # Python's integers know no overflow
+        for name in inside:
+            direct = direct + array[counts.names.index(name)].astype(object)
+        assert (ours[number] == direct.astype(np.float64)).all()
+        assert ours[number].max() > 2**31 or blocks == 1
+
+
+def test_large_int32_counts_do_not_overflow():
+    """900 images with 2^31 - 1 right pixels of the one class; half of those wrong in another."""
+    array = np.zeros((900, 2, 4, 4), np.int32)
+    array[:, :, 0, 0] = 2**31 - 1
+    array[:, 0, 1, 0] = 2**30
+    counts = counts_of(array)
+    (points,) = prepare([[counts]], parse("class/road"), FEW).points([parse("class/road")])
+    right = 2 * 900 * (2**31 - 1)
+    assert points[0, 0] == pytest.approx(100 * right / (right + 900 * 2**30), rel=1e-14)
+
+
+# Resamples.
+
+
+@pytest.mark.parametrize("absent", ["released", "exclude"])
+def test_resampled_is_the_loop_over_images(monkeypatch: pytest.MonkeyPatch, absent: str):
+    seeds, settings = drawn(), replace(FEW, absent=absent)
+    weights = recorded(monkeypatch, "multinomial")
+    (resampled,) = prepare([seeds], ASKED[0], settings).resampled(ASKED)
+    (only,) = weights
+    assert only.shape == (100, 14)
+    assert (only.sum(1) == 14).all()
+    assert resampled.shape == (len(METRICS), 100)
+    for number in range(0, 100, 7):
+        expected = looped(seeds, only[number], absent)
+        np.testing.assert_allclose(resampled[:, number], expected, rtol=1e-12)
+
+
+def test_blocks_are_drawn_whole(monkeypatch: pytest.MonkeyPatch):
+    seeds = drawn(33)
+    weights = recorded(monkeypatch, "multinomial")
+    images = prepare([seeds], ASKED[0], replace(FEW, blocks=3))
+    (resampled,) = images.resampled(ASKED)
+    (only,) = weights
+    assert only.shape == (100, 11)
+    for number in (0, 50, 99):
+        each_image = only[number][images.blocks.index]
+        np.testing.assert_allclose(resampled[:, number], looped(seeds, each_image), rtol=1e-12)
+
+
+def test_both_methods_see_the_same_draws():
+    a = drawn()
+    first, second = prepare([a, a], ASKED[0], FEW).resampled(ASKED)
+    np.testing.assert_array_equal(first, second)
+
+
+def test_without_each_is_the_loop_over_images():
+    seeds = drawn()
+    (without,) = prepare([seeds], ASKED[0], FEW).without_each(ASKED)
+    assert without.shape == (len(METRICS), 14)
+    for place in range(14):
+        weights = np.ones(14, np.int64)
+        weights[place] = 0
+        np.testing.assert_allclose(without[:, place], looped(seeds, weights), rtol=1e-12)
+
+
+def exchanged(a: Counts, b: Counts, flags: np.ndarray) -> tuple[Counts, Counts]:
+    """Predictions of the images with a flag change sides."""
+    first, second = a.counts.copy(), b.counts.copy()
+    for place in np.flatnonzero(flags):
+        first[place], second[place] = b.counts[place], a.counts[place]
+    return replace(a, counts=first), replace(b, counts=second)
+
+
+@pytest.mark.parametrize(("trainings_a", "trainings_b"), [(1, 1), (2, 2), (2, 3), (4, 2), (1, 3)])
+def test_swapped_is_the_loop_over_images(monkeypatch, trainings_a: int, trainings_b: int):
+    """Training i of a with training i of b, each as often as the least common multiple asks."""
+    rng = np.random.default_rng(0)
+    most = max(trainings_a, trainings_b)
+    arrays = Population().pair(rng, 12, most, Population(skill=2.0))
+    a = [counts_of(each) for each in arrays[0][:trainings_a]]
+    b = [counts_of(each) for each in arrays[1][:trainings_b]]
+    flags = recorded(monkeypatch, "integers")
+    swapped_a, swapped_b = prepare([a, b], ASKED[0], FEW).swapped(ASKED)
+    (only,) = flags
+    assert only.shape == (100, 12)
+    for number in range(0, 100, 23):
+        pairs = [
+            exchanged(a[place % trainings_a], b[place % trainings_b], only[number])
+            for place in range(math.lcm(trainings_a, trainings_b))
+        ]
+        ones = np.ones(12, np.int64)
+        for found, side in ((swapped_a, 0), (swapped_b, 1)):
+            expected = looped([pair[side] for pair in pairs], ones)
+            np.testing.assert_allclose(found[:, number], expected, rtol=1e-12)
+
+
+def test_half_of_the_blocks_are_exchanged(monkeypatch: pytest.MonkeyPatch):
+    flags = recorded(monkeypatch, "integers")
+    settings = replace(FEW, resamples=2000)
+    a = drawn(20, 1)
+    prepare([a, a], ASKED[0], settings).swapped([ASKED[0]])
+    every = np.concatenate(flags)
+    assert every.shape == (2000, 20)
+    assert set(np.unique(every)) == {0, 1}
+    assert abs(every.mean() - 0.5) < 4 * 0.5 / 40_000**0.5
+
+
+# Draws.
+
+
+def numbers(images: Images) -> np.ndarray:
+    return np.concatenate([*images.resampled(ASKED), *images.swapped(ASKED)])
+
+
+def test_same_seed_same_numbers_other_seed_others():
+    a, b = drawn(seed=0), drawn(seed=0, skill=2.0)
+    first, again = (numbers(prepare([a, b], ASKED[0], FEW)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    other = numbers(prepare([a, b], ASKED[0], replace(FEW, seed=1)))
+    assert (first != other).mean() > 0.5
+
+
+def test_numbers_do_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch):
+    """How many resamples fit into the cache is nothing that a result may hang on."""
+    a, b = drawn(seed=0), drawn(seed=0, skill=2.0)
+    settings = replace(FEW, resamples=230)
+    whole = numbers(prepare([a, b], ASKED[0], settings))
+    monkeypatch.setattr(room, "CHUNK", 97)
+    cut = numbers(prepare([a, b], ASKED[0], settings))
+    assert whole.shape == cut.shape == (4 * len(METRICS), 230)
+    np.testing.assert_array_equal(cut, whole)
+
+
+def test_parts_of_a_long_draw_differ():
+    """No two chunks may repeat one another."""
+    (resampled,) = prepare([drawn()], ASKED[0], replace(FEW, resamples=1300)).resampled(ASKED)
+    assert len(np.unique(resampled[0])) > 1200
+
+
+def test_order_of_the_other_counts_does_not_matter():
+    a, b = drawn(seed=0), drawn(seed=0, skill=2.0)
+    names = np.random.default_rng(5).permutation(a[0].names).tolist()
+    first = prepare([a, b], ASKED[0], FEW)
+    second = prepare(
+        [[a[0], a[1].select(names)], [each.select(names) for each in b]], *(ASKED[0], FEW)
+    )
+    np.testing.assert_array_equal(numbers(first), numbers(second))
+
+
+# Day and night.
+
+
+def by_day(counts: Counts, at_night: list[bool]) -> Counts:
+    return replace(counts, night=tuple(at_night))
+
+
+def test_day_and_night_are_over_their_own_images():
+    at_night = [place % 3 == 0 for place in range(30)]
+    counts = by_day(drawn(30, 1)[0], at_night)
+    for part, wanted in (("day", False), ("night", True)):
+        names = [n for n, dark in zip(counts.names, at_night, strict=True) if dark == wanted]
+        asked, plain = parse(f"{part}/Var"), parse("Var")
+        images = prepare([[counts]], asked, FEW)
+        alone = prepare([[replace(counts, night=None).select(names)]], plain, FEW)
+        assert images.images == len(names)
+        np.testing.assert_array_equal(images.methods[0], alone.methods[0])
+        np.testing.assert_array_equal(images.resampled([asked])[0], alone.resampled([plain])[0])
+
+
+def test_no_night_in_the_other_counts_is_refused():
+    a, b = drawn(20, 2)
+    dark = [place % 2 == 0 for place in range(20)]
+    for pair in ([[by_day(a, dark)], [b]], [[b], [by_day(a, dark)]]):
+        with pytest.raises(InputError, match="'night/mIoU'"):
+            prepare(pair, parse("night/mIoU"), FEW)
+
+
+def test_other_night_in_the_other_counts_is_refused():
+    """Else the nights of the one are compared with other images of the other."""
+    a, b = drawn(20, 2)
+    dark = [place % 2 == 0 for place in range(20)]
+    with pytest.raises(InputError, match="night"):
+        prepare([[by_day(a, dark)], [by_day(b, dark[::-1])]], parse("night/mIoU"), FEW)
+    fewer = [*dark[:-2], False, False]
+    with pytest.raises(InputError, match="night"):
+        prepare([[by_day(a, dark)], [by_day(b, fewer)]], parse("night/mIoU"), FEW)
+
+
+# Refusals.
+
+
+def test_other_classes():
+    a, b = drawn(12, 2)
+    other = replace(b, classes=("road", "car", "person", "tree"))
+    with pytest.raises(InputError, match=r"road, car, person, cone cannot be .* person, tree; "):
+        prepare([[a], [other]], ASKED[0], FEW)
+
+
+def test_other_partition():
+    a, b = drawn(12, 2)
+    with pytest.raises(InputError, match="counts by ring2 cannot be compared with counts by ring5"):
+        prepare([[a], [replace(b, partition="ring5")]], ASKED[0], FEW)
+
+
+def test_other_images():
+    a, b = drawn(12, 2)
+    less = b.select(b.names[:-1])
+    with pytest.raises(InputError, match=r"12 of split 'test' against 11 .* '00011D' .*leave_out"):
+        prepare([[a], [less]], ASKED[0], FEW)
+    with pytest.raises(InputError, match="11 of split 'test' against 12"):
+        prepare([[less], [b]], ASKED[0], FEW)
+    with pytest.raises(InputError, match="not of the same images"):
+        prepare([[a, less]], ASKED[0], FEW)
+
+
+def test_other_labels():
+    a, b = drawn(12, 2)
+    changed = b.counts.copy()
+    changed[7, 1, 0, 2] += 1
+    with pytest.raises(InputError, match=r"'00007D' holds other labels .*1 images do"):
+        prepare([[a], [replace(b, counts=changed)]], ASKED[0], FEW)
+
+
+def test_other_predictions_of_the_same_labels_are_no_other_labels():
+    a, b = drawn(12, 2)
+    changed = b.counts.copy()
+    changed[7, 1, 0] = np.roll(changed[7, 1, 0], 1)
+    prepare([[a], [replace(b, counts=changed)]], ASKED[0], FEW)
+
+
+# What both hold.
+
+
+def test_common_images_in_the_order_of_the_first():
+    a, b = drawn(12, 2)
+    first = a.select(a.names[:9][::-1])
+    (one,), (other,) = common([[first], [b.select(b.names[3:])]])
+    assert one.names == other.names == a.names[3:9][::-1]
+    np.testing.assert_array_equal(one.counts, a.counts[3:9][::-1])
+    np.testing.assert_array_equal(other.counts, b.counts[3:9][::-1])
+
+
+def test_no_common_image():
+    a, b = drawn(12, 2)
+    with pytest.raises(InputError, match="no image is in all counts, '0000[06]D' for one"):
+        common([[a.select(a.names[:6])], [b.select(b.names[6:])]])
+
+
+def test_no_image_common_to_all_of_three():
+    """Every two share one, all three none."""
+    counts = drawn(12, 1)[0]
+    names = counts.names
+    three = [counts.select([names[i] for i in pair]) for pair in ((0, 1), (0, 2), (1, 2))]
+    with pytest.raises(InputError, match="no image is in all counts"):
+        common([three[:1], three[1:]])
+
+
+def test_classes_are_those_of_the_population():
+    assert prepare([drawn(12, 1)], ASKED[0], FEW).classes == CLASSES
