@@ -18,8 +18,8 @@ HEADER = ("table", "row", "column", "mean", "sd", "n", "published", "difference"
 
 MARKDOWN_FILE = "table.md"
 EXTRA = re.compile(r"Every row of ours was run with (.*)\.")
-LEGEND = ("Bold:", "rho:")
-"""Beginnings of remarks on marks, which the page explains itself."""
+SHOWN = ("Bold:", "rho:", "Published:", "Ours:", "scale=demo:")
+"""Beginnings of remarks that the page shows by itself: marks, data, seeds and scale."""
 
 DEFAULT_SEEDS = (0, 1, 2)
 """Of a table that nobody has run yet."""
@@ -127,9 +127,9 @@ def _line(line: Mapping[str, str]) -> Line:
 
 
 def _remarks(markdown: str) -> list[str]:
-    """The list below the table; whatever explains marks is left out."""
+    """The list below the table; without `SHOWN`."""
     lines = [line[2:] for line in markdown.splitlines() if line.startswith("- ")]
-    return [line for line in lines if not line.startswith(LEGEND)]
+    return [line for line in lines if not line.startswith(SHOWN)]
 
 
 def reproduce_command(name: str, seeds: Sequence[int], scale: str, extra: str = "") -> str:
