@@ -373,8 +373,11 @@ def test_a_checkpoint_of_another_model_is_refused(
 
 
 def test_multirun_finishes_the_other_points_when_one_is_wrong(
-    call: Call, data: Path, tmp_path: Path
+    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from sweeps.running import executors
+
+    monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
     code, _, err = train(
         call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
     )
