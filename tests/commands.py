@@ -21,17 +21,23 @@ SMALL = (
     ),
 )
 Call = Callable[..., tuple[int, str, str]]
+Trained = Callable[..., Path]
 
 
 def short(steps: int) -> tuple[str, ...]:
     return f"trainer.max_steps={steps}", f"trainer.eval_every={steps}", "trainer.checkpoint_every=2"
 
 
+def words_of(data: Path, runs: Path, *overrides: str) -> list[str]:
+    """Arguments of `rgbt.run`."""
+    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
+    return [*place, *SMALL, *overrides]
+
+
 def train(call: Call, data: Path, runs: Path, *overrides: str) -> tuple[int, str, str]:
     from rgbt.run import main
 
-    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
-    return call(main, *place, *SMALL, *overrides)
+    return call(main, *words_of(data, runs, *overrides))
 
 
 def only_run(runs: Path) -> Path:

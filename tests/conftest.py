@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from rgbt.randomness import numpy_generator
-from tests.commands import SPLITS, Call
+from tests.commands import SPLITS, Call, Trained, only_run, words_of
 
 WriteMFNet = Callable[..., Path]
 
@@ -38,6 +38,24 @@ def write_png(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), np.ascontiguousarray(image))
 
 
+def write_data(
+    root: Path, splits: Mapping[str, list[str]], hw: tuple[int, int], layout: str = "packed"
+) -> Path:
+    for split, names in splits.items():
+        root.mkdir(exist_ok=True)
+        (root / f"{split}.txt").write_text("\n".join(names) + "\n")
+        for name in names:
+            rgb, thermal, label = pair(name, hw)
+            if layout == "packed":
+                write_png(root / "images" / f"{name}.png", np.dstack([rgb, thermal]))
+                write_png(root / "labels" / f"{name}.png", label)
+            else:
+                write_png(root / "RGB" / f"{name}.png", rgb)
+                write_png(root / "Thermal" / f"{name}.png", thermal)
+                write_png(root / "Label" / f"{name}.png", label)
+    return root
+
+
 @pytest.fixture
 def write_mfnet(tmp_path: Path) -> WriteMFNet:
     def write(
@@ -46,20 +64,7 @@ def write_mfnet(tmp_path: Path) -> WriteMFNet:
         layout: str = "packed",
         folder: str = "mf",
     ) -> Path:
-        root = tmp_path / folder
-        for split, names in splits.items():
-            root.mkdir(exist_ok=True)
-            (root / f"{split}.txt").write_text("\n".join(names) + "\n")
-            for name in names:
-                rgb, thermal, label = pair(name, hw)
-                if layout == "packed":
-                    write_png(root / "images" / f"{name}.png", np.dstack([rgb, thermal]))
-                    write_png(root / "labels" / f"{name}.png", label)
-                else:
-                    write_png(root / "RGB" / f"{name}.png", rgb)
-                    write_png(root / "Thermal" / f"{name}.png", thermal)
-                    write_png(root / "Label" / f"{name}.png", label)
-        return root
+        return write_data(tmp_path / folder, splits, hw, layout)
 
     return write
 
@@ -91,3 +96,26 @@ def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> 
 @pytest.fixture
 def data(write_mfnet: Callable[..., Path]) -> Path:
     return write_mfnet(SPLITS, hw=(48, 64))
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """The folder of a run with these overrides, on data equal to `data`; to be read or copied."""
+    from rgbt.run import main
+
+    made: dict[tuple[str, ...], Path] = {}
+
+    def run(*overrides: str) -> Path:
+        if overrides not in made:
+            place = tmp_path_factory.mktemp("trained")
+            data = write_data(place / "mf", SPLITS, (48, 64))
+            words = ["rgbt", *words_of(data, place / "runs", *overrides)]
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(sys, "argv", words)
+                with pytest.raises(SystemExit) as left:
+                    main()
+            assert not left.value.code
+            made[overrides] = only_run(place / "runs")
+        return made[overrides]
+
+    return run

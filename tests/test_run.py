@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,17 @@ import numpy as np
 import pytest
 
 from rgbt.metrics.counts import Counts
-from tests.commands import SMALL, SPLITS, Call, assert_one_sentence, only_run, short, train
+from tests.commands import (
+    SMALL,
+    SPLITS,
+    Call,
+    Trained,
+    assert_one_sentence,
+    only_run,
+    short,
+    train,
+    words_of,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -78,8 +89,7 @@ def test_the_same_seed_gives_the_same_losses_and_another_seed_another_run(
 
 
 def command(data: Path, runs: Path, *overrides: str) -> list[str]:
-    place = (f"dataset.root={data}", f"runs_dir={runs}", "dataset=mfnet", "tracking=none")
-    return [sys.executable, "-m", "rgbt.run", *place, *SMALL, *overrides]
+    return [sys.executable, "-m", "rgbt.run", *words_of(data, runs, *overrides)]
 
 
 def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_path: Path) -> None:
@@ -244,9 +254,15 @@ def test_an_unreadable_file_can_be_skipped_and_is_reported(
     assert result["skipped"] == ["00003N"]
 
 
-def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    train(call, data, runs, "+experiment=crm", *short(1))
+@pytest.fixture
+def runs(trained: Trained, tmp_path: Path) -> Path:
+    """A `runs_dir` with one finished run: crm, one step, on files equal to those of `data`."""
+    done = trained("+experiment=crm", *short(1))
+    shutil.copytree(done, tmp_path / "runs" / done.name)
+    return tmp_path / "runs"
+
+
+def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, runs: Path) -> None:
     (only_run(runs) / "result.json").unlink()
     (data / "train.txt").write_text("\n".join(SPLITS["train"][:-1]) + "\n")
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
@@ -255,10 +271,8 @@ def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, tmp_p
 
 
 def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
-    call: Call, data: Path, tmp_path: Path
+    call: Call, data: Path, runs: Path
 ) -> None:
-    runs = tmp_path / "runs"
-    train(call, data, runs, "+experiment=crm", *short(1))
     (only_run(runs) / "result.json").unlink()
     corrupted_and_repaired = data / "images" / "00003N.png"
     image = cv2.imread(str(corrupted_and_repaired), cv2.IMREAD_UNCHANGED)
@@ -269,12 +283,12 @@ def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
     assert "have changed since this run was begun" in err
 
 
-def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Path) -> None:
+def test_evaluate_and_predict_a_stored_run(
+    call: Call, data: Path, runs: Path, tmp_path: Path
+) -> None:
     from rgbt import evaluate, predict
     from rgbt.command import plain_command
 
-    runs = tmp_path / "runs"
-    train(call, data, runs, "+experiment=crm", *short(1))
     folder = only_run(runs)
     evaluate_entry = plain_command(evaluate.OWN, evaluate.main)
 
@@ -317,12 +331,10 @@ def test_evaluate_and_predict_a_stored_run(call: Call, data: Path, tmp_path: Pat
     assert (other / "a.png").read_bytes() == before
 
 
-def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Path) -> None:
+def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
     from rgbt import evaluate
     from rgbt.command import plain_command
 
-    runs = tmp_path / "runs"
-    train(call, data, runs, "+experiment=crm", *short(1))
     folder = only_run(runs)
     entry = plain_command(evaluate.OWN, evaluate.main)
     cases = {
@@ -348,9 +360,10 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, data: Path, tmp_path: Pa
     assert_one_sentence(err, "there is no such checkpoint")
 
 
-def test_a_checkpoint_of_another_model_is_refused(call: Call, data: Path, tmp_path: Path) -> None:
-    train(call, data, tmp_path / "runs", "+experiment=crm", *short(1))
-    folder = only_run(tmp_path / "runs")
+def test_a_checkpoint_of_another_model_is_refused(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    folder = trained("+experiment=crm", *short(1))
     code, _, err = train(
         *(call, data, tmp_path / "other", "+experiment=crm", "model.num_queries=7"),
         *(f"model.weights={folder}", *short(1)),
@@ -360,8 +373,11 @@ def test_a_checkpoint_of_another_model_is_refused(call: Call, data: Path, tmp_pa
 
 
 def test_multirun_finishes_the_other_points_when_one_is_wrong(
-    call: Call, data: Path, tmp_path: Path
+    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from sweeps.running import executors
+
+    monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
     code, _, err = train(
         call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
     )

@@ -15,20 +15,23 @@ from rgbt.command import plain_command
 from rgbt.config import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.weights.__main__ import main as weights_main
-from tests.commands import Call, assert_one_sentence, only_run, short, train
+from tests.commands import Call, Trained, assert_one_sentence, only_run, short, train
 from tests.models.golden import SHARED, compose
 
 EVALUATE = plain_command(evaluate.OWN, evaluate.main)
 REAL = SHARED / "realdata"
 
 
-def test_a_run_starts_from_another_runs_weights(call: Call, data: Path, tmp_path: Path) -> None:
-    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
-    code, _, err = train(call, data, tmp_path / "first", *one)
-    assert code == 0, err
-    first = only_run(tmp_path / "first")
+ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
+"""One step of a small network."""
+
+
+def test_a_run_starts_from_another_runs_weights(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    first = trained(*ONE)
     still = ("optimizer.lr=1.0e-30", f"model.weights={first}")
-    code, _, err = train(call, data, tmp_path / "second", *one, *still)
+    code, _, err = train(call, data, tmp_path / "second", *ONE, *still)
     assert code == 0, err
     second = only_run(tmp_path / "second")
     before, after = (
@@ -39,29 +42,26 @@ def test_a_run_starts_from_another_runs_weights(call: Call, data: Path, tmp_path
     assert all("running" in key or "num_batches" in key for key in moved)
 
 
-def test_fresh_parts_keep_their_random_start(call: Call, data: Path, tmp_path: Path) -> None:
-    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
-    code, _, err = train(call, data, tmp_path / "first", *one)
-    assert code == 0, err
-    first = only_run(tmp_path / "first")
+def test_fresh_parts_keep_their_random_start(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    first = trained(*ONE)
     other = (f"model.weights={first}", "model.fresh=[decode1.]", "optimizer.lr=1.0e-30", "seed=7")
-    code, _, err = train(call, data, tmp_path / "second", *one, *other)
+    code, _, err = train(call, data, tmp_path / "second", *ONE, *other)
     assert code == 0, err
     assert "named in model.fresh" in err
     before, after = (
-        torch.load(only_run(tmp_path / name) / "best.pt", weights_only=True)["model"]
-        for name in ("first", "second")
+        torch.load(folder / "best.pt", weights_only=True)["model"]
+        for folder in (first, only_run(tmp_path / "second"))
     )
     assert not torch.equal(before["decode1.conv.weight"], after["decode1.conv.weight"])
     assert torch.equal(before["decode2.conv.weight"], after["decode2.conv.weight"])
 
 
-def test_weights_are_scored_without_a_run(call: Call, data: Path, tmp_path: Path) -> None:
-    code, _, err = train(
-        call, data, tmp_path, "+experiment=mfnet", "masker.patch_size=null", *short(2)
-    )
-    assert code == 0, err
-    folder = only_run(tmp_path)
+def test_weights_are_scored_without_a_run(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    folder = trained(*ONE)
     named = (
         *("model=mfnet_tiny", f"model.weights={folder}", f"dataset.root={data}"),
         *(f"runs_dir={tmp_path}", "data.num_workers=0", "trainer.threads=1"),
@@ -80,14 +80,13 @@ def test_weights_are_scored_without_a_run(call: Call, data: Path, tmp_path: Path
     assert len(list((tmp_path / "out").glob("*_overlay.png"))) == len(stored.names)
 
 
-def test_another_way_of_feeding_is_said(call: Call, data: Path, tmp_path: Path) -> None:
-    one = (*("+experiment=mfnet", "masker.patch_size=null"), *short(1))
-    code, _, err = train(call, data, tmp_path / "first", *one)
-    assert code == 0, err
-    first = only_run(tmp_path / "first")
+def test_another_way_of_feeding_is_said(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    first = trained(*ONE)
     for runs, inputs in (("same", "unit"), ("other", "crm")):
         words = (f"model.weights={first}", f"model/inputs={inputs}")
-        code, _, err = train(call, data, tmp_path / runs, *one, *words)
+        code, _, err = train(call, data, tmp_path / runs, *ONE, *words)
         assert code == 0, err
         assert ("this network with something else" in err) == (inputs == "crm")
 
@@ -97,7 +96,7 @@ def test_another_way_of_feeding_is_said(call: Call, data: Path, tmp_path: Path) 
     assert call(weights_main, *words)[0] == 0
     for runs, inputs in (("third", "unit"), ("fourth", "crm")):
         words = (f"model.weights={exported}", f"model/inputs={inputs}")
-        code, _, err = train(call, data, tmp_path / runs, *one, *words)
+        code, _, err = train(call, data, tmp_path / runs, *ONE, *words)
         assert code == 0, err
         assert ("this network with something else" in err) == (inputs == "crm")
 
@@ -112,12 +111,11 @@ def test_another_way_of_feeding_is_said(call: Call, data: Path, tmp_path: Path) 
         assert said == change.endswith("false")
 
 
-def test_networks_with_random_parts_are_not_scored(call: Call, data: Path, tmp_path: Path) -> None:
-    code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "masker.patch_size=null",
-                         *short(1))  # fmt: skip
-    assert code == 0, err
+def test_networks_with_random_parts_are_not_scored(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
     named = (
-        *("model=mfnet_tiny", f"model.weights={only_run(tmp_path)}", f"dataset.root={data}"),
+        *("model=mfnet_tiny", f"model.weights={trained(*ONE)}", f"dataset.root={data}"),
         *("model.fresh=[decode1]", "data.num_workers=0", "trainer.threads=1"),
     )
     code, _, err = call(EVALUATE, *named)

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -73,10 +74,13 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def executor(module: Path) -> LocalExecutor:
+def executor(module: Path) -> Iterator[LocalExecutor]:
+    # Nothing here needs torch. The server is one of the whole process: later tests start their own.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(executors, "PRELOADED", ())
-        return LocalExecutor()
+        patch.setattr(executors, "own_modules", list)
+        yield LocalExecutor()
+    forkserver._forkserver._stop()
 
 
 Start = Callable[..., Job]
@@ -235,7 +239,7 @@ DRIVER = textwrap.dedent("""
 
     if __name__ == "__main__":
         sys.path.insert(0, sys.argv[1])
-        executors.PRELOADED = ()
+        executors.PRELOADED, executors.own_modules = (), list
         folder = Path(sys.argv[2])
         job = executors.LocalExecutor().start(("tiny_run", "wait", str(folder / "pid")), {},
                                               folder / "log")
