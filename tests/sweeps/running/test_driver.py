@@ -147,7 +147,7 @@ def test_max_failures_is_the_number_of_failures_that_ends_a_call(tmp_path: Path)
 
 
 def test_a_run_that_takes_too_long_is_stopped_and_the_next_one_begun(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, plans(2), only("x=0", hang), timeout_minutes=0.0005).run()
+    desk = list_desk(tmp_path, plans(2), only("x=0", hang), timeout_minutes=0.02).run()
     assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
     assert "timeout_minutes" in trial(desk, 0).user_attrs[names.REASON]
     assert desk.executor.calls[0].stops == 1
