@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from rgbt.checks import InputError, check_range, nearest
 from rgbt.command import built
 
 if TYPE_CHECKING:
+    from analysis.uncertainty.settings import NamedBlocks
     from rgbt.data.mfnet import MFNet
+
+MOST = 1_000_000
+"""What a count may be, where nothing else limits it."""
 
 
 def whole(key: str, text: str, low: int, high: int) -> int:
@@ -18,10 +24,33 @@ def whole(key: str, text: str, low: int, high: int) -> int:
     Raises:
         InputError: it is none.
     """
-    if not text.strip().isdecimal():
+    # Longer ones Python does not even read.
+    if not text.strip().isdecimal() or len(text) > 18:
         raise InputError(f"{key}={text}: expected a whole number from {low} to {high}.")
     check_range(key, int(text), low, high)
     return int(text)
+
+
+def blocks_of(text: str) -> NamedBlocks | int:
+    """A number of images, or a word that `Resampling` knows and checks."""
+    return whole("blocks", text, 1, MOST) if text.isdecimal() else cast("NamedBlocks", text)
+
+
+def out_folder(text: str) -> Path | None:
+    """The folder that `out` names, None for ""; told before any work whether it can be written.
+
+    Raises:
+        InputError: it is a file or lies below one, or may not be written.
+    """
+    if not text:
+        return None
+    out = Path(text)
+    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    if not there.is_dir():
+        raise InputError(f"out={text}: {there} is a file; give a folder.")
+    if not os.access(there, os.W_OK):
+        raise InputError(f"out={text}: {there} may not be written; give another folder.")
+    return out
 
 
 def decimal(key: str, text: str, example: str) -> float:

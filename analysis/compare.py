@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.arguments import decimal, refuse_others, whole
+from analysis.arguments import blocks_of, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 
@@ -61,6 +61,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
     refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
+    out = out_folder(arguments["out"])
     opened = [
         open_counts(arguments[side], arguments["runs_dir"], arguments["split"]) for side in "ab"
     ]
@@ -72,8 +73,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     said = sentence(comparison, *labels)
     show(rich_table(grid))
     show(escape(said + "\n" + remark(settings)))
-    if arguments["out"]:
-        _write(Path(arguments["out"]), grid, said, comparison)
+    if out is not None:
+        _write(out, grid, said, comparison)
     return 0
 
 
@@ -85,15 +86,14 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     """
     from typing import cast
 
-    from analysis.uncertainty.settings import MOST, Method, NamedBlocks, Resampling
+    from analysis.uncertainty.settings import MOST, Method, Resampling
     from rgbt.metrics.metric import Absent
 
-    blocks = arguments["blocks"]
     return Resampling(
         resamples=whole("resamples", arguments["resamples"], 100, MOST),
         level=decimal("level", arguments["level"], "0.95"),
         method=cast(Method, arguments["method"]),
-        blocks=int(blocks) if blocks.isdecimal() else cast(NamedBlocks, blocks),
+        blocks=blocks_of(arguments["blocks"]),
         seed=whole("seed", arguments["seed"], 0, 2**31),
         absent=cast(Absent, arguments["absent"]),
     )

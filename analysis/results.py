@@ -52,7 +52,7 @@ def open_counts(
     """
     root = Path(runs_dir)
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    words = [text] if _of_group(text, root) else _words(text)
+    words = [text] if _of_group(text, root) else split_words(text)
     found = [stored for word in words for stored in _open(word, root, split)]
     paths = [stored.path for stored in found]
     for path in paths:
@@ -66,7 +66,8 @@ def label_of(stored: tuple[Stored, ...]) -> str:
     return " + ".join(dict.fromkeys(each.label for each in stored))
 
 
-def _words(text: str) -> list[str]:
+def split_words(text: str) -> list[str]:
+    """The entries of a list with commas between them; InputError where one is empty."""
     # Not at the commas of "grbm train_sizes=[240,480]".
     words = [word.strip() for word in re.split(r",(?![^\[]*\])", text)]
     if not all(words):
@@ -79,7 +80,7 @@ def _words(text: str) -> list[str]:
 def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
-        return [Stored(path.stem, "", None, path.resolve(), Counts.load(path))]
+        return [_of_file(path)]
     grouped = _of_group(word, runs_dir)
     if grouped:
         return [_of_run(folder, split) for folder in grouped]
@@ -116,7 +117,14 @@ def _of_scores(folder: Path) -> Stored:
         raise InputError(
             f"{folder} holds {', '.join(file.name for file in files)}; name one of these files."
         )
-    return Stored(folder.name, "", None, files[0].resolve(), Counts.load(files[0]))
+    return _of_file(files[0])
+
+
+def _of_file(path: Path) -> Stored:
+    """A file of counts, called like its folder where its own name says only what it holds."""
+    path = path.resolve()
+    label = path.parent.name if path.stem.startswith("counts_") else path.stem
+    return Stored(label, "", None, path, Counts.load(path))
 
 
 def _of_group(word: str, runs_dir: Path) -> list[RunFolder]:

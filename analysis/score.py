@@ -10,15 +10,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from analysis.arguments import dataset_of, decimal, refuse_others, whole
+from analysis.arguments import (
+    MOST,
+    blocks_of,
+    dataset_of,
+    decimal,
+    out_folder,
+    refuse_others,
+    whole,
+)
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
-from rgbt.metrics.names import MIOU
+from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import Options, Scored
-    from analysis.predictions.table import ScoreTable
+    from analysis.predictions.table import Cell, ScoreTable
+    from analysis.results import Stored
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
 
@@ -46,6 +55,9 @@ OWN = {
     **OF_A_FOLDER,
 }
 MAX_THREADS = 256
+
+OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
+"""Part of the images -> its mIoU."""
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
@@ -81,7 +93,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
             "expected one of predictions=folder and counts=run, got "
             f"{' and '.join(given) or 'neither'}."
         )
-    out = Path(arguments["out"]) if arguments["out"] else None
+    out = out_folder(arguments["out"])
     settings = _resampling(arguments)
     if given == ["counts"]:
         counted, remarks = _stored(arguments, overrides), []
@@ -204,23 +216,26 @@ def _stored(arguments: dict[str, str], overrides: list[str]) -> list[tuple[str, 
         "stored counts hold one partition and no map by pixel; for the others write predictions "
         "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
     )
-    several = len({stored.label for stored in found}) < len(found)
+    labels = [stored.label for stored in found]
     return [
-        (f"{stored.label} seed {stored.seed}" if several else stored.label, stored.counts)
+        (stored.label if labels.count(stored.label) == 1 else _told_apart(stored), stored.counts)
         for stored in found
     ]
+
+
+def _told_apart(stored: Stored) -> str:
+    """A label of its own for one of several of one name."""
+    return str(stored.path) if stored.seed is None else f"{stored.label} seed {stored.seed}"
 
 
 def _resampling(arguments: dict[str, str]) -> Resampling | None:
     from analysis.uncertainty import Resampling
 
-    resamples = whole("resamples", arguments["resamples"], 0, 1_000_000)
+    resamples = whole("resamples", arguments["resamples"], 0, MOST)
     if resamples == 0:
         return None
     level = decimal("level", arguments["level"], "0.95")
-    blocks = arguments["blocks"]
-    drawn: Any = int(blocks) if blocks.isdecimal() else blocks  # Resampling refuses other words
-    return Resampling(resamples=resamples, level=level, blocks=drawn)
+    return Resampling(resamples=resamples, level=level, blocks=blocks_of(arguments["blocks"]))
 
 
 def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> ScoreTable:
@@ -228,21 +243,24 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     from analysis.predictions.table import interval_cells, with_intervals
     from analysis.uncertainty import estimate
 
-    found, drawn = {}, ""
+    found: dict[Cell, tuple[float, float]] = {}
+    drawn: dict[str, str] = {}
     for absent in table.conventions():
         cells = interval_cells(table, absent)
         estimates = estimate([counts], list(cells), replace(settings, absent=absent))
         for metric, each in estimates.items():
             if each.images is not None:
                 found[cells[metric]] = (each.images.low, each.images.high)
-        drawn = estimates[MIOU].said
+        drawn |= {part: estimates[name].said for part, name in OF_PARTS.items() if name in cells}
+    whole_split = drawn.pop("all")
     if not found:
         return replace(
-            table, intervals=f"{table.partition}: no intervals, too few images: {drawn}."
+            table, intervals=f"{table.partition}: no intervals, too few images: {whole_split}."
         )
+    parts = "".join(f"; {part} of {said}" for part, said in drawn.items())
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"({settings.method}, {settings.resamples} resamples of {drawn})."
+        f"({settings.method}, {settings.resamples} resamples of {whole_split}{parts})."
     )
     return with_intervals(table, found, said)
 

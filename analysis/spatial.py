@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.arguments import decimal, refuse_others, whole
+from analysis.arguments import MOST, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice
 from rgbt.command import built, plain_command
 
@@ -33,9 +33,6 @@ OWN: dict[str, str | None] = {
     "workers": "0",
     "out": "",
 }
-MOST = 1_000_000
-"""What a count may be."""
-
 OVERRIDES = ("dataset", "data.on_error")
 """What of the configuration counts here; another key is refused."""
 
@@ -66,18 +63,18 @@ def main(values: dict[str, str], overrides: list[str]) -> None:
     from rgbt.tracking.terminal import place_lines, show
 
     _check_words(values)
+    out = out_folder(values["out"])
     numbers = {key: whole(key, values[key], 0, MOST) for key in ("blocks", "resamples", "seed")}
     level = decimal("level", values["level"], "0.95")
     check_resampling(numbers["blocks"], numbers["resamples"], level)
     settings, dataset = _settings(values, overrides)
-    dataset.names(values["split"])  # a split that is not there is said before a folder is made
-    if values["out"]:
-        Path(values["out"]).mkdir(parents=True, exist_ok=True)
+    dataset.names(values["split"])  # a split that is not there is told before anything is read
     stats = _collect(dataset, values["split"], settings)
     found = claims(stats, level=level, **numbers)
     _print(stats, found, (values["estimator"], values["average"]), level)
-    if values["out"]:
-        show(place_lines(_write(stats, found, values, Path(values["out"]))))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        show(place_lines(_write(stats, found, values, out)))
 
 
 def _check_words(values: dict[str, str]) -> None:
@@ -114,7 +111,7 @@ def _regions(values: dict[str, str]) -> Regions:
         raise InputError(f"aspect={aspect} is one of rings; leave it out with {partition} strips.")
     regions = whole("regions", values["regions"], 1, MAX_REGIONS)
     return Regions(
-        partition=partition,  # type: ignore[arg-type]  # checked in `_check_names`
+        partition=partition,  # type: ignore[arg-type]  # checked in `_check_words`
         regions=regions,
         aspect=aspect if partition == "ring" else None,  # type: ignore[arg-type]  # as above
         absent="released",

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from analysis.arguments import whole
+from analysis.arguments import out_folder, whole
 from rgbt.checks import InputError
 from rgbt.command import built, plain_command, readable_paths
 
@@ -37,9 +37,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     on the page.
     """
     resamples = whole("resamples", arguments["resamples"], FEWEST, MOST)
-    out, runs_dir = (Path(arguments[key]).expanduser() for key in ("out", "runs_dir"))
-    if out.is_file():
-        raise InputError(f"out={out} is a file; give a folder for the page.")
+    runs_dir, out = Path(arguments["runs_dir"]).expanduser(), out_folder(arguments["out"])
+    if out is None:
+        raise InputError("'out' has no value; give a folder for the page.")
     # Read by Hydra; the tracker resolves the folder like that of a run.
     place = readable_paths([f"runs_dir={os.fspath(runs_dir)}"])
     tracking = built("tracking", [*place, *overrides])

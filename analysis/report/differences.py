@@ -182,7 +182,8 @@ def sentence(pair: Pair, compared: Comparison) -> str:
     seeds = " against ".join(f"{count} seed{'s' * (count > 1)}" for count in counts)
     return (
         f"Released less paper: {shown} ({pair.paper[0].entry.group}; {seeds}; "
-        f"{100 * compared.level:g} % intervals over {over}, {compared.said})."
+        f"{100 * compared.level:g} % intervals over {over}, {compared.said}; p not corrected for "
+        "the number of comparisons)."
     )
 
 

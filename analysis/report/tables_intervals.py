@@ -108,10 +108,10 @@ def _resampled(
             for metric, each in estimates.items()
         }
     first, second = counts
-    # The same trainings stand on both sides: how they spread over seeds cancels, images do not.
-    compared = compare(second, first, metrics, settings)
+    compared = compare(second, first, metrics, settings, paired=True)
     return {
-        each.metric: _covering(each.images, None, compared.said) for each in compared.differences
+        each.metric: _covering(each.images, each.both, compared.said)
+        for each in compared.differences
     }
 
 

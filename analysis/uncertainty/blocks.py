@@ -41,7 +41,7 @@ def make_blocks(
     """The blocks that `choice` asks for (see `Resampling.blocks`).
 
     Args:
-        names: of N images; frames of one sequence differ in their last number alone.
+        names: of N images; frames of one sequence differ in one number alone.
         choice: see `Resampling.blocks`.
         series: (L, N), influence of every image on each of L scores; read by "auto" alone, which
             takes the longest of their block lengths.
@@ -55,8 +55,8 @@ def make_blocks(
         return _singles(len(names))
     if sequences is None:
         raise InputError(
-            f"blocks={choice}: the name '{_without_number(names)}' holds no frame number, so that "
-            "neighbours cannot be told; use blocks=none."
+            f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
+            "but for one number); use blocks=none."
         )
     if choice == "sequence":
         blocks = _joined(len(names), sequences, f"{len(sequences)} sequences")
@@ -70,8 +70,8 @@ def make_blocks(
         blocks = _joined(len(names), pieces, said)
     if blocks.count < FEWEST:
         raise InputError(
-            f"blocks={choice}: {len(names)} images make {blocks.said}, and fewer than {FEWEST} "
-            "pieces say nothing about how sure a score is; give a smaller number of images."
+            f"blocks={choice}: {len(names)} images make {blocks.said}, and fewer than {FEWEST} say "
+            "nothing about how sure a score is; take shorter blocks, or blocks=auto."
         )
     return blocks
 
@@ -142,19 +142,28 @@ def _automatic(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int64
 
 
 def _sequences(names: Sequence[str]) -> list[NDArray[np.int64]] | None:
-    """Places of the images of every sequence, by frame; None where a name holds no number."""
-    found: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for place, name in enumerate(names):
-        match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
-        if match is None:
-            return None
-        before, number, after = match.groups()
-        found.setdefault((before, after), []).append((int(number), place))
+    """Places of the images of every sequence, by frame; None where names tell no neighbours.
+
+    The frame is the last number in the names that is not the same in all of them; names that are
+    equal but for it are one sequence.
+    """
+    words = [re.split(r"(\d+)", name) for name in names]
+    shapes: dict[tuple[str, ...], list[int]] = {}
+    for place, parts in enumerate(words):
+        shapes.setdefault(tuple(parts[::2]), []).append(place)
+    if () in {shape[1:] for shape in shapes}:
+        return None
+    found: dict[tuple[str, ...], list[tuple[int, int]]] = {}
+    for places in shapes.values():
+        numbers = range(1, len(words[places[0]]), 2)
+        varied = [at for at in numbers if len({words[place][at] for place in places}) > 1]
+        frame = varied[-1] if varied else numbers[-1]
+        for place in places:
+            rest = (*words[place][:frame], *words[place][frame + 1 :])
+            found.setdefault(rest, []).append((int(words[place][frame]), place))
+    if all(len(frames) == 1 for frames in found.values()):
+        return None
     return [np.array([place for _, place in sorted(frames)]) for frames in found.values()]
-
-
-def _without_number(names: Sequence[str]) -> str:
-    return next(name for name in names if not re.search(r"\d", name))
 
 
 def _cut(places: NDArray[np.int64], length: int) -> list[NDArray[np.int64]]:

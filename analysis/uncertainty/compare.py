@@ -85,25 +85,34 @@ class Comparison:
 
 
 def compare(
-    a: Sequence[Counts], b: Sequence[Counts], metrics: Sequence[str], settings: Resampling
+    a: Sequence[Counts],
+    b: Sequence[Counts],
+    metrics: Sequence[str],
+    settings: Resampling,
+    *,
+    paired: bool = False,
 ) -> Comparison:
     """Compare two methods on the same images.
 
     Intervals over images resample blocks of images, the same for both methods. p-values over
     images exchange the predictions of the methods on every block with probability 1/2: under the
-    hypothesis that the methods are alike all these are equally likely. Seeds of the two methods
-    are not paired (Welch).
+    hypothesis that the methods are alike all these are equally likely. Seeds of two methods are not
+    paired (Welch); two evaluations of the same trainings are.
 
     Args:
         a: counts of the trainings of the first method, one or more.
         b: of the second, on the same images.
         metrics: names, see `rgbt.metrics.named`.
         settings: of the resampling.
+        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways.
 
     Raises:
         InputError: other images, classes, regions or labels; fewer than `FEWEST` blocks; no such
             metric.
+        ValueError: paired, but not as many.
     """
+    if paired and len(a) != len(b):
+        raise ValueError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
     found: dict[str, Difference] = {}
     described: dict[str | None, Images] = {}
     for group in by_part(metrics):
@@ -113,7 +122,8 @@ def compare(
                 f"{images.blocks.said} are too few to compare two methods; {FEWEST} are the least."
             )
         described[group[0].part] = images
-        found |= {difference.metric: difference for difference in _differences(images, group)}
+        every = _differences(images, group, paired=paired)
+        found |= {difference.metric: difference for difference in every}
     ordered = [found[metric] for metric in dict.fromkeys(metrics)]
     corrected = holm([difference.p for difference in ordered])
     main = described[parse(metrics[0]).part]
@@ -129,7 +139,7 @@ def compare(
     )
 
 
-def _differences(images: Images, asked: Sequence[Asked]) -> Iterator[Difference]:
+def _differences(images: Images, asked: Sequence[Asked], *, paired: bool) -> Iterator[Difference]:
     a, b = images.drawn(asked)
     swapped_a, swapped_b = images.swapped(asked)
     every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
@@ -140,14 +150,15 @@ def _differences(images: Images, asked: Sequence[Asked]) -> Iterator[Difference]
             metric=each.metric, a=first, b=second, value=value, p_images=swap_p(value, swapped)
         )
         resampled, without = rows_b[1] - rows_a[1], rows_b[2] - rows_a[2]
-        yield _with_intervals(images, plain, (resampled, without), (rows_a[0], rows_b[0]))
+        points = (rows_b[0] - rows_a[0],) if paired else (rows_a[0], rows_b[0])
+        yield _with_intervals(images, plain, (resampled, without), points)
 
 
 def _with_intervals(
     images: Images,
     plain: Difference,
     resampled: tuple[Values, Values],
-    points: tuple[Values, Values],
+    points: tuple[Values, ...],
 ) -> Difference:
     settings, value = images.settings, plain.value
     around = over_images(value, *resampled, method=settings.method, level=settings.level)

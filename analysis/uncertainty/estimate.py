@@ -96,10 +96,10 @@ def estimate_of(images: Images, points: Values, resampled: Values, without: Valu
     spread = over_seeds(points)
     trainings = both = None
     if spread is not None:
-        trainings = student(value, spread, level)
+        trainings = _of_score(student(value, spread, level))
         if around is not None:
             whole = together(image_spread(images, resampled), spread)
-            both = student(value, widest(level, whole, spread), level)
+            both = _of_score(student(value, widest(level, whole, spread), level))
     return Estimate(
         value=value,
         sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),
@@ -109,6 +109,11 @@ def estimate_of(images: Images, points: Values, resampled: Values, without: Valu
         both=both,
         said=images.blocks.said,
     )
+
+
+def _of_score(interval: Interval) -> Interval:
+    """Without what lies below 0: no score is negative, and neither is a variance."""
+    return Interval(max(0.0, interval.low), interval.high)
 
 
 def image_spread(images: Images, resampled: Values) -> Spread:

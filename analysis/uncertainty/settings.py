@@ -26,7 +26,7 @@ class Resampling:
             bias-corrected and accelerated (Efron, 1987).
         blocks: what is drawn together, because neighbouring frames show nearly the same:
             "none" single images; a number: that many neighbours; "sequence": whole sequences (names
-            that are equal but for the frame number); "auto": as many neighbours as the scores of
+            that are equal but for one number); "auto": as many neighbours as the scores of
             the images are correlated over (Politis and White, 2004).
         seed: of the draws.
         absent: how a class without pixels scores, see `rgbt.metrics.scores`.

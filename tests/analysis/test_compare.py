@@ -118,10 +118,13 @@ def test_names_that_are_equal_are_told_apart(call: Call, tmp_path: Path):
     for folder, counts in zip(("x", "y"), pair(), strict=True):
         (tmp_path / folder).mkdir()
         counts.save(tmp_path / folder / "counts_test.npz")
-    arguments = f"a={tmp_path}/x/counts_test.npz", f"b={tmp_path}/y/counts_test.npz"
+        counts.save(tmp_path / folder / "mine.npz")
+    arguments = f"a={tmp_path}/x/mine.npz", f"b={tmp_path}/y/mine.npz"
     code, out, _ = call(ENTRY, *arguments, *FAST)
     assert code == 0
-    assert "b: counts_test less a: counts_test" in out
+    assert "b: mine less a: mine" in out
+    arguments = f"a={tmp_path}/x/counts_test.npz", f"b={tmp_path}/y/counts_test.npz"
+    assert "y less x" in call(ENTRY, *arguments, *FAST)[1]
 
 
 def test_files(call: Call, files: tuple[str, str], tmp_path: Path):

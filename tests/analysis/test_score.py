@@ -159,7 +159,7 @@ def test_stored_counts_are_scored(
 ) -> None:
     out = tmp_path / "scores"
     arguments = (f"predictions={predictions}", *place(data), "resamples=0")
-    score(call, *arguments, f"out={out}", "name=counts_ring5", "partition=ring")
+    score(call, *arguments, f"out={out}", "name=scores", "partition=ring")
     written = (out / "scores.csv").read_text()
     stored = f"counts={out / 'counts_ring5.npz'}"
     code, _, err = score(call, stored, "resamples=0", f"out={tmp_path / 'again'}")

@@ -184,16 +184,17 @@ def test_cells_of_another_evaluation_use_its_counts(data: ReportData) -> None:
     assert cell.covers == "images and seeds"
 
 
-def test_differences_of_columns_are_paired_over_images(data: ReportData) -> None:
+def test_differences_of_columns_are_paired_over_images_and_seeds(data: ReportData) -> None:
     cell = cell_of(data, "B", "drop")
     full = [counts_of(seed, 0.8) for seed in range(3)]
     rgb = [counts_of(seed, 0.8 - 0.2) for seed in range(3)]
-    compared = compare(full, rgb, ["mIoU"], Resampling(resamples=RESAMPLES)).differences[0]
-    assert compared.images is not None
+    settings = Resampling(resamples=RESAMPLES)
+    compared = compare(full, rgb, ["mIoU"], settings, paired=True).differences[0]
+    assert compared.both is not None
     assert cell.mean == pytest.approx(compared.value)
     assert cell.mean < 0
-    assert (cell.low, cell.high) == pytest.approx((compared.images.low, compared.images.high))
-    assert cell.covers == "images"
+    assert (cell.low, cell.high) == pytest.approx((compared.both.low, compared.both.high))
+    assert cell.covers == "images and seeds"
 
 
 def test_the_table_has_ranks_orders_and_notes(data: ReportData) -> None:

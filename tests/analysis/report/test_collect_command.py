@@ -95,7 +95,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(call: Call, tmp_path: Path
     (tmp_path / "report").write_text("")
     code, _, err = call(entry, f"out={tmp_path / 'report'}")
     assert code == 2
-    assert_one_sentence(err, "is a file; give a folder for the page")
+    assert_one_sentence(err, "is a file; give a folder.")
 
 
 @pytest.mark.slow

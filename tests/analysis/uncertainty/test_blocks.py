@@ -199,8 +199,21 @@ def test_auto_leaves_enough_blocks():
 @pytest.mark.parametrize("choice", ["sequence", 5])
 def test_names_without_numbers(choice):
     names = [*mfnet(20), "final"]
-    with pytest.raises(InputError, match=f"blocks={choice}: the name 'final' holds no frame"):
+    with pytest.raises(InputError, match=f"blocks={choice}: names such as '00001D' tell no neigh"):
         make_blocks(names, choice, NOTHING)
+
+
+@pytest.mark.parametrize("ending", ["_left2", "_480x640", ""])
+def test_a_number_that_is_the_same_everywhere_is_no_frame(ending):
+    names = [f"2021_{frame:04d}{ending}" for frame in range(40)]
+    assert make_blocks(names, 4, NOTHING).said == "10 blocks of up to 4 neighbouring frames"
+
+
+def test_names_that_tell_no_neighbours():
+    names = [f"{letter}_{number}" for number, letter in enumerate("abcdefghijklm")]
+    assert make_blocks(names, "auto", NOTHING).said == "13 single images"
+    with pytest.raises(InputError, match="tell no neighbouring frames"):
+        make_blocks(names, 5, NOTHING)
 
 
 def test_too_few_blocks():

@@ -272,3 +272,39 @@ def test_identical_methods_are_rarely_called_different():
     )
     assert stats.binom.sf(22, 200, 0.05) < 1e-3
     assert 1 <= alarms <= 22
+
+
+def test_two_evaluations_of_the_same_trainings_are_paired():
+    """Trainings differ by much, and what the second evaluation loses hardly: a narrow interval."""
+    varied = Population(training_sd=0.8)
+    first, _ = pair(varied, 200, 3, first=varied)
+    second = [replace(counts, counts=shifted(counts.counts)) for counts in first]
+    settings = replace(SETTINGS, blocks="none")
+    (paired,) = compare(first, second, ["mIoU"], settings, paired=True).differences
+    (apart,) = compare(first, second, ["mIoU"], settings).differences
+    drops = [
+        value("mIoU", after, "released") - value("mIoU", before, "released")
+        for before, after in zip(first, second, strict=True)
+    ]
+    assert paired.both is not None
+    assert apart.both is not None
+    assert paired.value == pytest.approx(np.mean(drops))
+    error = stats.sem(drops)
+    assert paired.both.half >= stats.t.ppf(0.975, 2) * error - 1e-9
+    assert paired.both.half < apart.both.half / 2
+
+
+def test_paired_needs_as_many():
+    first, second = pair(Population(), trainings=2)
+    with pytest.raises(ValueError, match="got 2 and 1"):
+        compare(first, second[:1], ["mIoU"], SETTINGS, paired=True)
+
+
+def shifted(counts: np.ndarray) -> np.ndarray:
+    """A tenth of what was right is wrong."""
+    moved = counts.copy()
+    for row in range(counts.shape[-1]):
+        lost = counts[..., row, row] // 10
+        moved[..., row, row] -= lost
+        moved[..., row, row - 1] += lost
+    return moved
