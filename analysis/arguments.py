@@ -86,8 +86,14 @@ def dataset_of(overrides: Sequence[str]) -> MFNet:
     """The data set that overrides choose.
 
     Raises:
-        InputError: wrong settings, or a data set in another layout than MFNet's.
+        InputError: none is chosen, wrong settings, or a data set in another layout than MFNet's.
     """
+    # Without this the images of another data set would be scored against the embedded one.
+    if not any(word.startswith("dataset=") for word in overrides):
+        raise InputError(
+            "the data set has to be named: dataset=mfnet dataset.root=/data/MFNet, or "
+            "dataset=synth, the embedded one."
+        )
     from rgbt.data.mfnet import MFNet
 
     dataset = built("dataset", overrides)

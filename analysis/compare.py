@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from rgbt.tracking.tables import Grid
 
 OWN = {
-    "a": None,
-    "b": None,
+    "a": "",
+    "b": "",
     "metrics": "auto",
-    "split": "test",
+    "split": "",
     "missing": "refuse",
     "level": "0.95",
     "resamples": "10000",
@@ -49,12 +49,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     method    percentile or bca: how intervals over images are taken from the resamples
     blocks    images drawn together: auto, none, sequence, or a number of neighbouring frames
     absent    released: a class without a pixel scores 0; exclude: it is left out of means
-    split     of runs
+    split     of runs; default: test
     out       folder for comparison.md and comparison.csv
     """
     from rich.markup import escape
 
-    from analysis.results import label_of, open_counts
+    from analysis.results import open_counts
     from analysis.uncertainty import compare
     from analysis.uncertainty.sentence import sentence
     from rgbt.tracking.terminal import rich_table, show
@@ -62,13 +62,14 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
     out = out_folder(arguments["out"])
+    _check_given(arguments)
     opened = [
         open_counts(arguments[side], arguments["runs_dir"], arguments["split"]) for side in "ab"
     ]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
     comparison = compare(a, b, metrics_of(arguments["metrics"], [*a, *b]), settings)
-    labels = _labels([label_of(each) for each in opened])
+    labels = _labels(opened)
     grid = comparison_grid(comparison, labels)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
@@ -175,9 +176,35 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _labels(labels: list[str]) -> list[str]:
-    """Labels that differ."""
-    return labels if labels[0] != labels[1] else [f"a: {labels[0]}", f"b: {labels[1]}"]
+def _check_given(arguments: dict[str, str]) -> None:
+    from analysis.results import groups_in
+
+    for key in ("a", "b"):
+        if not arguments[key]:
+            groups = ", ".join(groups_in(arguments["runs_dir"])) or "none"
+            raise InputError(
+                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
+                f"in {arguments['runs_dir']}: {groups}."
+            )
+
+
+def _labels(opened: Sequence[tuple[Stored, ...]]) -> list[str]:
+    """Labels that differ: what the methods are called, else with their seeds."""
+    from analysis.results import label_of
+
+    labels = [label_of(each) for each in opened]
+    if labels[0] == labels[1]:
+        seeds = [
+            sorted(stored.seed for stored in each if stored.seed is not None) for each in opened
+        ]
+        labels = [
+            f"{label} seed {', '.join(map(str, s))}"
+            for label, s in zip(labels, seeds, strict=True)
+            if s
+        ]
+    if len(set(labels)) < 2:
+        labels = [f"{key}: {label_of(each)}" for key, each in zip("ab", opened, strict=True)]
+    return labels
 
 
 def _shown(interval: Interval | None) -> str:

@@ -35,9 +35,7 @@ class Stored:
     counts: Counts
 
 
-def open_counts(
-    text: str, runs_dir: Path | str = "runs", split: str = "test"
-) -> tuple[Stored, ...]:
+def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tuple[Stored, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
@@ -45,20 +43,32 @@ def open_counts(
             group ("grbm sigma_div=2": all its seeds in `runs_dir`), or several of these with commas
             between them.
         runs_dir: where runs lie.
-        split: of runs; a file holds one.
+        split: "": the test split of runs, and whatever a file holds.
 
     Raises:
-        InputError: there is no such thing, or a run has no counts yet.
+        InputError: there is no such thing, a run has no counts of the split, or a file is of
+            another one.
     """
     root = Path(runs_dir)
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
     words = [text] if _of_group(text, root) else split_words(text)
     found = [stored for word in words for stored in _open(word, root, split)]
+    for stored in found:
+        if split and stored.counts.split != split:
+            raise InputError(
+                f"{stored.path} is of split '{stored.counts.split}', but split={split} was asked "
+                "for; leave split= out, or name counts of that split."
+            )
     paths = [stored.path for stored in found]
     for path in paths:
         if paths.count(path) > 1:
             raise InputError(f"'{text}' names {path} twice; one training counts once.")
     return tuple(found)
+
+
+def groups_in(runs_dir: Path | str) -> list[str]:
+    """Names of all groups of runs in a folder."""
+    return sorted({_tag(run, GROUP) for run in _runs(Path(runs_dir))} - {""})
 
 
 def label_of(stored: tuple[Stored, ...]) -> str:
@@ -89,7 +99,7 @@ def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
     try:
         folder = find_run(word, runs_dir)
     except (InputError, OSError) as error:  # OSError: longer than a file's name may be
-        groups = sorted({_tag(run, GROUP) for run in _runs(runs_dir)} - {""})
+        groups = groups_in(runs_dir)
         known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
         raise InputError(
             f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
@@ -136,11 +146,14 @@ def _runs(runs_dir: Path) -> list[RunFolder]:
 
 
 def _of_run(run: RunFolder, split: str) -> Stored:
+    split = split or "test"
     path = run.counts_path(split)
     if not path.is_file():
+        there = [each.stem.removeprefix("counts_") for each in run.path.glob("counts_*.npz")]
         raise InputError(
-            f"{run.path} has no counts of split '{split}'; it is not finished, or "
-            f"python -m rgbt.evaluate run={run.path} split={split} out={path} makes them."
+            f"{run.path} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
+            f"'{split}'; python -m rgbt.evaluate run={run.path} split={split} out={path} makes "
+            "them once it is finished."
         )
     seed = _tag(run, SEED)
     return Stored(

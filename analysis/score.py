@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from analysis.arguments import (
     MOST,
@@ -22,7 +22,7 @@ from analysis.arguments import (
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
-from rgbt.metrics.regions import MAX_REGIONS
+from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import Options, Scored
@@ -46,7 +46,7 @@ OF_A_FOLDER = {
 OWN = {
     "predictions": "",
     "counts": "",
-    "split": "test",
+    "split": "",
     "out": "",
     "runs_dir": "runs",
     "resamples": "10000",
@@ -55,6 +55,7 @@ OWN = {
     **OF_A_FOLDER,
 }
 MAX_THREADS = 256
+PARTITION_NAMES = get_args(Partition)
 
 OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 """Part of the images -> its mIoU."""
@@ -67,7 +68,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
                  channel), a palette PNG, or RGB in the colours of dataset.palette
     counts       instead: counts of runs; run folder, config key, MLflow run id, file, or several
                  with commas
-    split        split of the data set
+    split        split of the data set; default: test
     out          folder for counts_<partition>.npz, maps.npz, scores.md and scores.csv; without
                  one, the tables are shown only
     runs_dir     folder of runs, for counts=
@@ -94,6 +95,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
             f"{' and '.join(given) or 'neither'}."
         )
     out = out_folder(arguments["out"])
+    if out is not None and arguments["predictions"]:
+        _check_same_method(out, arguments)
     settings = _resampling(arguments)
     if given == ["counts"]:
         counted, remarks = _stored(arguments, overrides), []
@@ -139,11 +142,32 @@ def score_tables(
 def write_counts(scored: Scored, out: Path) -> None:
     """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
     out.mkdir(parents=True, exist_ok=True)
+    # Earlier counts and maps would pass for ones of these predictions.
+    for path in (
+        *(p for each in PARTITION_NAMES for p in out.glob(f"counts_{each}*.npz")),
+        out / "maps.npz",
+    ):
+        path.unlink(missing_ok=True)
     for counts in scored.counts:
         counts.save(out / f"counts_{counts.partition}.npz")
-    (out / "maps.npz").unlink(missing_ok=True)  # an earlier map would pass for one of these images
     if scored.maps is not None:
         scored.maps.save(out / "maps.npz")
+
+
+def _check_same_method(out: Path, arguments: dict[str, str]) -> None:
+    """Refuse a folder with scores of another method: files of both would stand side by side."""
+    import csv
+
+    name = arguments["name"] or Path(arguments["predictions"]).resolve().name
+    if not (out / "scores.csv").is_file():
+        return
+    with (out / "scores.csv").open(newline="") as stream:
+        earlier = next(iter(csv.DictReader(stream)), {}).get("method", name)
+    if earlier != name:
+        raise InputError(
+            f"out={out} holds scores of '{earlier}'; give '{name}' a folder of its own, or the "
+            "same name with name=..."
+        )
 
 
 def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) -> None:
@@ -161,7 +185,9 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
         title = "Scores of " + ", ".join(dict.fromkeys(table.name for table in tables))
         write_atomic(out / "scores.md", markdown(title, tables, remarks).encode())
         write_atomic(out / "scores.csv", tidy_csv(tables).encode())
+        counts = sorted(path.name for path in (*out.glob("counts_*.npz"), *out.glob("maps.npz")))
         places = [("tables", str(out / "scores.md")), ("tidy", str(out / "scores.csv"))]
+        places += [("counts", f"{out}/ ({', '.join(counts)})")] if counts else []
     for table in tables:
         said = "\n".join(filter(None, (convention_line(table), table.intervals)))
         show(Group(*map(rich_table, grids(table)), Text(f"{said}\n")))
@@ -179,7 +205,7 @@ def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
 
     refuse_others(overrides, ("dataset",), list(OWN))
     dataset, options = dataset_of(overrides), _options(arguments)
-    folder, split = Path(arguments["predictions"]), arguments["split"]
+    folder, split = Path(arguments["predictions"]), arguments["split"] or "test"
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("counting", total=len(dataset.names(split)))
         return score_folder(folder, dataset, split, options, lambda: progress.advance(task))

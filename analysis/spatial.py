@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.arguments import MOST, decimal, out_folder, refuse_others, whole
+from analysis.arguments import MOST, dataset_of, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice
 from rgbt.command import built, plain_command
 
@@ -99,7 +99,7 @@ def _settings(values: dict[str, str], overrides: list[str]) -> tuple[Settings, D
         workers=whole("workers", values["workers"], 0, 1024),
         skip_unreadable=built("data", overrides).on_error == "skip",
     )
-    return settings, built("dataset", overrides)
+    return settings, dataset_of(overrides)
 
 
 def _regions(values: dict[str, str]) -> Regions:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from analysis.arguments import out_folder, whole
+from analysis.arguments import out_folder, refuse_others, whole
 from rgbt.checks import InputError
 from rgbt.command import built, plain_command, readable_paths
 
@@ -42,6 +42,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         raise InputError("'out' has no value; give a folder for the page.")
     # Read by Hydra; the tracker resolves the folder like that of a run.
     place = readable_paths([f"runs_dir={os.fspath(runs_dir)}"])
+    refuse_others(overrides, ("tracking",), list(OWN))
     tracking = built("tracking", [*place, *overrides])
 
     from rich.console import Console

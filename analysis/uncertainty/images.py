@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
 from analysis.uncertainty.settings import Resampling
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import Asked, images_of, parse, values
@@ -206,7 +206,7 @@ def _like(first: Counts, other: Counts) -> Counts:
     if other.partition != first.partition:
         raise InputError(
             f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
-            f"evaluate again with regions={first.partition}."
+            "count both by one partition (rgbt.evaluate regions=..., analysis.score partition=...)."
         )
     if set(other.names) != set(first.names):
         only = sorted(set(first.names) ^ set(other.names))
@@ -241,11 +241,10 @@ def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
     shared = set(every[0].names).intersection(*(counts.names for counts in every))
     kept = [name for name in every[0].names if name in shared]
     if not kept:
-        name = every[0].names[0]
-        other = next(counts for counts in every if name not in counts.names)
+        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
         raise InputError(
-            f"no image is in all counts, '{name}' for one is not in those of split "
-            f"'{other.split}'; {nearest(name, other.names[:10])}."
+            f"no image is in all counts, which are of {splits} with names such as "
+            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
         )
     return [[counts.select(kept) for counts in seeds] for seeds in methods]
 

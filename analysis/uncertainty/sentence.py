@@ -19,6 +19,11 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     found = comparison.differences[0]
     if found.interval is None:
         return f"{found.metric} of {label_a} and {label_b} cannot be compared: nothing to score."
+    if found.value == 0 and found.interval.half == 0:
+        return (
+            f"{label_a} and {label_b} have the same {found.metric}, {found.a.value:.2f}, on every "
+            f"draw of the {comparison.images} images."
+        )
     alpha = 1 - comparison.level
     is_told = found.p < alpha and 0.0 not in found.interval
     scores = f"{found.b.value:.2f} against {found.a.value:.2f}"

@@ -130,7 +130,7 @@ def values(
     else:
         raise InputError(
             f"'{asked.metric}': the counts have the regions 1 to {by_region.shape[-3]}; use counts "
-            "of another file of conf/metric (a table's key `regions`)."
+            "of more regions (another file of conf/metric)."
         )
     if asked.class_name is None:
         return 100.0 * MEANS[asked.score](matrices, absent)

@@ -124,7 +124,9 @@ def test_no_such_run_group_or_folder(call: Call, files: tuple[str, str], tmp_pat
         ("b=crn", "did you mean 'crm'?"),
         (f"b={tmp_path}/empty", "holds neither a run (config.yaml) nor counts"),
         (f"b={tmp_path}/none.npz", "there is no file of counts"),
-        ("b=", "expected runs, files of counts or a group"),
+        ("b=", "'b' has no value; give a run, a file of counts, or a group of runs. Groups in"),
+        ("b=", ": crm."),
+        ("b=crm,", "expected runs, files of counts or a group"),
     ):
         code, out, err = call(ENTRY, files[0], b, place, *FAST)
         assert (code, out) == (2, "")
@@ -142,3 +144,9 @@ def test_out_that_is_a_file(call: Call, files: tuple[str, str], tmp_path: Path):
     code, _, err = call(ENTRY, *files, *FAST, f"out={tmp_path}/taken")
     assert code == 2
     assert_one_sentence(err, "taken")
+
+
+def test_a_file_of_another_split(call: Call, files: tuple[str, str]):
+    code, _, err = call(ENTRY, *files, "split=val")
+    assert code == 2
+    assert_one_sentence(err, "is of split 'test', but split=val was asked for")

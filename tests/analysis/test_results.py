@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     tags = {"rgbt.group": group, "rgbt.seed": str(seed)} if group else {}
     run.describe(Description(f"{group} seed={seed}", tags, {}))
     some(seed).save(run.counts_path("test"))
-    some(seed + 100).save(run.counts_path("val"))
+    replace(some(seed + 100), split="val").save(run.counts_path("val"))
     (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
     if finished:
         run.finish({"mIoU": 0.5})
@@ -164,7 +165,9 @@ def test_a_run_that_is_not_finished_is_opened_by_name_but_not_with_its_group(run
 
 
 def test_no_counts_of_that_split(runs: Path):
-    with pytest.raises(InputError, match=r"has no counts of split 'all'.*rgbt.evaluate run="):
+    with pytest.raises(
+        InputError, match=r"has counts of the splits test, val, not of 'all'.*rgbt.eval"
+    ):
         open_counts("aaa0", runs, split="all")
 
 

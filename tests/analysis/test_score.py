@@ -173,9 +173,47 @@ def test_stored_counts_are_scored(
     assert "'dataset' has no effect on stored counts" in err
 
 
+def test_a_folder_holds_scores_of_one_method(
+    call: Call, data: Path, predictions: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "scores"
+    arguments = (f"predictions={predictions}", *place(data), "resamples=0", f"out={out}")
+    assert score(call, *arguments)[0] == 0
+    (out / "counts_test.npz").write_text("of a run")
+    code, _, err = score(call, *arguments, "name=other")
+    assert code == 2
+    assert "holds scores of 'method'; give 'other' a folder of its own" in err
+    # The same method again: nothing of the first time is left, and nothing of others is touched.
+    assert score(call, *arguments, "partition=ring", "regions=3")[0] == 0
+    left = {path.name for path in out.glob("*.npz")}
+    assert left == {"counts_ring3.npz", "counts_test.npz", "maps.npz"}
+
+
+def test_day_and_night_say_their_own_blocks(call: Call) -> None:
+    del call
+    rng = np.random.default_rng(0)
+    counts = Counts(
+        counts=rng.integers(0, 50, (40, 2, 3, 3)),
+        names=tuple(f"{number:05d}{'N' if number < 12 else 'D'}" for number in range(40)),
+        night=tuple(number < 12 for number in range(40)),
+        classes=("a", "b", "c"),
+        partition="ring2",
+        dataset="x",
+        split="test",
+    )
+    settings = Resampling(resamples=100, blocks="none")
+    (table,) = score_tables([("m", counts)], settings)
+    assert "of 40 single images; day of 28 single images; night of 12 single" in table.intervals
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
+        (("predictions=a",), "the data set has to be named: dataset=mfnet"),
+        (
+            ("predictions=a", "dataset=mfnet", "out=/dev/null/x"),
+            "/dev/null is a file; give a folder",
+        ),
         ((), "expected one of predictions=folder and counts=run, got neither"),
         (("predictions=a", "counts=b"), "got predictions and counts"),
         (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect here"),

@@ -328,7 +328,7 @@ def test_common_images_in_the_order_of_the_first():
 
 def test_no_common_image():
     a, b = drawn(12, 2)
-    with pytest.raises(InputError, match="no image is in all counts, '0000[06]D' for one"):
+    with pytest.raises(InputError, match="no image is in all counts, .*'00000D' and '00006D'"):
         common([[a.select(a.names[:6])], [b.select(b.names[6:])]])
 
 
