@@ -1,0 +1,133 @@
+"""Numbers of the page that depend on a choice: absent classes, percent, seeds, runs there twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.report import collect
+from analysis.report.differences import difference_entries, load_choices
+from analysis.report.runs import percent_scores
+from analysis.report.store import StoredRun
+from analysis.report.tables_files import Line, Recorded
+from analysis.report.tables_intervals import OWN, Intervals, Source
+from analysis.report.tables_scored import Draft, asked_of, score_again, values_of
+from analysis.uncertainty import Resampling, compare, estimate
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
+from sweeps.table.table import load_table
+from tests.analysis.report.stores import TABLE, counts_of, files_of
+from tests.analysis.report.test_collect_parts import run_of, stored
+
+
+def quiet(items: Sequence[Any], what: str) -> Iterator[Any]:
+    yield from items
+
+
+def without_a_class(seed: int) -> Counts:
+    """A third class that occurs nowhere, so that the two conventions differ."""
+    counts = counts_of(seed)
+    wide = np.zeros((*counts.counts.shape[:2], 3, 3), np.int64)
+    wide[..., :2, :2] = counts.counts
+    return replace(counts, counts=wide, classes=(*counts.classes, "cone"))
+
+
+def test_variances_of_parts_are_no_percent() -> None:
+    counts = counts_of(0)
+    night = tuple(index % 2 == 0 for index in range(len(counts.names)))
+    told = replace(counts, night=night)
+    found = percent_scores(told, "released")
+    for metric in ("Var", "day/Var", "night/Var", "night/mIoU", "region/1"):
+        assert found[metric] == pytest.approx(value(metric, told, "released")), metric
+
+
+@pytest.mark.parametrize("absent", ["released", "exclude"])
+def test_intervals_score_absent_classes_as_the_table_does(absent: Any) -> None:
+    runs = {f"k{seed}": run_of({}, seed, without_a_class(seed)) for seed in range(2)}
+    intervals, source = Intervals(runs), Source(tuple(runs), (OWN,), absent)
+    intervals.ask(source, "mIoU")
+    intervals.compute(200, quiet)
+    counts = [without_a_class(seed) for seed in range(2)]
+    expected = estimate(counts, ["mIoU"], Resampling(resamples=200, absent=absent))["mIoU"]
+    assert intervals.found[source, "mIoU"].interval == expected.both
+
+
+def test_differences_score_absent_classes_as_the_runs_do() -> None:
+    choice = next(each for each in load_choices() if each.topic == "Learning rate")
+    sides = [
+        [
+            replace(run_of(dict(values), seed, without_a_class(seed + shift)), absent="exclude")
+            for seed in range(2)
+        ]
+        for shift, values in ((0, choice.paper.values), (5, choice.released.values))
+    ]
+    entries = difference_entries([run for side in sides for run in side], 200, quiet)
+    effect = next(each.effect for each in entries if each.topic == choice.topic)
+    expected = compare(
+        *([run.counts for run in side if run.counts] for side in sides),
+        metrics=["mIoU"],
+        settings=Resampling(resamples=200, absent="exclude"),
+    ).differences[0]
+    assert expected.interval is not None
+    assert f"mIoU {expected.value:+.2f} [{expected.interval.low:+.2f}, " in effect
+    assert "not corrected" in effect
+
+
+def draft(tmp_path: Path, seeds: int, runs: dict[str, Any]) -> Draft:
+    """Row A with one run per seed, recorded with `seeds` of them."""
+    path = tmp_path / "t.yaml"
+    path.write_text(TABLE)
+    line = Line(1.0, None, seeds, None, "", tuple(runs))
+    recorded = Recorded(
+        name="own/t",
+        scale="paper",
+        seeds=tuple(range(seeds)),
+        lines={("A", column): line for column in ("mIoU", "rgb", "drop")},
+        orders={},
+    )
+    return Draft(recorded, score_again(recorded, load_table(str(path)), runs))
+
+
+def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
+    run = run_of({}, 0, counts_of(0))
+    run._evaluations["evaluations/table_rgb_as-trained.npz"] = counts_of(0, 0.5)
+    found = draft(tmp_path, 1, {"k0": run})
+    table = found.scored.table
+    drop = next(each for each in table.columns if each.name == "drop")
+    expected = value("mIoU", counts_of(0, 0.5), "released") - value(
+        "mIoU", counts_of(0), "released"
+    )
+    assert expected < 0
+    assert values_of(found, table.rows[0], drop, {"k0": run}) == pytest.approx((expected,))
+
+
+def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> None:
+    runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
+    table = draft(tmp_path, 2, runs).scored.table
+    row, column = table.rows[0], table.columns[0]
+    assert asked_of(draft(tmp_path, 2, runs), row, column) is not None
+    assert asked_of(draft(tmp_path, 3, runs), row, column) is None
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_a_run_that_is_there_twice_the_finished_one_is_shown(
+    order: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one: StoredRun = stored(files_of(tmp_path), rgbt__key="k0")
+    both = [replace(one, status="FAILED", run_id="failed"), replace(one, run_id="finished")]
+
+    def opened(each: StoredRun, remarks: list[str]) -> Any:
+        del remarks
+        run = run_of({}, 0)
+        return replace(run, entry=replace(run.entry, status=each.status, run_id=each.run_id))
+
+    monkeypatch.setattr(collect, "open_run", opened)
+    remarks: list[str] = []
+    (run,) = collect._open_all([both[index] for index in order], quiet, remarks)
+    assert run.entry.run_id == "finished"
+    assert "is in the store twice" in remarks[0]
