@@ -32,7 +32,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
                  entries with one label are seeds of one method
     runs_dir     folder of runs (runs)
     scores       CSV of TC and CA: class,variant,tc,ca
-    split        split of the data set or of the runs (test; for statistics: train)
+    split        split of the data set or of the runs (test; for statistics: train); a file that
+                 holds another one is refused
     part         all, day or night
     names        images to show, with commas
     pick, rows   instead: rule (first, or largest_difference between the first and the last method)
@@ -45,8 +46,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     patches      sizes of the patches of crm/fig5 (8,16,32,64); seed: of the masks (0)
     band         interval over: widest, images, seeds or both; with resamples (10000), level (0.95)
                  and blocks (auto, none, sequence or a number)
-    size         of the picture of regions/heat (480x640)
-    overrides of data set and partition: dataset=mfnet dataset.root=/data/MFNet metric=ring9
+    size         of the picture of regions/heat (480x640), 16 to 4096 pixels a side
+    overrides of data set and partition: dataset=mfnet dataset.root=/data/MFNet metric=ring9;
+    stored statistics are of one partition, heat maps alone can be cut anew
     """
     figure, out = arguments["figure"], arguments["out"]
     given = {key: arguments[key] for key in OF_FIGURES if arguments[key]}

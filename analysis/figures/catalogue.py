@@ -25,6 +25,7 @@ class Entry:
         groups: groups of the configuration that take effect.
         make: draws it.
         metric: the partition unless ``metric=`` is given.
+        idle: keys of the configuration below `groups` that take no effect nevertheless.
     """
 
     shows: str
@@ -33,6 +34,7 @@ class Entry:
     groups: tuple[str, ...]
     make: Callable[[Given], Figure]
     metric: str = "ring5"
+    idle: tuple[str, ...] = ("metric.absent",)
 
 
 STATISTICS = "statistics= (of analysis.spatial) or dataset="
@@ -56,6 +58,7 @@ FIGURES: dict[str, Entry] = {
         ("maps", "part", *SPATIAL),
         BOTH,
         make_papers.spatialseg_fig1,
+        idle=(),
     ),
     "spatialseg/fig2": Entry(
         "IoU, accuracy and occupancy over vertical, horizontal and ring regions",
@@ -154,10 +157,13 @@ def make(figure: str, values: dict[str, str], overrides: list[str]) -> Figure:
     entry = FIGURES[figure]
     words = [word.lstrip("+~").partition("=")[0] for word in overrides]
     idle = [key for key in values if key not in entry.keys]
-    idle += [key for key in words if key.split(".")[0] not in entry.groups]
+    idle += [key for key in words if key.split(".")[0] not in entry.groups or key in entry.idle]
     if idle:
         known = ("figure", "out", *entry.keys, *entry.groups)
         raise InputError(
             f"'{idle[0]}' has no effect on figure={figure}; {nearest(idle[0], known)}."
         )
-    return entry.make(Given(figure, values, tuple(overrides), entry.metric))
+    given = Given(figure, values, tuple(overrides), entry.metric)
+    if not given.has_dataset:
+        given.refuse([key for key in words if key.startswith("dataset.")], "dataset=...")
+    return entry.make(given)

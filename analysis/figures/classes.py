@@ -17,11 +17,12 @@ from analysis.figures.style import (
     series_style,
     styled,
 )
-from analysis.statistics.data import SpatialStatistics
+from analysis.statistics.data import ALL, SpatialStatistics
 from analysis.statistics.derive import class_region_occupancy, normalised
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
+from rgbt.metrics.names import NIGHT
 from rgbt.metrics.scores import miou
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ class ClassRegions:
         partition: name of the regions.
         shares: (K - 1, R) occupancy in percent of the region where the class is most frequent;
             NaN for a class that occurs nowhere.
+        part: of the images, "all", "day" or "night".
         method: whose IoU `miou` is, or None.
         miou: (R,) percent, or None.
     """
@@ -44,6 +46,7 @@ class ClassRegions:
     classes: tuple[str, ...]
     partition: str
     shares: NDArray[np.float64]
+    part: str
     method: str | None
     miou: NDArray[np.float64] | None
 
@@ -60,13 +63,13 @@ def class_regions(
 
     Args:
         statistics: of a data set; the paper cuts it into nine rings.
-        part: "all", "day" or "night".
+        part: "all", "day" or "night", of the shares and of the mIoU.
         method: label and counts of a method over the same regions; None: no mIoU is drawn. The
             mean is over all classes with the background, which the paper does not state.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: counts over other regions, or a part that the data set does not hold.
+        InputError: counts over other regions, or a part that the data set or the counts lack.
     """
     shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
     scores = None
@@ -77,14 +80,26 @@ def class_regions(
                 f"methods: '{label}' was counted over {counts.partition} but the statistics over "
                 f"{statistics.partition}; score or measure with one partition."
             )
-        scores = 100 * miou(counts.by_region(), absent)
+        scores = 100 * miou(_of_part(label, counts, part).by_region(), absent)
     return ClassRegions(
         classes=tuple(statistics.classes[1:]),
         partition=statistics.partition,
         shares=shares,
+        part=part,
         method=None if method is None else method[0],
         miou=scores,
     )
+
+
+def _of_part(label: str, counts: Counts, part: str) -> Counts:
+    if part == ALL:
+        return counts
+    night = counts.night or [None] * len(counts.names)
+    of_part = [dark == (part == NIGHT) for dark in night]
+    chosen = [name for name, take in zip(counts.names, of_part, strict=True) if take]
+    if not chosen:
+        raise InputError(f"part={part}: the counts of '{label}' hold no image of the {part}.")
+    return counts.select(chosen)
 
 
 @styled
@@ -99,7 +114,8 @@ def draw(data: ClassRegions) -> Figure:
     if data.miou is not None:
         line = {"color": APART, "linewidth": 2.2, "marker": "*", "markersize": 7}
         axes.plot(places, data.miou, label=f"mIoU ({data.method})", **line)  # type: ignore[arg-type]
-    region_axis(axes, len(places), f"region ({data.partition})")
+    images = "" if data.part == ALL else f"; images of the {data.part}"
+    region_axis(axes, len(places), f"region ({data.partition}){images}")
     axes.set(ylim=(0, 105))
     axes.set_ylabel("SOR, percent of the class's\nlargest region" + _and_iou(data))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,34 +83,51 @@ def read_scores(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
         car,(G) Ours-dice,61.2,55.0
 
     Raises:
-        InputError: no such file, other columns, a value that is no percentage, a line twice.
+        InputError: no such file, not UTF-8, other columns, a value that is no percentage, a line
+            twice, or a line with more values than columns.
     """
     if not path.is_file():
         raise InputError(f"scores={path}: there is no such file; expected CSV {','.join(HEADER)}.")
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != HEADER:
-            raise InputError(
-                f"scores={path}: expected the columns {','.join(HEADER)}, got "
-                f"{','.join(reader.fieldnames or ()) or 'none'}."
-            )
-        found: dict[tuple[str, str], tuple[float, float]] = {}
-        for line in reader:
-            key = (line["class"], line["variant"])
-            if key in found:
-                raise InputError(
-                    f"scores={path}: class '{key[0]}' of '{key[1]}' stands there twice."
-                )
-            found[key] = (_percent(path, line, "tc"), _percent(path, line, "ca"))
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for line in _lines(path):
+        key = (line["class"], line["variant"])
+        if key in found:
+            raise InputError(f"scores={path}: class '{key[0]}' of '{key[1]}' stands there twice.")
+        found[key] = (_percent(path, line, "tc"), _percent(path, line, "ca"))
     if not found:
         raise InputError(f"scores={path}: there is no line below the columns.")
     return found
 
 
-def _percent(path: Path, line: Mapping[str, str | None], column: str) -> float:
+def _lines(path: Path) -> list[dict[str, str]]:
+    """The lines below the header, each with exactly its columns."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(
+            f"scores={path} is no CSV file in UTF-8 ({error}); save it as one, with the columns "
+            f"{','.join(HEADER)}."
+        ) from error
+    header, lines = (rows[0], rows[1:]) if rows else ([], [])
+    if tuple(header) != HEADER:
+        raise InputError(
+            f"scores={path}: expected the columns {','.join(HEADER)}, got "
+            f"{','.join(header) or 'none'}."
+        )
+    for line in lines:
+        if len(line) != len(HEADER):
+            raise InputError(
+                f"scores={path}: '{','.join(line)}' has {len(line)} values for the {len(HEADER)} "
+                f"columns {','.join(HEADER)}; put quotes around a name with a comma."
+            )
+    return [dict(zip(HEADER, line, strict=True)) for line in lines]
+
+
+def _percent(path: Path, line: Mapping[str, str], column: str) -> float:
     where = f"scores={path}: {column} of '{line['class']}' for '{line['variant']}'"
     try:
-        value = float(line[column] or "")
+        value = float(line[column])
     except ValueError as error:
         raise InputError(f"{where} must be a number, got '{line[column]}'.") from error
     check_range(where, value, 0, 100)

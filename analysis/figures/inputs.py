@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.arguments import decimal, whole
+from analysis.arguments import MOST, decimal, whole
 from rgbt.checks import InputError, check_choice, nearest
 
 if TYPE_CHECKING:
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from rgbt.data.mfnet import MFNet
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Regions
-
-MOST = 1_000_000
-"""What a count may be."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +81,11 @@ class Given:
         Raises:
             InputError: not given, an empty entry, or a label twice.
         """
+        from analysis.results import split_words
+
         found: dict[str, str] = {}
-        for entry in self.need(key, what).split(","):
-            label, colon, place = entry.strip().partition(":")
+        for entry in split_words(self.need(key, what)):
+            label, colon, place = entry.partition(":")
             place = place if colon else label
             label = label if colon else Path(place).name
             if not label or not place:
@@ -151,12 +150,42 @@ class Given:
             if len(listed) < number:
                 raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
             return listed[:number]
-        chosen = tuple(self.values["names"].split(","))
+        chosen = tuple(name.strip() for name in self.values["names"].split(","))
         for name in chosen:
             if name not in listed:
                 near = nearest(name, listed[:20])
                 raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
         return chosen
+
+    def refuse(self, keys: Sequence[str], without: str) -> None:
+        """Refuse keys that take effect only beside something that was not given.
+
+        Raises:
+            InputError: one of `keys` was given; `without` says what is missing.
+        """
+        words = [word.lstrip("+~").partition("=")[0] for word in self.overrides]
+        for key in keys:
+            if key in self.values or key in words:
+                raise InputError(
+                    f"'{key}' has no effect on figure={self.figure} without {without}; leave it "
+                    "out, or give that too."
+                )
+
+    def check_split(self, stored: str, source: object) -> None:
+        """Refuse a ``split=`` that is not the one of an opened file.
+
+        Args:
+            stored: split that the file is of.
+            source: the file, for the sentence.
+
+        Raises:
+            InputError: they differ.
+        """
+        if self.get("split", stored) != stored:
+            raise InputError(
+                f"split={self.values['split']}: {source} is of split '{stored}' already; leave "
+                "split= out, or give a file of that split."
+            )
 
     def maps(self) -> PixelMaps:
         """The pixel maps of ``maps=``, a file or a folder of `analysis.score`."""
@@ -165,11 +194,16 @@ class Given:
         what = "the folder (or its maps.npz) that python -m analysis.score wrote"
         return PixelMaps.load(_file(self.need("maps", what), "maps.npz"))
 
-    def statistics(self) -> SpatialStatistics:
+    def statistics(self, *, by_region: bool = False) -> SpatialStatistics:
         """Those of ``statistics=``, a file or a folder of `analysis.spatial`, or of ``dataset=``.
 
+        Args:
+            by_region: the figure shows the regions that were measured, so that a ``metric=`` that
+                was given must be these. (Heat maps are cut anew.)
+
         Raises:
-            InputError: neither or both were given.
+            InputError: neither or both were given, or a stored file of another split or partition
+                than was asked for.
         """
         from analysis.statistics.data import SpatialStatistics
 
@@ -180,7 +214,17 @@ class Given:
             )
         if self.has_dataset:
             return self._measured()
-        return SpatialStatistics.load(_file(self.values["statistics"], "statistics.npz"))
+        path = _file(self.values["statistics"], "statistics.npz")
+        stored = SpatialStatistics.load(path)
+        self.check_split(stored.split, path)
+        has_metric = any(word.lstrip("+~").startswith("metric") for word in self.overrides)
+        if by_region and has_metric and self.regions.name != stored.partition:
+            raise InputError(
+                f"metric: {path} was measured over {stored.partition}, not over "
+                f"{self.regions.name}; leave metric= out, or measure again with python -m "
+                "analysis.spatial partition=... regions=..."
+            )
+        return stored
 
     def _measured(self) -> SpatialStatistics:
         from analysis.statistics.collect import Settings, collect

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+from analysis.arguments import blocks_of
 from analysis.figures.inputs import Given, progress
 from rgbt.checks import InputError
 
@@ -17,6 +19,12 @@ if TYPE_CHECKING:
     from rgbt.metrics.counts import Counts
 
 ABSENT = ("released", "exclude")
+LEAST, MOST_PIXELS = 16, 4096
+"""Pixels of a side of ``size=``."""
+
+LONGEST = 8
+"""Times that one side of ``size=`` may be the other."""
+
 PREDICTIONS = "label:folder of predicted label images, with commas between methods"
 
 
@@ -81,14 +89,25 @@ def region_heat(given: Given) -> Figure:
     """Regions painted by their mIoU."""
     from analysis.figures import profiles, regions
 
-    height, times, width = given.get("size", "480x640").partition("x")
-    if not (times and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
-        raise InputError(f"size must be HEIGHTxWIDTH in pixels, got '{given.get('size', '')}'.")
+    image_hw = _image_hw(given.get("size", "480x640"))
     absent: Any = given.choice("absent", ABSENT)
     methods = [
         profiles.means_only(label, seeds, absent) for label, seeds in _methods(given).items()
     ]
-    return regions.draw_heat(regions.region_heat(methods, (int(height), int(width))))
+    return regions.draw_heat(regions.region_heat(methods, image_hw))
+
+
+def _image_hw(size: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", size)
+    height, width = map(int, match.groups()) if match else (0, 0)
+    if not (LEAST <= height <= MOST_PIXELS and LEAST <= width <= MOST_PIXELS):
+        raise InputError(
+            f"size must be HEIGHTxWIDTH with {LEAST} to {MOST_PIXELS} pixels each, such as 480x640,"
+            f" got '{size}'."
+        )
+    if max(height, width) > LONGEST * min(height, width):
+        raise InputError(f"size={size}: one side is more than {LONGEST} times the other.")
+    return height, width
 
 
 def region_profile(given: Given) -> Figure:
@@ -103,12 +122,11 @@ def _profiles(given: Given) -> list[Profile]:
     from analysis.uncertainty import Resampling
 
     band: Any = given.choice("band", BANDS)
-    blocks: Any = given.get("blocks", "auto")
     absent: Any = given.choice("absent", ABSENT)
     settings = Resampling(
         resamples=given.number("resamples", 10_000),
         level=given.fraction("level", 0.95),
-        blocks=int(blocks) if blocks.isdecimal() else blocks,
+        blocks=blocks_of(given.get("blocks", "auto")),
         absent=absent,
     )
     methods = _methods(given)
@@ -122,13 +140,13 @@ def _profiles(given: Given) -> list[Profile]:
 
 def _methods(given: Given) -> dict[str, list[Counts]]:
     """Label -> counts of its seeds; entries with one label are seeds of one method."""
-    from analysis.results import open_counts
+    from analysis.results import open_counts, split_words
 
     text = given.need("runs", "runs, groups or files of counts, with commas; label:run names one")
-    runs_dir, split = Path(given.get("runs_dir", "runs")).expanduser(), given.get("split", "test")
+    runs_dir, split = Path(given.get("runs_dir", "runs")).expanduser(), given.get("split", "")
     found: dict[str, list[Counts]] = {}
-    for word in text.split(","):
-        label, colon, place = word.strip().partition(":")
+    for word in split_words(text):
+        label, colon, place = word.partition(":")
         for stored in open_counts(place if colon else label, runs_dir, split):
             found.setdefault(label if colon else stored.label, []).append(stored.counts)
     return found

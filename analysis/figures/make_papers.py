@@ -31,10 +31,17 @@ def spatialseg_fig1(given: Given) -> Figure:
             "IoU, statistics=... (of python -m analysis.spatial) or dataset=... for the sample "
             "occupancy, or both."
         )
+    if not has_statistics:
+        given.refuse(["part"], "statistics=... or dataset=..., whose images it chooses")
+    part = given.choice("part", PARTS)
     if "maps" in given.values:
-        heats.append(maps.iou_heat(given.maps(), given.regions))
+        pixel_maps = given.maps()
+        if not has_statistics:
+            given.check_split(pixel_maps.split, given.values["maps"])
+        heats.append(maps.iou_heat(pixel_maps, given.regions, beside_part=part != "all"))
+    else:
+        given.refuse(["metric.absent"], "maps=...")
     if has_statistics:
-        part = given.choice("part", PARTS)
         heats.append(maps.occupancy_heat(given.statistics(), given.regions, part))
     return maps.draw_heats(heats)
 
@@ -63,9 +70,11 @@ def spatialseg_fig3(given: Given) -> Figure:
     """Occupancy of each class, and mIoU, by region."""
     from analysis.figures import classes
 
-    statistics = given.statistics()
+    statistics = given.statistics(by_region=True)
     method = None
-    if "methods" in given.values:
+    if "methods" not in given.values:
+        given.refuse(["absent"], "methods=...")
+    else:
         methods = given.counts("methods", statistics.partition)
         if len(methods) != 1:
             raise InputError(f"methods: {given.figure} shows one method, got {len(methods)}.")
@@ -89,11 +98,15 @@ def spatialseg_fig4(given: Given) -> Figure:
             "analysis.score), statistics=... (of python -m analysis.spatial), or dataset=... for "
             "its first image or that of names=..."
         )
+    if not given.has_dataset:
+        given.refuse(["names"], "dataset=...")
     picture: Any
     if given.has_dataset:
-        picture = given.dataset.read(given.names(1)[0]).rgb
+        picture = given.dataset.read(_one_name(given)).rgb
     elif sources == ["maps"]:
-        picture = iou_map(given.maps())
+        pixel_maps = given.maps()
+        given.check_split(pixel_maps.split, given.values["maps"])
+        picture = iou_map(pixel_maps)
     else:
         picture = occupancy_map(given.statistics())
     region_map = given.regions.map((picture.shape[0], picture.shape[1]))
@@ -105,7 +118,7 @@ def spatialseg_fig5(given: Given) -> Figure:
     from analysis.figures import image_quality
     from analysis.statistics.resampling import Blocks
 
-    statistics = given.statistics()
+    statistics = given.statistics(by_region=True)
     return image_quality.draw(image_quality.laplacian_series(statistics, Blocks(statistics)))
 
 
@@ -117,7 +130,7 @@ def spatialseg_fig6(given: Given) -> Figure:
     from analysis.statistics.resampling import Blocks
 
     estimator, average = given.choice("estimator", ESTIMATORS), given.choice("average", AVERAGES)
-    statistics = given.statistics()
+    statistics = given.statistics(by_region=True)
     series = image_quality.snr_series(statistics, Blocks(statistics), estimator, average)
     return image_quality.draw(series)
 
@@ -146,8 +159,15 @@ def crm_fig5(given: Given) -> Figure:
     from rgbt.command import built
 
     patches = given.numbers("patches", masks.PATCHES)
-    sample = given.dataset.read(given.names(1)[0])
+    sample = given.dataset.read(_one_name(given))
     chosen = masks.masker_overrides(patches).items()
     maskers = {title: built("masker", overrides) for title, overrides in chosen}
     multiple = masks.whole_cells(patches)
     return masks.draw(masks.mask_examples(sample, maskers, multiple, given.number("seed", 0)))
+
+
+def _one_name(given: Given) -> str:
+    names = given.names(1)
+    if len(names) > 1:
+        raise InputError(f"names: figure={given.figure} shows one image, got {len(names)}.")
+    return names[0]

@@ -1,7 +1,10 @@
 """SpatialSeg, Figs. 1 and 4: heat maps over pixel positions, and the regions drawn on a picture.
 
-The paper does not state how large its "centre" and its "edge" are. Here they are the innermost and
-the outermost ring of the partition, which stands in the figure and can be changed with ``metric=``.
+The paper does not state how large its "centre" and its "edge" are, nor how its numbers come from
+its map. Here centre and edge are the innermost and the outermost ring of the partition, which
+stands in the figure and can be changed with ``metric=``; and the numbers are those of the tables:
+of (a) the regional mIoU, of (b) the sample occupancy rate, both from the pixels of a ring added up
+over all images before anything is divided. They are not means over the pixels of the map.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ class HeatMap:
 
     Attributes:
         what: "IoU" or "sample occupancy".
-        source: what it is of: a method, or a data set with its split.
+        source: what it is of: a method or a data set, its split, and which images of it.
+        measure: what the three numbers are, for the caption.
         values: (H, W) in 0..1; NaN: nothing to score at that position.
         centre: of the innermost region, 0..1.
         edge: of the outermost region.
@@ -52,6 +56,7 @@ class HeatMap:
 
     what: str
     source: str
+    measure: str
     values: NDArray[np.float64]
     centre: float
     edge: float
@@ -75,16 +80,17 @@ class RegionPicture:
     partition: str
 
 
-def iou_heat(maps: PixelMaps, regions: Regions) -> HeatMap:
+def iou_heat(maps: PixelMaps, regions: Regions, *, beside_part: bool = False) -> HeatMap:
     """Pixel-level IoU, mean over classes (Fig. 1a).
 
     The three numbers are not means over pixels of the map: intersections and unions are added up
-    over the pixels of a region first, as for every regional IoU of the tables. The map itself
+    over the pixels of a region first, which gives the regional mIoU of the tables. The map itself
     leaves classes out that never occur at a pixel, see `analysis.predictions.maps.iou_map`.
 
     Args:
-        maps: intersections and unions of a method's predictions.
+        maps: intersections and unions of a method's predictions, all images together.
         regions: a partition into rings, and how a class counts that a ring lacks.
+        beside_part: the map beside it is of day or night alone, so that this one says "all images".
 
     Raises:
         InputError: a partition that has no centre.
@@ -102,7 +108,8 @@ def iou_heat(maps: PixelMaps, regions: Regions) -> HeatMap:
 
     return HeatMap(
         what="IoU",
-        source=maps.name,
+        source=f"{maps.name}, {maps.split}" + (", all images" if beside_part else ""),
+        measure="mIoU",
         values=iou_map(maps),
         centre=pooled(region_map == 0),
         edge=pooled(region_map == regions.regions - 1),
@@ -130,6 +137,7 @@ def occupancy_heat(statistics: SpatialStatistics, regions: Regions, part: str = 
     return HeatMap(
         what="sample occupancy",
         source=f"{statistics.dataset}, {statistics.split}" + ("" if part == "all" else f", {part}"),
+        measure="SOR",
         values=values,
         centre=float(by_region[0]),
         edge=float(by_region[-1]),
@@ -195,7 +203,8 @@ def draw_heats(heats: Sequence[HeatMap]) -> Figure:
 def _three_numbers(heat: HeatMap) -> str:
     numbers = (("centre", heat.centre), ("edge", heat.edge), ("image", heat.whole))
     text = ", ".join(f"{name} {100 * value:.1f} %" for name, value in numbers)
-    return f"{text}\ncentre, edge: inner and outer region of {heat.partition}"
+    where = f"centre, edge: inner and outer region of {heat.partition}"
+    return f"{heat.measure}: {text}\n{where}, pixels pooled"
 
 
 @styled

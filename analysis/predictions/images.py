@@ -232,6 +232,12 @@ def _decode(path: Path, mode: Literal["stored", "RGB"] = "stored") -> Array:
             if mode == "stored":
                 return np.array(image, np.uint8)
             shown = image.convert("RGBA")
+    except Image.DecompressionBombError as error:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+        raise InputError(
+            f"{path} says that it holds more than {most} pixels, too many for a label image; write "
+            "the prediction again."
+        ) from error
     except (OSError, SyntaxError, ValueError, zlib.error) as error:
         raise InputError(
             f"{path} cannot be decoded ({error}); write the prediction again."

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.metrics.metric import Absent, Regions
+from rgbt.metrics.metric import Absent
 
 FORMAT = "rgbt pixel maps 1"
 """Written into every file; another number means another layout."""
@@ -134,7 +134,8 @@ def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
 
     Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there. At a single pixel
     most classes never occur, so that "released", which counts them as 0, mostly shows how many
-    classes occur; the default leaves them out.
+    classes occur; the default leaves them out. The mean of the map over a region is not the mIoU
+    of that region, which adds up pixels before it divides; only the latter is ever printed.
 
     Args:
         maps: see `PixelMaps`.
@@ -148,29 +149,6 @@ def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
     heat: Heat = np.full(ratio.shape[1:], np.nan)
     np.divide(ratio.sum(0), there, out=heat, where=there > 0)
     return heat
-
-
-def ring_means(heat: Heat, regions: int = 5) -> Heat:
-    """Mean of a map over rings of equal area: the first is its centre, the last its edge.
-
-    Source: SpatialSeg, Fig. 1, prints the values of centre and edge without saying how far these
-    reach; here they are the first and the last ring of the tables.
-
-    Args:
-        heat: (H, W), NaN is left out.
-        regions: R, number of rings.
-
-    Returns:
-        (R,); NaN where a ring holds only NaN.
-    """
-    partition = Regions(partition="ring", regions=regions, aspect="image", absent="exclude")
-    region = partition.map((heat.shape[0], heat.shape[1]))
-    known = ~np.isnan(heat)
-    sums = np.bincount(region[known], weights=heat[known], minlength=regions)
-    pixels = np.bincount(region[known], minlength=regions)
-    means: Heat = np.full(regions, np.nan)
-    np.divide(sums, pixels, out=means, where=pixels > 0)
-    return means
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from analysis.predictions.folder import listed
-from analysis.predictions.maps import iou_map, ring_means
 from analysis.predictions.scoring import Scored
 from analysis.predictions.table import ALL, Cell, Metric, Score, ScoreTable
 from rgbt.metrics.metric import Absent
@@ -113,13 +112,6 @@ def remarks_on(scored: Scored) -> list[str]:
         )
     if scored.maps is None:
         remarks.append("The images differ in size, so there is no map by pixel.")
-        return remarks
-    rings = scored.counts[0].counts.shape[1]
-    means = 100 * ring_means(iou_map(scored.maps), rings)
-    remarks.append(
-        f"Mean IoU by pixel (classes that never occur at a pixel left out): centre {means[0]:.2f}, "
-        f"edge {means[-1]:.2f} (first and last of {rings} rings)."
-    )
     return remarks
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from rgbt.config import NOT_IN_KEY
 from rgbt.tracking.tables import without_nan
 
 Uncertainty = Literal["images", "seeds", "images and seeds", "none"]
@@ -129,6 +130,7 @@ class TableEntry:
         orders: column -> (Spearman's rho or None, number of rows).
         notes: sentences below the table.
         command: that completes it.
+        extra: overrides that every row of ours was run with, as typed, or "".
     """
 
     name: str
@@ -146,11 +148,21 @@ class TableEntry:
     orders: Mapping[str, tuple[float | None, int]]
     notes: tuple[str, ...]
     command: str
+    extra: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialEntry:
-    """One trial of a study: state, parameters, objectives, whether on the front, runs."""
+    """One trial of a study.
+
+    Attributes:
+        number: from 0.
+        state: "complete", "pruned", "failed", "running" or "waiting".
+        params: name -> value as text.
+        values: of the objectives; () where it is not complete.
+        on_front: whether no other trial beats it.
+        runs: their keys.
+    """
 
     number: int
     state: str
@@ -230,6 +242,8 @@ class ReportData:
         masks: mask examples.
         differences: paper against release.
         remarks: what could not be read, one sentence each.
+        silent: configuration keys (with all below them) in which runs that are the same run may
+            differ: paths, labels, hardware.
     """
 
     title: str
@@ -242,6 +256,7 @@ class ReportData:
     masks: tuple[Picture, ...]
     differences: tuple[DifferenceEntry, ...]
     remarks: tuple[str, ...] = field(default=())
+    silent: tuple[str, ...] = NOT_IN_KEY
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; NaN becomes None."""

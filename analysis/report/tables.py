@@ -113,6 +113,7 @@ def _entry(draft: Draft, intervals: Intervals, remarks: list[str]) -> TableEntry
         orders={name: _rho(each.rho, each.rows) for name, each in scored.orders.items()},
         notes=(*_notes(table), *recorded.remarks),
         command=_command(recorded),
+        extra=recorded.extra,
     )
 
 
@@ -191,4 +192,5 @@ def _without_file(recorded: Recorded) -> TableEntry:
         orders={name: (rho, 0) for name, rho in recorded.orders.items()},
         notes=("Its file is gone: values as recorded, without intervals.", *recorded.remarks),
         command=_command(recorded),
+        extra=recorded.extra,
     )

@@ -34,7 +34,7 @@ from analysis.statistics.judging import (
     every,
     most,
 )
-from analysis.statistics.resampling import Blocks, Interval
+from analysis.statistics.resampling import MOST_RESAMPLES, Blocks, ValueInterval
 from rgbt.checks import check_range
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -58,7 +58,7 @@ def claims(
     Args:
         stats: of a split; claims about centre and edge need rings, two of them or more.
         blocks: images per block of neighbouring frames (`resampling.Blocks`).
-        resamples: how many.
+        resamples: how many, 100..100 000.
         level: of confidence, 0.5..0.999.
         seed: of the draws.
 
@@ -87,7 +87,7 @@ def claims(
 def check_resampling(blocks: int, resamples: int, level: float) -> None:
     """Raise InputError where a number of `claims` is out of range."""
     check_range("blocks", blocks, 1, 1_000_000)
-    check_range("resamples", resamples, 100, 1_000_000)
+    check_range("resamples", resamples, 100, MOST_RESAMPLES)
     check_range("level", level, 0.5, 0.999)
 
 
@@ -249,7 +249,7 @@ def _day_over_night(
 ) -> Finding:
     what = f"{modality}: day / night"
     if DAY not in by_part:
-        nothing = Interval(math.nan, math.nan, math.nan)
+        nothing = ValueInterval(math.nan, math.nan, math.nan)
         return Finding(what, wanted, nothing, OPEN, "no images of both day and night")
     return judge.ratio(what, by_part[DAY][:, index], by_part[NIGHT][:, index], wanted)
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.statistics.data import ALL, SpatialStatistics
-from analysis.statistics.resampling import MIN_BLOCKS, Blocks, Interval, Scale
+from analysis.statistics.resampling import MIN_BLOCKS, Blocks, Scale, ValueInterval
 
 Verdict = Literal["holds", "does not hold", "cannot be decided on this sample"]
 HOLDS: Verdict = "holds"
@@ -51,7 +51,7 @@ class Finding:
 
     what: str
     wanted: Range
-    interval: Interval
+    interval: ValueInterval
     verdict: Verdict
     note: str = ""
 
@@ -161,7 +161,7 @@ class Judge:
         return _if_enough(self.finding(what, samples, wanted), self.blocks.containing(present))
 
 
-def decide(interval: Interval, wanted: Range) -> Verdict:
+def decide(interval: ValueInterval, wanted: Range) -> Verdict:
     """Where the whole interval lies: in the range, outside it, or neither."""
     if interval.low >= wanted[0] and interval.high <= wanted[1]:
         return HOLDS
@@ -187,7 +187,7 @@ def _if_enough(finding: Finding, blocks: int) -> Finding:
     """`finding`, or its value alone where it rests on too few blocks."""
     if blocks >= MIN_BLOCKS:
         return finding
-    nothing = Interval(finding.interval.value, math.nan, math.nan)
+    nothing = ValueInterval(finding.interval.value, math.nan, math.nan)
     note = f"only {blocks} block{'' if blocks == 1 else 's'} of images"
     return replace(finding, interval=nothing, verdict=OPEN, note=note)
 

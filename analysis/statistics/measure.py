@@ -74,7 +74,7 @@ class RegionSums:
         self.num_regions = int(region_map.max()) + 1
 
     def __call__(self, values: NDArray[np.int32]) -> Floats:
-        """(R,) sums of (H, W) int32 values of at most 2^23 in size; whole, kept as float64."""
+        """(R,) sums of (H, W) int32 values below 2^23 in size; whole, kept as float64."""
         summed = np.empty((len(self._bands), values.shape[1]), np.int64)
         for row, (begin, end) in zip(summed, self._bands, strict=True):
             row[:] = np.add.reduce(values[begin:end], axis=0, dtype=np.int32)

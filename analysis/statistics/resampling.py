@@ -16,6 +16,9 @@ from analysis.statistics.data import ALL, SpatialStatistics
 from rgbt.metrics.names import DAY, NIGHT
 from rgbt.randomness import numpy_generator
 
+MOST_RESAMPLES = 100_000
+"""How often each resample draws each block is held in memory at once: 8 bytes each."""
+
 MIN_BLOCKS = 5
 """Fewer blocks of a part say too little about how blocks differ to decide anything."""
 
@@ -23,7 +26,7 @@ Scale = Literal["linear", "ratio"]
 Floats = NDArray[np.float64]
 
 
-class Interval(NamedTuple):
+class ValueInterval(NamedTuple):
     """A value with the ends of its interval; NaN ends where there is none."""
 
     value: float
@@ -38,10 +41,18 @@ class Blocks:
     cut into blocks of `size` consecutive ones; every resample draws as many blocks of the part as
     it has, with replacement. Row 0 of everything is the sample itself, the other rows resamples.
 
+    This is not the rule of `analysis.uncertainty.blocks`. Here blocks have one fixed length, follow
+    the names across sequences, never hold both day and night, and every resample keeps the number
+    of blocks of each part; the last block of a part is what is left over. There blocks are pieces
+    of nearly equal length of one sequence (names alike but for the number of the frame), day and
+    night are not held apart within a sequence, and the length is measured from how alike
+    neighbours score unless a number is given. Measurements of images have no score to measure it
+    by, and day must be compared with night; but the two rules may give intervals of other widths.
+
     Args:
         stats: measurements.
         size: images per block, at least 1, which treats images as independent.
-        resamples: B, at least 2.
+        resamples: B, 2 to `MOST_RESAMPLES`.
         seed: of the draws.
     """
 
@@ -104,7 +115,7 @@ class Blocks:
         *,
         level: float = 0.95,
         scale: Scale = "linear",
-    ) -> Interval:
+    ) -> ValueInterval:
         """Interval of a quantity: value -+ t times its bootstrap standard error.
 
         With the few blocks that a small split has, percentiles of resamples are too narrow. So the
@@ -131,12 +142,12 @@ class Blocks:
         # A resample without a pixel of a rare class has no value for it.
         spread = scaled[1:][~np.isnan(scaled[1:])]
         if smallest < 2 or not np.isfinite(scaled[0]) or not np.isfinite(spread).all():
-            return Interval(value, math.nan, math.nan)
+            return ValueInterval(value, math.nan, math.nan)
         quantile = float(stdtrit(freedom, 0.5 + level / 2))
         reach = quantile * float(spread.std()) * math.sqrt(smallest / (smallest - 1))
         ends = scaled[0] - reach, scaled[0] + reach
         low, high = (math.exp(end) for end in ends) if scale == "ratio" else ends
-        return Interval(value, float(low), float(high))
+        return ValueInterval(value, float(low), float(high))
 
     def _chosen(self, part: str) -> list[int]:
         """Blocks of `part`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,20 @@ def test_miou_of_a_method_over_the_same_regions(tmp_path: Path) -> None:
     np.testing.assert_allclose(data.miou, [62.5, 100])
     found = texts(draw(data), tmp_path)
     assert {"car", "color cone", "mIoU (CRM-B)"} <= set(found)
+
+
+def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
+    matrices = np.array([[[[6, 2], [0, 2]]] * 2, [[[8, 0], [0, 2]]] * 2])
+    by_day = counts(matrices, "vertical2")
+    stats = statistics(two_images(), HALVES, np.array([False, True]))
+    known = replace(by_day, night=(False, True))
+    data = class_regions(stats, "night", ("CRM-B", known))
+    np.testing.assert_allclose(data.miou, [100, 100])
+    np.testing.assert_allclose(class_regions(stats, "day", ("CRM-B", known)).miou, [62.5, 62.5])
+    assert "region (vertical2); images of the night" in texts(draw(data), tmp_path)
+    for night in (None, (False, False)):
+        with pytest.raises(InputError, match="counts of 'CRM-B' hold no image of the night"):
+            class_regions(stats, "night", ("CRM-B", replace(by_day, night=night)))
 
 
 def test_counts_over_other_regions_are_refused() -> None:

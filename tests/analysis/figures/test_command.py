@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -155,6 +156,30 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         (["figure=temporal/fig5", "out=f.pdf"], "needs scores=..., a CSV file"),
         (["figure=regions/heat", "out=f.pdf"], "needs runs=..."),
         (["figure=regions/heat", "out=f.pdf", "size=big"], "size must be HEIGHTxWIDTH"),
+        (["figure=regions/heat", "out=f.pdf", "size=99999999x9"], "16 to 4096 pixels each"),
+        (["figure=regions/heat", "out=f.pdf", "size=4097x640"], "16 to 4096 pixels each"),
+        (["figure=regions/heat", "out=f.pdf", "size=15x100"], "16 to 4096 pixels each"),
+        (["figure=regions/heat", "out=f.pdf", "size=4096x16"], "more than 8 times the other"),
+        (
+            ["figure=spatialseg/fig5", "out=f.pdf", "statistics=s", "dataset.root=/nope"],
+            "'dataset.root' has no effect on figure=spatialseg/fig5 without dataset=...",
+        ),
+        (
+            ["figure=spatialseg/fig1", "out=f.pdf", "maps=m.npz", "part=night"],
+            "'part' has no effect on figure=spatialseg/fig1 without statistics=... or dataset=...",
+        ),
+        (
+            ["figure=spatialseg/fig1", "out=f.pdf", "statistics=s", "metric.absent=exclude"],
+            "'metric.absent' has no effect on figure=spatialseg/fig1 without maps=...",
+        ),
+        (
+            ["figure=spatialseg/fig3", "out=f.pdf", "metric.absent=exclude"],
+            "'metric.absent' has no effect on figure=spatialseg/fig3",
+        ),
+        (
+            ["figure=spatialseg/fig4", "out=f.pdf", "maps=m.npz", "names=a"],
+            "'names' has no effect on figure=spatialseg/fig4 without dataset=...",
+        ),
         (["figure=multihead/fig3", "out=f.pdf", "maps=m.npz"], "'maps' has no effect on figure="),
         (["figure=multihead/fig3", "out=f.pdf", "metric=ring9"], "'metric' has no effect on"),
         (["figure=spatialseg/fig2", "out=f.pdf", "methods=a:x,a:y"], "two entries are called 'a'"),
@@ -180,6 +205,16 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
     ("figure", "change", "sentence"),
     [
         ("spatialseg/fig5", ["dataset=mfnet"], "(not both)"),
+        ("spatialseg/fig5", ["split=test"], "statistics.npz is of split 'train' already"),
+        ("spatialseg/fig2", ["split=test"], "statistics.npz is of split 'train' already"),
+        ("spatialseg/fig1", ["split=test"], "statistics.npz is of split 'train' already"),
+        ("spatialseg/fig5", ["metric=vertical5"], "over ring5, not over vertical5; leave metric="),
+        ("spatialseg/fig5", ["metric=ring5", "metric.regions=4"], "over ring5, not over ring4"),
+        ("spatialseg/fig3", ["metric=ring9"], "was measured over ring5, not over ring9"),
+        ("regions/profile", ["split=val"], "counts_ring5.npz is of split 'test', but split=val"),
+        ("regions/heat", ["split=val"], "counts_ring5.npz is of split 'test', but split=val"),
+        ("spatialseg/fig4", ["names=00001N,00002D"], "shows one image, got 2"),
+        ("crm/fig5", ["names=00001N,00002D"], "shows one image, got 2"),
         ("spatialseg/fig4", ["names=00099D"], "split 'test' has no image '00099D'"),
         ("spatialseg/fig8", ["names=00001N"], "leave pick= and rows= out"),
         ("spatialseg/fig9", ["rows=13"], "rows=13, but split 'test' has 12 images"),
@@ -200,10 +235,65 @@ def test_input_that_does_not_fit(
     assert sentence in " ".join(err.split())
 
 
+@pytest.mark.parametrize(
+    ("figure", "same"),
+    [
+        ("spatialseg/fig5", ["split=train", "metric=ring5"]),
+        ("spatialseg/fig3", ["split=train", "metric=ring5"]),
+        ("regions/heat", ["split=test"]),
+    ],
+)
+def test_what_a_file_holds_may_be_said(
+    call: Call, made: Path, tmp_path: Path, figure: str, same: list[str]
+) -> None:
+    words = [*arguments(figure, made), *same]
+    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("figure", ["spatialseg/fig1", "spatialseg/fig4"])
+def test_maps_are_of_one_split(call: Call, made: Path, tmp_path: Path, figure: str) -> None:
+    words = [f"figure={figure}", f"out={tmp_path / 'f.svg'}", f"maps={made / 'a'}"]
+    assert call(ENTRY, *words, "split=test")[0] == 0
+    code, _, err = call(ENTRY, *words, "split=val")
+    assert code == 2
+    assert "is of split 'test' already" in " ".join(err.split())
+
+
+def test_maps_of_other_images_say_so(call: Call, made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "f.svg"
+    words = [*arguments("spatialseg/fig1", made), "part=night"]
+    code, _, err = call(ENTRY, "figure=spatialseg/fig1", f"out={out}", *words)
+    assert code == 0, err
+    assert "(a) IoU: a, test, all images" in out.read_text()
+    assert "(b) sample occupancy: toy, train, night" in out.read_text()
+
+
+def test_names_may_stand_apart_from_their_commas(call: Call, made: Path, tmp_path: Path) -> None:
+    words = [*arguments("spatialseg/fig9", made), "names=00003N, 00004D"]
+    code, _, err = call(ENTRY, "figure=spatialseg/fig9", f"out={tmp_path / 'f.png'}", *words)
+    assert code == 0, err
+
+
+def test_commas_in_brackets_belong_to_the_name(call: Call, made: Path, tmp_path: Path) -> None:
+    """Groups are called so: "crm train_sizes=[240,480]"."""
+    folder = tmp_path / "crm sizes=[240,480]"
+    folder.mkdir()
+    (folder / "counts_ring5.npz").write_bytes((made / "a" / "counts_ring5.npz").read_bytes())
+    out, other = tmp_path / "f.svg", made / "b" / "counts_ring5.npz"
+    for runs in (f"{folder}", f"{folder},B:{other}", f"CRM [1,2]:{folder}, B:{other}"):
+        code, _, err = call(ENTRY, "figure=regions/heat", f"out={out}", f"runs={runs}")
+        assert code == 0, err
+    assert "CRM [1,2] (mIoU" in out.read_text()
+
+
 def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Path) -> None:
     for name in ("s0", "s1"):
         rng = np.random.default_rng(len(name))
-        counts(rng.integers(1, 9, (20, 2, 2, 2))).save(tmp_path / f"{name}.npz")
+        # Of "val": a file's split need not be named.
+        replace(counts(rng.integers(1, 9, (20, 2, 2, 2))), split="val").save(
+            tmp_path / f"{name}.npz"
+        )
     runs = ",".join(f"ours:{tmp_path / name}.npz" for name in ("s0", "s1"))
     out = tmp_path / "f.svg"
     words = [f"runs={runs}", f"out={out}", "resamples=100", "blocks=none"]

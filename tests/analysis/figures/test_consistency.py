@@ -55,6 +55,9 @@ def test_draws_every_series_and_class(tmp_path: Path) -> None:
         ((*LINES[:2], "bike,(G),nan,1"), r"must lie in \[0, 100\], got nan"),
         (LINES[:4], "no TC and CA of class 'car_stop' for '\\(H\\)'"),
         ((LINES[0], "car,(G),50,60"), "above its TC 50"),
+        ((LINES[0], "car,(G),60,50,40"), r"'car,\(G\),60,50,40' has 5 values for the 4 columns"),
+        ((LINES[0], "car,(G),60"), r"has 3 values for the 4 columns"),
+        ((LINES[0], 'car,"(G),60,50'), r"is no CSV file in UTF-8"),
     ],
 )
 def test_bad_files_are_told_in_one_sentence(
@@ -62,6 +65,18 @@ def test_bad_files_are_told_in_one_sentence(
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         class_consistency(read_scores(written(tmp_path, *lines)))
+
+
+def test_files_that_are_not_text_in_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "scores.csv"
+    path.write_bytes("class,variant,tc,ca\nFahrrad,größer,60,50\n".encode("latin-1"))
+    with pytest.raises(InputError, match=r"scores\.csv is no CSV file in UTF-8"):
+        read_scores(path)
+
+
+def test_names_with_commas_stand_in_quotes(tmp_path: Path) -> None:
+    path = written(tmp_path, LINES[0], 'car,"ours, dice",60,50', "", 'bike,"ours, dice",30,20')
+    assert class_consistency(read_scores(path)).variants == ("ours, dice",)
 
 
 def test_missing_file(tmp_path: Path) -> None:

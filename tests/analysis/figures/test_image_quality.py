@@ -50,6 +50,24 @@ def test_snr_by_hand(measured: SpatialStatistics) -> None:
     assert "std" in other.measure
 
 
+@pytest.mark.parametrize("part", ["all", "day", "night"])
+def test_intervals_are_of_the_blocks_of_their_part(measured: SpatialStatistics, part: str) -> None:
+    """All: 20 blocks in two strata; day and night: 10 blocks each."""
+    drawn_from = blocks(measured)
+    laplacian = laplacian_series(measured, drawn_from)
+    snr = snr_series(measured, drawn_from, "immerkaer", "pooled")
+    means = drawn_from.mean(measured.laplacian, part)
+    noise = drawn_from.mean(measured.noise["immerkaer"], part)
+    ratios = drawn_from.mean(measured.mean, part) / noise
+    quantile = 2.10092204024096 if part == "all" else 2.26215716279821  # t of 18 and of 9 degrees
+    for series, samples in ((laplacian, means), (snr, ratios)):
+        for index, modality in enumerate(("rgb", "thermal")):
+            logs = np.log(samples[:, index])
+            reach = quantile * logs[1:].std(0) * np.sqrt(10 / 9)
+            expected = np.exp([logs[0] - reach, logs[0] + reach])
+            np.testing.assert_allclose(series.bands[modality, part], expected, rtol=1e-5)
+
+
 def test_intervals_hold_the_value_and_are_wider_for_fewer_images(
     measured: SpatialStatistics,
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,9 +19,12 @@ from analysis.figures.maps import (
     occupancy_over,
 )
 from analysis.predictions.maps import PixelMaps
+from analysis.predictions.scoring import Options, score_folder
+from analysis.predictions.table import Cell, score_table
 from analysis.statistics.derive import region_occupancy
 from rgbt.checks import InputError
-from rgbt.metrics.metric import Regions
+from rgbt.data.mfnet import MFNet
+from rgbt.metrics.metric import Absent, Regions
 from tests.analysis.figures.drawn import CLASSES, PALETTE, statistics, strips, texts
 
 RINGS = strips(2, "ring")
@@ -53,6 +57,29 @@ def test_three_numbers_pool_pixels_before_dividing() -> None:
     # The map leaves classes out that never occur at a pixel.
     np.testing.assert_allclose(heat.values[inner], 3 / 8)
     np.testing.assert_allclose(heat.values[~inner], 3 / 4)
+
+
+@pytest.mark.parametrize("absent", ["released", "exclude"])
+def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absent) -> None:
+    """One folder of predictions: Fig. 1 and the table of regions say the same."""
+    names, rng = ("00001D", "00002N"), np.random.default_rng(0)
+    for folder in ("images", "labels", "ours"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "test.txt").write_text("\n".join(names))
+    for name in names:
+        label = rng.integers(0, 3, (24, 32), np.uint8)
+        label[8:16, 10:22] = 0  # the centre lacks classes 1 and 2
+        predicted = np.where(rng.random(label.shape) < 0.7, label, 0)
+        label[rng.random(label.shape) < 0.1] = 255
+        cv2.imwrite(str(tmp_path / "labels" / f"{name}.png"), label)
+        cv2.imwrite(str(tmp_path / "ours" / f"{name}.png"), predicted)
+    scored = score_folder(tmp_path / "ours", MFNet(str(tmp_path)), "test", Options(regions=5))
+    assert scored.maps is not None
+    rings = Regions(partition="ring", regions=5, aspect="image", absent=absent)
+    heat = iou_heat(scored.maps, rings)
+    table = score_table(scored.counts[0], "ours").scores
+    wanted = [table[Cell(absent=absent, region=region)].value for region in (1, 5, None)]
+    np.testing.assert_allclose([100 * heat.centre, 100 * heat.edge, 100 * heat.whole], wanted)
 
 
 def test_absent_classes_can_be_left_out() -> None:
@@ -97,10 +124,12 @@ def test_draws_the_numbers_and_says_what_centre_and_edge_are(tmp_path: Path) -> 
     both = [iou_heat(maps(np.ones((2, 60, 80)), np.full((2, 60, 80), 2)), RINGS)]
     both.append(occupancy_heat(stats, RINGS))
     found = " ".join(texts(draw_heats(both), tmp_path))
-    assert "centre 50.0 %" in found
+    assert "mIoU: centre 50.0 %" in found
+    assert "SOR: centre 25.0 %" in found
+    assert "pixels pooled" in found
     assert "edge 25.0 %" in found
     assert "inner and outer region of ring2" in found
-    assert "(a) IoU: RTFNet" in found
+    assert "(a) IoU: RTFNet, test" in found
     assert "(b) sample occupancy: toy, train" in found
     assert "1.0" in found  # the scale ends at 1 whatever the values
     assert "(a)" not in " ".join(texts(draw_heats(both[1:]), tmp_path))

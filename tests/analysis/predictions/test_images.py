@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,10 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
         (np.array([[0, 1]], np.uint16), r"bad\.png: expected 8 bits per channel, got 16"),
         (np.array([[True, False]]), r"bad\.png: expected 8 bits per pixel, got 1"),
         (np.zeros((1, 2, 4), np.uint8), r"bad\.png: 2 pixels are transparent"),
+        (
+            np.array([[[0, 0, 0, 255], [0, 0, 0, 254]]], np.uint8),  # nearly opaque is not opaque
+            r"bad\.png: 1 pixels are transparent",
+        ),
         (np.zeros((1, 2, 2), np.uint8), r"bad\.png: .*got grey with transparency"),
     ],
 )
@@ -106,6 +112,17 @@ def test_files_that_are_no_png_or_half_of_one(tmp_path: Path) -> None:
     half.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"half\.png cannot be decoded"):
         reader().read(half)
+
+
+def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> None:
+    path = grey(tmp_path / "bomb.png")
+    content = bytearray(path.read_bytes())
+    content[16:24] = struct.pack(">II", 20_000, 10_000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    path.write_bytes(content)
+    for form in ("index", "colour"):
+        with pytest.raises(InputError, match=r"bomb\.png says .* more than 178956970 pixels"):
+            reader(form).read(path)  # type: ignore[arg-type]
 
 
 def test_two_classes_of_one_colour_cannot_be_told_by_colour(tmp_path: Path) -> None:

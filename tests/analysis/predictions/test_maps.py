@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.predictions.maps import MapSum, PixelMaps, iou_map, ring_means
+from analysis.predictions.maps import MapSum, PixelMaps, iou_map
 from rgbt.checks import InputError
 
 
@@ -53,19 +53,6 @@ def test_mean_over_classes_by_hand_under_both_conventions() -> None:
     found = maps([[[2, 1, 0]], [[1, 0, 0]]], [[[4, 2, 0]], [[1, 0, 0]]])
     np.testing.assert_allclose(iou_map(found), [[0.75, 0.5, np.nan]])
     np.testing.assert_allclose(iou_map(found, "released"), [[0.75, 0.25, 0.0]])
-
-
-def test_centre_and_edge_are_the_first_and_last_ring() -> None:
-    heat = np.zeros((8, 8))
-    heat[:, 0] = np.nan  # left out, not counted as 0
-    heat[7] = 0.25
-    heat[3:5, 3:5] = 0.5
-    means = ring_means(heat, 4)  # the first ring is the square of 8 / sqrt(4) = 4 pixels a side
-    assert means[0] == pytest.approx(0.5 * 4 / 16)
-    assert 0 < means[3] < 0.25
-    means = ring_means(np.where(heat == 0.25, np.nan, heat), 4)
-    assert means[3] == 0.0
-    assert np.isnan(ring_means(np.full((8, 8), np.nan), 4)).all()
 
 
 def test_saved_and_loaded_are_equal(tmp_path: Path) -> None:

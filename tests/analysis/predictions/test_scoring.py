@@ -137,6 +137,14 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
     assert scored.resized == tuple(LABELS)
 
 
+def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> None:
+    """3 columns on 4: centres at 0.375, 1.125, 1.875 and 2.625 lie in columns 0, 1, 1, 2."""
+    folder = write({name: [[0, 1, 2]] * 3 for name in PREDICTIONS})
+    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    second = score_folder(folder, tiny, "test", options).counts[0].counts[1]  # label 0 everywhere
+    np.testing.assert_array_equal(second[:, 0], [[4, 4, 0], [0, 4, 4]])
+
+
 def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> None:
     bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
     for _ in range(3):

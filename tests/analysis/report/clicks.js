@@ -5,6 +5,15 @@ const rows = () => [...card.querySelectorAll("tbody .row-name")].map((each) => e
 const heads = () => [...card.querySelectorAll("th .sort")];
 const head = (name) => heads().find((button) => button.textContent.startsWith(name));
 const type = (field, value) => { field.value = value; field.dispatchEvent(new Event("input")); };
+result.ids = [...document.querySelectorAll("[id]")].map((each) => each.id);
+result.titles = [...document.querySelectorAll("article.table-card h3")].map((each) => each.textContent);
+result.overview = [...document.querySelectorAll("#summary tbody tr")].map((row) => [...row.children].map((each) => each.textContent));
+const overviewHeads = [...document.querySelectorAll("#summary table")][0].querySelectorAll("thead th");
+result.overviewHeads = [...overviewHeads].map((each) => each.textContent);
+result.legend = document.querySelector("#summary").textContent;
+result.focusableInPictures = document.querySelectorAll('[role="img"] [tabindex]').length;
+result.groups = [...document.querySelectorAll('svg[role="group"]')].map((each) => each.ariaLabel);
+result.trialsInGroups = document.querySelectorAll('svg[role="group"] [role="button"]').length;
 result.asGiven = rows();
 head("mIoU").click();
 result.highest = rows();
@@ -34,18 +43,27 @@ result.commands = [...panel.querySelectorAll(".command code")].map((each) => eac
 result.hash = location.hash;
 const keys = [...panel.querySelectorAll(".config tr.differs th")];
 result.differing = keys.map((each) => each.textContent);
+result.onlyLabel = panel.querySelector(".tools label.check").textContent;
+result.silentMore = panel.querySelector(".tools .muted").textContent;
+result.onlyShown = [...panel.querySelectorAll(".config tbody th")].map((each) => each.textContent);
 panel.querySelectorAll(".panel-body button[aria-pressed]")[2].click();
 result.third = panel.querySelector(".command code").textContent;
 type(panel.querySelector("input[type=search]"), "patch_size");
 panel.querySelector(".tools input[type=checkbox]").click();
 result.patch = [...panel.querySelectorAll(".config tbody tr")].map((row) => row.textContent);
+type(panel.querySelector("input[type=search]"), "demo_steps");
+result.silent = [...panel.querySelectorAll(".config tbody tr")].map((row) => row.textContent);
+result.silentMarked = panel.querySelectorAll(".config .differs").length;
 panel.querySelector(".close").click();
 result.closed = !panel.open;
 setTimeout(() => {
   result.focused = document.activeElement === cell;
-  location.hash = "run=" + DATA.runs[4].key;
+  location.hash = "50%"; // Not an address of this page; a fault would stand in the console.
   setTimeout(() => {
-    result.run = panel.querySelector("#panel-title").textContent;
-    document.body.dataset.result = JSON.stringify(result);
+    location.hash = "run=" + DATA.runs[4].key;
+    setTimeout(() => {
+      result.run = panel.querySelector("#panel-title").textContent;
+      document.body.dataset.result = JSON.stringify(result);
+    }, 50);
   }, 50);
 }, 50);

@@ -33,6 +33,9 @@ SEEDS = (0, 1, 2)
 RUN_TABLES = ("spatialseg/table3", "spatialseg/table4", "spatialseg/table5", "spatialseg/table6")
 """Their 20 rows have three runs each."""
 
+LUCKY = 5
+"""Of these rows the one with the highest mIoU; two of its three runs stand behind it."""
+
 ALSO = {"crm/table3a": 2, "spatialseg/table7": 3, "multihead/table2": 2}
 """Tables of which the last rows are run: with one column, with 18, with three."""
 
@@ -98,7 +101,13 @@ def run_entry(row: int, seed: int, table: str = "spatialseg/table3", label: str 
         repeat=f"git checkout 44fd6f73f3 && {repeat}",
         host="lab-2 (2 CPU cores, Intel Xeon 2.60 GHz)",
         dataset="78cbf1ddd753b67c49173ac5a9abb553871db73aa2c8c91d5c0ba03277a9c51b",
-        config={**CONFIG, "masker.sigma_div": str(2**row) if row else "None", "seed": str(seed)},
+        config={
+            **CONFIG,
+            "masker.sigma_div": str(2**row) if row else "None",
+            "seed": str(seed),
+            "recipe.demo_steps": str(240 + row),
+            "runs_dir": f"/data/{row}",
+        },
     )
 
 
@@ -146,7 +155,8 @@ def table_entry(name: str, runs_by_row: dict[int, list[RunEntry]]) -> TableEntry
         for row in range(len(table.rows))
     ]
     for index, column in enumerate(table.columns):
-        ours = ranks([row[index].mean for row in rows], column.best)
+        whole = [row[index].mean if row[index].seeds == len(SEEDS) else None for row in rows]
+        ours = ranks(whole, column.best)
         printed = ranks([row[index].published for row in rows], column.best)
         for row, rank, published in zip(rows, ours, printed, strict=True):
             row[index] = replace(row[index], rank=rank, published_rank=published)
@@ -197,8 +207,8 @@ def search(runs: Sequence[RunEntry]) -> StudyEntry:
     """A search with two objectives: 40 trials, of which 5 were pruned and one failed."""
     rng = numpy_generator(0, "search")
     points = [(float(rng.normal(49, 1.2)), float(rng.gamma(8, 1.6))) for _ in range(40)]
-    states = ["PRUNED" if n % 8 == 7 else "FAIL" if n == 12 else "COMPLETE" for n in range(40)]
-    complete = [p for p, state in zip(points, states, strict=True) if state == "COMPLETE"]
+    states = ["pruned" if n % 8 == 7 else "failed" if n == 12 else "complete" for n in range(40)]
+    complete = [p for p, state in zip(points, states, strict=True) if state == "complete"]
     trials = tuple(
         TrialEntry(
             number=number,
@@ -208,8 +218,8 @@ def search(runs: Sequence[RunEntry]) -> StudyEntry:
                 "loss.spatial.alpha": f"{rng.uniform(0, 2):.3g}",
                 "optimizer.lr": f"{10 ** rng.uniform(-4, -2):.3g}",
             },
-            values=point if state == "COMPLETE" else (),
-            on_front=state == "COMPLETE"
+            values=point if state == "complete" else (),
+            on_front=state == "complete"
             and not any(o[0] >= point[0] and o[1] <= point[1] and o != point for o in complete),
             runs=tuple(run.key for run in runs[number % 20 : number % 20 + 2]),
         )
@@ -237,7 +247,7 @@ def grid(runs: Sequence[RunEntry]) -> StudyEntry:
     trials = [
         TrialEntry(
             number=number,
-            state="COMPLETE",
+            state="complete",
             params={"masker.patch_size": str(8 * 2 ** (number % 4)), "seed": str(number // 4)},
             values=(run.scores["mIoU"],),
             on_front=False,
@@ -302,7 +312,9 @@ def report(num_rows: int = 20) -> ReportData:
     for number, (name, row) in enumerate(places[:num_rows]):
         label = load_table(name).rows[row].label
         made = [run_entry(number, seed, name, label) for seed in SEEDS]
-        behind[name][row] = made[:2] if number == 5 else made
+        if number == LUCKY:
+            made = [replace(run, scores={**run.scores, "mIoU": 70.0 + run.seed}) for run in made]
+        behind[name][row] = made[:2] if number == LUCKY else made
         runs += made
     for name, count in ALSO.items() if num_rows == len(places) else ():
         last = len(load_table(name).rows)

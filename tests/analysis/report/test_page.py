@@ -19,6 +19,7 @@ from rgbt.checks import InputError
 from tests.analysis.report import pages
 
 HOSTILE = "<img src=x onerror=\"document.title='run'\"></script><script>throw 1</script>\u2028&amp;"
+EXTRAS = ("loss.spatial.alpha=1", "loss.spatial.alpha=-1")
 CLICKS = Path(__file__).with_name("clicks.js")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 browser = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on the PATH")
@@ -26,11 +27,15 @@ browser = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on the PATH")
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    """60 runs; one of them has a name, and one table a note, that try to be markup."""
+    """60 runs; one of them has a name, and one table a note, that try to be markup.
+
+    The table stands there twice more, run with overrides that differ by a sign.
+    """
     made: ReportData = pages.report()
     runs = (replace(made.runs[0], name=HOSTILE, command=HOSTILE), *made.runs[1:])
     table = replace(made.tables[0], notes=(HOSTILE, *made.tables[0].notes))
-    return replace(made, title=HOSTILE, runs=runs, tables=(table, *made.tables[1:]))
+    again = (replace(made.tables[0], extra=extra) for extra in EXTRAS)
+    return replace(made, title=HOSTILE, runs=runs, tables=(table, *again, *made.tables[1:]))
 
 
 @pytest.fixture(scope="module")
@@ -219,13 +224,72 @@ def test_click_on_a_number_shows_where_it_comes_from(data: ReportData, clicked: 
     assert clicked["open"] is True
     assert clicked["panel"] == "Ny/4, mIoU"
     assert clicked["commands"] == [runs[0].repeat, runs[0].command]
-    assert clicked["differing"] == ["masker.sigma_div", "seed"]
+    assert clicked["differing"] == clicked["onlyShown"] == ["masker.sigma_div", "seed"]
+    assert clicked["onlyLabel"] == "only the 2 that differ"
     assert clicked["third"] == runs[2].repeat
     assert clicked["patch"] == ["masker.patch_size16"]
     assert clicked["hash"] == "#cell=table-spatialseg-table3-demo%2F3%2F5"
     assert clicked["closed"] is True
     assert clicked["focused"] is True
     assert clicked["run"] == data.runs[4].name
+
+
+def test_keys_that_cannot_matter_stand_in_the_whole_list_alone(clicked: Any) -> None:
+    (row,) = clicked["silent"]  # of the fourth row of a table of seven
+    assert row.startswith("recipe.demo_steps243")
+    assert "240 (3), 241 (3), 242 (3), 244 (3)" in row
+    assert clicked["silentMore"] == "2 more are no part of the config key"
+    assert clicked["silentMarked"] == 0
+
+
+def test_tables_run_with_other_overrides_are_told_apart(clicked: Any) -> None:
+    assert len(set(clicked["ids"])) == len(clicked["ids"])
+    first, second, third = clicked["titles"][:3]
+    assert not any(extra in first for extra in EXTRAS)
+    assert (second, third) == (f"{first[:-1]} {EXTRAS[0]}#", f"{first[:-1]} {EXTRAS[1]}#")
+
+
+def test_summary_names_the_best_row_of_those_with_all_seeds(data: ReportData, clicked: Any) -> None:
+    table = data.tables[0]
+    miou = table.columns.index("mIoU")
+    cells = [row[miou] for row in table.cells]
+    highest = max(range(len(cells)), key=lambda row: cells[row].mean or 0)
+    assert cells[highest].seeds == 2
+    whole = [row for row in range(len(cells)) if cells[row].seeds == 3]
+    best = max(whole, key=lambda row: cells[row].mean or 0)
+    printed = max(range(len(cells)), key=lambda row: cells[row].published or 0)
+    shown = dict(zip(clicked["overviewHeads"], clicked["overview"][0], strict=True))
+    assert (shown["best of ours"], shown["best published"]) == (
+        table.rows[best],
+        table.rows[printed],
+    )
+    assert shown["same?"] == ("✓ yes" if best == printed else "✗ no")
+
+
+def test_summary_says_where_the_best_published_row_was_not_run(
+    data: ReportData, clicked: Any
+) -> None:
+    table = next(table for table in data.tables if table.name == "multihead/table2")
+    assert [row[0].published_rank for row in table.cells if row[0].rank] == [0, 0]
+    (shown,) = (row for row in clicked["overview"] if row[0] == "multihead/table2")
+    assert shown[-1] == "– not run"
+
+
+def test_summary_does_not_judge_by_intervals_of_single_rows(clicked: Any) -> None:
+    assert "overlap" not in clicked["legend"]
+    said = (
+        "Intervals of single rows do not answer whether two rows differ; python -m analysis.compare"
+    )
+    assert said in clicked["legend"]
+
+
+def test_marks_that_can_be_reached_are_not_inside_a_picture(clicked: Any) -> None:
+    assert clicked["focusableInPictures"] == 0
+    assert clicked["groups"] == [
+        "masks: val/mIoU against val/Var",
+        "patch-size/grid: mIoU by trial",
+    ]
+    assert clicked["trialsInGroups"] == 34 + 12
 
 
 @browser
@@ -238,13 +302,15 @@ def test_empty_store_has_a_page(tmp_path: Path) -> None:
     assert "The store has no studies yet." in shown
 
 
-PHONE = """
+FRAME = """
 const frame = document.querySelector("iframe");
 frame.srcdoc = JSON.parse(document.getElementById("page").textContent);
 frame.addEventListener("load", () => {
   const inside = frame.contentDocument;
   inside.querySelectorAll("details").forEach((each) => (each.open = true));
+  const list = inside.querySelector(".list-runs");
   document.body.dataset.result = JSON.stringify({
+    list: list.scrollWidth - list.clientWidth,
     width: inside.documentElement.scrollWidth, drawn: inside.documentElement.dataset.drawn,
     menu: getComputedStyle(inside.querySelector("nav")).display,
     sticky: getComputedStyle(inside.querySelector("tbody th")).position });
@@ -252,19 +318,31 @@ frame.addEventListener("load", () => {
 """
 
 
-@browser
-@pytest.mark.slow
-def test_phone_scrolls_tables_and_not_the_page(text: str, tmp_path: Path) -> None:
-    # Headless windows are 500 pixels wide at least, a frame may be narrower.
-    inside = page.embedded(text)
+def framed(folder: Path, text: str, width: int) -> Any:
+    """Measures of the page in a frame: headless windows are 500 pixels wide at least."""
     wrapper = (
-        '<!DOCTYPE html><body><iframe style="width:390px;height:800px;border:0"></iframe>'
-        f'<script type="application/json" id="page">{inside}</script></body>'
+        f'<!DOCTYPE html><body><iframe style="width:{width}px;height:800px;border:0"></iframe>'
+        f'<script type="application/json" id="page">{page.embedded(text)}</script></body>'
     )
-    dom, console = dump(tmp_path, wrapper, PHONE)
+    dom, console = dump(folder, wrapper, FRAME)
     assert console == []
     found = re.search(r'data-result="([^"]*)"', dom)
     assert found is not None
-    result = json.loads(html.unescape(found.group(1)))
+    return json.loads(html.unescape(found.group(1)))
+
+
+@browser
+@pytest.mark.slow
+def test_list_of_runs_fits_a_laptop(text: str, tmp_path: Path) -> None:
+    result = framed(tmp_path, text, 1280)
+    assert result["drawn"] == "yes"
+    assert result["list"] == 0
+
+
+@browser
+@pytest.mark.slow
+def test_phone_scrolls_tables_and_not_the_page(text: str, tmp_path: Path) -> None:
+    result = framed(tmp_path, text, 390)
     assert result.pop("width") <= 390
+    assert result.pop("list") > 0
     assert result == {"drawn": "yes", "menu": "none", "sticky": "sticky"}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.statistics.claims import claims
-from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, decide, every, most
-from analysis.statistics.resampling import Blocks, Interval
+from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Judge, decide, every, most
+from analysis.statistics.resampling import Blocks, ValueInterval
 from rgbt.checks import InputError
 from tests.analysis.statistics.scenes import made
 
@@ -146,10 +146,10 @@ def test_strips_have_no_centre() -> None:
 
 def test_verdicts() -> None:
     above = (1.0, math.inf)
-    assert decide(Interval(2, 1.1, 3), above) == HOLDS
-    assert decide(Interval(0.5, 0.2, 0.9), above) == FAILS
-    assert decide(Interval(1.5, 0.9, 2), above) == OPEN
-    assert decide(Interval(2, math.nan, math.nan), above) == OPEN
+    assert decide(ValueInterval(2, 1.1, 3), above) == HOLDS
+    assert decide(ValueInterval(0.5, 0.2, 0.9), above) == FAILS
+    assert decide(ValueInterval(1.5, 0.9, 2), above) == OPEN
+    assert decide(ValueInterval(2, math.nan, math.nan), above) == OPEN
     assert every([HOLDS, HOLDS]) == HOLDS
     assert every([HOLDS, OPEN]) == OPEN
     assert every([HOLDS, OPEN, FAILS]) == FAILS
@@ -170,6 +170,43 @@ def test_a_mean_gets_the_t_interval_of_its_blocks() -> None:
     found = blocks.interval(blocks.mean(values))
     assert found.value == pytest.approx(values.mean())
     np.testing.assert_allclose(found[1:], [means.mean() - reach, means.mean() + reach], atol=0.01)
+
+
+def test_freedom_is_blocks_less_strata() -> None:
+    """Day and night of 3 blocks each: 6 - 2 degrees, t = 2.776; the smaller stratum enlarges."""
+    blocks = Blocks(made(images=30), size=5, resamples=100)
+    samples = np.array([10.0, 9.0, 11.0, 9.0, 11.0])  # a standard error of 1
+    found = blocks.interval(samples)
+    reach = 2.7764451051977987 * math.sqrt(3 / 2)
+    np.testing.assert_allclose(found, [10, 10 - reach, 10 + reach])
+    by_day = blocks.interval(samples, "day")  # 3 - 1 degrees
+    assert by_day.high == pytest.approx(10 + 4.302652729696142 * math.sqrt(3 / 2))
+
+
+def _judge(regions: int) -> Judge:
+    stats = made(images=IMAGES, regions=regions, night=False)  # 12 blocks: 11 degrees of freedom
+    return Judge(stats, Blocks(stats, size=10, resamples=100), 0.95)
+
+
+def test_of_many_steps_each_has_to_be_surer() -> None:
+    """One of 4 steps at 2.6 standard errors: t is 2.20 for one number, 2.98 for one of four."""
+    error = math.sqrt(12 / 11)  # what a standard error of 1 is enlarged to
+    values = np.zeros((5, 5)) + [100, 80, 60, 40, 40 - 2.6 * error]
+    values[1:, 4] += [-1, 1, -1, 1]
+    judge = _judge(5)
+    steps = judge.largest_step("steps", values)
+    assert steps.verdict == OPEN
+    assert steps.what == "steps (4 to 5)"
+    assert steps.interval.high == pytest.approx((2.980872430052668 - 2.6) * error)
+    assert judge.finding("alone", np.diff(values)[:, 3], (-math.inf, 0.0)).verdict == HOLDS
+
+
+@pytest.mark.parametrize(("regions", "third"), [(2, 1), (5, 1), (9, 3), (11, 3)])
+def test_centre_and_edge_are_thirds_of_the_regions(regions: int, third: int) -> None:
+    values = np.arange(1.0, regions + 1) ** 2
+    judge = _judge(regions)
+    assert judge.centre(values) == pytest.approx(values[:third].mean())
+    assert judge.edge(values) == pytest.approx(values[regions - third :].mean())
 
 
 def test_blocks_are_neighbours_in_name_within_day_and_night() -> None:
@@ -197,6 +234,7 @@ def test_draws_depend_on_the_seed_alone() -> None:
     [
         ({"blocks": 0}, "blocks must lie in"),
         ({"resamples": 10}, "resamples must lie in"),
+        ({"resamples": 100_001}, "resamples must lie in"),
         ({"level": 1.0}, r"level must lie in \[0.5, 0.999\], got 1"),
     ],
 )

@@ -9,6 +9,7 @@ from analysis.statistics.measure import (
     ESTIMATORS,
     HAAR_BINS,
     MEDIAN_OF_NORMAL,
+    TALLEST_BAND,
     Meter,
     RegionSums,
     grouped_median,
@@ -171,6 +172,15 @@ def test_largest_values_do_not_overflow() -> None:
     image = (np.indices((300, 300)).sum(0) % 2 * 255).astype(np.uint8)
     found = Meter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
     assert found[0][0] == pytest.approx(1020.0**2)
+
+
+def test_sums_of_many_rows_do_not_overflow() -> None:
+    """1200 rows alike; 257 of the largest value would leave 32 bits."""
+    largest = 2**23 - 1
+    for value in (largest, -largest):
+        values = np.full((1200, 3), value, np.int32)
+        assert RegionSums(np.zeros((1200, 3), np.uint8))(values) == [3600 * value]
+    assert TALLEST_BAND * (8 * 255) ** 2 < 2**31
 
 
 def test_a_region_without_a_window_has_no_noise() -> None:

@@ -24,9 +24,12 @@ function chartWidth() {
   return Math.max(280, Math.min(980, document.getElementById("main").clientWidth - 44));
 }
 
+/** A picture; where marks in it can be reached, a group, as nothing inside a picture is read out. */
 function drawing(width, height, label, ...children) {
-  const attributes = { width, height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label };
-  return svg("svg", attributes, svg("title", {}, label), children);
+  const attributes = { width, height, viewBox: `0 0 ${width} ${height}`, "aria-label": label };
+  const made = svg("svg", attributes, svg("title", {}, label), children);
+  made.setAttribute("role", made.querySelector("[tabindex]") ? "group" : "img");
+  return made;
 }
 
 /** Round steps that cover [low, high] with about `count` ticks. */

@@ -109,6 +109,17 @@ function slug(...parts) {
   return parts.join("-").replace(/[^A-Za-z0-9]+/g, "-").replace(/^-|-$/g, "").toLowerCase();
 }
 
+const taken = new Set();
+
+/** A slug that nothing else on the page has: "a=1" and "a=-1" are written alike. */
+function placeName(...parts) {
+  const wanted = slug(...parts);
+  let name = wanted;
+  for (let number = 2; taken.has(name); number += 1) name = `${wanted}-${number}`;
+  taken.add(name);
+  return name;
+}
+
 /** Tell people who cannot see the change. */
 function say(text) {
   document.getElementById("said").textContent = text;

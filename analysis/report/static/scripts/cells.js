@@ -83,7 +83,7 @@ function openCell(table, row, column) {
     ...(table.scale === "demo" ? [["scale", "demo: compare orders, not values"]] : []),
   ];
   openPanel({
-    title: `${table.rows[row]}, ${table.columns[column]}`, subtitle: `${table.name}, ${table.number}`,
+    title: `${table.rows[row]}, ${table.columns[column]}`, subtitle: fullName(table),
     facts: el("dl", {}, facts.map(([name, value]) => [el("dt", {}, name), el("dd", {}, value)])),
     runs: cell.runs, values: valuesByRun(table, row, column), valueName: table.columns[column],
     hash: `cell=${encodeURIComponent(`${table.id}/${row}/${column}`)}`, peers: runsOfTable(table),

@@ -43,7 +43,7 @@ function setHash(hash) {
 /** The panel of one run alone. */
 function openRun(key) {
   const run = RUNS.get(key);
-  const peers = DATA.tables.filter((table) => table.name in (run?.table_rows ?? {})).flatMap(runsOfTable);
+  const peers = DATA.tables.map(runsOfTable).filter((keys) => keys.includes(key)).flat();
   const same = DATA.runs.filter((other) => run && other.experiment === run.experiment).map((r) => r.key);
   openPanel({
     title: run ? run.name : key, subtitle: "Run", facts: null, runs: [key], values: [],
@@ -139,30 +139,37 @@ function differingKeys(keys) {
   return found;
 }
 
-/** The configuration: what differs from the compared runs first on request, filtered by text. */
+/** Keys that may differ between two runs that are the same run, such as paths. */
+function isSilent(key) {
+  return DATA.silent.some((silent) => key === silent || key.startsWith(`${silent}.`));
+}
+
+/** The configuration: on request what tells the compared runs apart alone, filtered by text. */
 function configList(run, peers) {
   const differing = differingKeys([run.key, ...peers]);
+  const telling = new Set([...differing.keys()].filter((key) => !isSilent(key)));
+  const silent = differing.size - telling.size;
   const body = el("tbody");
-  const state = { text: "", only: differing.size > 0 };
+  const state = { text: "", only: telling.size > 0 };
   const draw = () => {
     const keys = Object.keys(run.config).filter((key) =>
-      (!state.only || differing.has(key)) && `${key}=${run.config[key]}`.toLowerCase().includes(state.text));
-    body.replaceChildren(...keys.map((key) => configRow(run, key, differing.get(key))));
+      (!state.only || telling.has(key)) && `${key}=${run.config[key]}`.toLowerCase().includes(state.text));
+    body.replaceChildren(...keys.map((key) => configRow(run, key, differing.get(key), telling.has(key))));
     if (!keys.length) body.append(el("tr", {}, el("td", { colspan: 3 }, "Nothing matches.")));
   };
   draw();
   const filter = textFilter("Filter keys and values", (text) => { state.text = text; draw(); });
-  const only = checkbox(`only the ${differing.size} that differ`, state.only, (on) => { state.only = on; draw(); });
+  const only = checkbox(`only the ${telling.size} that differ`, state.only, (on) => { state.only = on; draw(); });
   const head = el("tr", {}, ["key", "value", `other values among ${plural(unique(peers).length, "run")}`].map((t) => el("th", { scope: "col" }, t)));
   return [el("h4", {}, `Configuration, ${Object.keys(run.config).length} keys`),
-    el("div", { class: "tools" }, filter, differing.size ? only : null),
+    el("div", { class: "tools" }, filter, telling.size ? only : null, silent ? el("span", { class: "muted" }, `${silent} more ${silent === 1 ? "is" : "are"} no part of the config key`) : null),
     scrollBox("configuration", el("table", { class: "plain config" }, el("thead", {}, head), body))];
 }
 
-function configRow(run, key, counts) {
+function configRow(run, key, counts, telling) {
   const others = [...(counts ?? [])].filter(([value]) => value !== run.config[key]);
   const text = others.slice(0, 8).map(([value, count]) => `${value ?? "absent"} (${count})`).join(", ");
-  return el("tr", { class: counts ? "differs" : null },
+  return el("tr", { class: telling ? "differs" : null },
     el("th", { scope: "row" }, breakable(key)), el("td", {}, el("code", {}, breakable(run.config[key]))),
     el("td", { class: "muted" }, others.length > 8 ? `${text}, and ${others.length - 8} more` : text));
 }

@@ -3,10 +3,10 @@
 
 const MAP = { width: 240, height: 180 };
 
-/** "ring9_released_3_4" -> {kind: "ring", count: 9, released: true}; null if it is none of ours. */
+/** "ring9_released_3_4" -> {kind: "ring", count: 9}; null if it is none of ours. */
 function partitionOf(name) {
-  const found = /^(ring|vertical|horizontal)(\d+)(_released_3_4)?$/.exec(name);
-  return found && { kind: found[1], count: Number(found[2]), released: Boolean(found[3]) };
+  const found = /^(ring|vertical|horizontal)(\d+)(?:_released_3_4)?$/.exec(name);
+  return found && { kind: found[1], count: Number(found[2]) };
 }
 
 /** What a region is called where it has a place: "centre", "edge", "left", ... */

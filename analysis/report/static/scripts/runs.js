@@ -55,7 +55,7 @@ function runTable(state, range, changed) {
     { title: "Var", show: (group) => meanText(group, "Var"), sort: (group) => score(group.runs, "Var"), number: true, highFirst: false },
     { title: "regions", show: (group) => heatStrip(group, range), sort: (group) => group.ious[0], highFirst: true },
     { title: "started", show: (group) => moment(first(group).started), sort: (group) => first(group).started, highFirst: true, class: "moment" },
-    { title: "duration", show: (group) => duration(mean(group.runs.map((r) => r.seconds))), sort: (group) => mean(group.runs.map((r) => r.seconds)), number: true },
+    { title: "time", show: (group) => duration(mean(group.runs.map((r) => r.seconds))), sort: (group) => mean(group.runs.map((r) => r.seconds)), number: true },
     { title: "status", show: statusSummary, sort: (group) => statusSummary(group), class: "status" },
   ];
   const table = sortableTable("runs", columns);
@@ -101,11 +101,12 @@ function heatStrip(group, range) {
   return el("span", { class: "heat-strip" }, cells);
 }
 
+/** "✓ finished"; with counts where the runs of a group are not alike. Lines break between the states. */
 function statusSummary(group) {
-  return unique(group.runs.map(statusText)).map((text) => {
-    const count = group.runs.filter((run) => statusText(run) === text).length;
-    return group.runs.length > 1 ? `${text} (${count})` : text;
-  }).join(", ");
+  const states = unique(group.runs.map(statusText));
+  if (states.length === 1) return states[0];
+  const counted = states.map((text) => `${text} (${group.runs.filter((run) => statusText(run) === text).length})`);
+  return counted.map((text) => text.replaceAll(" ", "\u00a0")).join(", ");
 }
 
 function profileKey(group, index) {

@@ -13,7 +13,7 @@ function drawContents() {
   const below = {
     tables: [...DATA.tables.filter((table) => table.isRun).map((table) => [table.id, contentsName(table)]),
       ...(DATA.tables.some((table) => !table.isRun) ? [["not-run-yet", "not run yet"]] : [])],
-    searches: DATA.studies.map((study) => [slug("study", study.name), study.name]),
+    searches: DATA.studies.map((study) => [study.id, study.name]),
   };
   const link = ([id, text]) => el("li", {}, el("a", { href: `#${id}` }, text));
   const entries = Object.keys(RENDER).map((id) => {
@@ -24,10 +24,11 @@ function drawContents() {
   document.getElementById("navigation").append(el("ul", {}, entries));
 }
 
-/** A table run at two scales stands twice, so the scale is part of its name there. */
+/** A table run at two scales, or with overrides, stands twice: its name there says which it is. */
 function contentsName(table) {
   const twice = DATA.tables.filter((other) => other.name === table.name).length > 1;
-  return `${table.paper}, ${table.number}${twice ? ` (${table.scale})` : ""}`;
+  const which = twice ? [table.scale, table.extra].filter(Boolean).join(", ") : table.extra;
+  return [`${table.paper}, ${table.number}`, which ? breakable(` (${which})`) : null];
 }
 
 /** Marks in the contents where the reader is. */
@@ -50,10 +51,19 @@ function followReading() {
   mark();
 }
 
+/** What a part of an address stands for; as it is where it was not written by this page ("50%"). */
+function decoded(part) {
+  try {
+    return decodeURIComponent(part);
+  } catch (error) {
+    return part;
+  }
+}
+
 /** Open what the address names: a run, a cell, a trial, or a place inside something folded. */
 function openHash() {
   const hash = location.hash.slice(1);
-  const [kind, value] = hash.split("=").map(decodeURIComponent);
+  const [kind, value] = hash.split("=").map(decoded);
   if (kind === "run" && value) return openRun(value);
   if (kind === "cell" && value) return openCellAt(value.split("/"));
   if (kind === "trial" && value) return openTrialAt(value.split("/"));
@@ -69,7 +79,7 @@ function openCellAt([id, row, column]) {
 }
 
 function openTrialAt([id, number]) {
-  const study = DATA.studies.find((each) => slug("study", each.name) === id);
+  const study = DATA.studies.find((each) => each.id === id);
   const trial = study?.trials.find((each) => each.number === Number(number));
   if (trial) openTrial(study, trial);
 }

@@ -1,28 +1,26 @@
 // Section 5: searches, grids and lists.
 "use strict";
 
+for (const study of DATA.studies) study.id = placeName("study", study.name);
+
 function renderSearches(section) {
   if (!DATA.studies.length) return section.append(el("p", { class: "empty" }, "The store has no studies yet."));
   section.append(...DATA.studies.map(studyCard));
 }
 
+/** States are the collector's words: complete, pruned, failed, running, waiting. */
 function isComplete(trial) {
-  return trial.state === "COMPLETE" && trial.values.length > 0 && trial.values.every(isNumber);
-}
-
-/** Optuna's states as people are told them. */
-function stateWord(state) {
-  return state === "FAIL" ? "failed" : state.toLowerCase();
+  return trial.state === "complete" && trial.values.length > 0 && trial.values.every(isNumber);
 }
 
 function studyCard(study) {
   const counts = unique(study.trials.map((trial) => trial.state))
-    .map((state) => `${study.trials.filter((trial) => trial.state === state).length} ${stateWord(state)}`);
+    .map((state) => `${study.trials.filter((trial) => trial.state === state).length} ${state}`);
   const wanted = study.objectives.map((name, i) => `${study.maximize[i] ? "highest" : "lowest"} ${name}`).join(", ");
   const drawn = study.trials.some(isComplete)
     ? chart((width) => (study.objectives.length > 1 ? frontChart(study, width) : historyChart(study, width))).holder
     : el("p", { class: "empty" }, "No trial is complete yet.");
-  return el("article", { id: slug("study", study.name), class: "table-card" },
+  return el("article", { id: study.id, class: "table-card" },
     el("h3", {}, study.name, " ", el("span", { class: "badge" }, study.kind)),
     el("p", { class: "caption" }, `Wanted: ${wanted}. ${plural(study.trials.length, "trial")}: ${counts.join(", ")}.`),
     drawn, trialTable(study),
@@ -31,13 +29,13 @@ function studyCard(study) {
 }
 
 function openTrial(study, trial) {
-  const facts = [["state", stateWord(trial.state)],
+  const facts = [["state", trial.state],
     ...study.objectives.map((name, index) => [name, fixed(trial.values[index])]),
     ...Object.entries(trial.params).map(([key, value]) => [key, el("code", {}, value)])];
   openPanel({
     title: `Trial ${trial.number}`, subtitle: `Study ${study.name}`,
     facts: el("dl", {}, facts.map(([name, value]) => [el("dt", {}, breakable(name)), el("dd", {}, value)])),
-    runs: trial.runs, values: [], hash: `trial=${encodeURIComponent(`${slug("study", study.name)}/${trial.number}`)}`,
+    runs: trial.runs, values: [], hash: `trial=${encodeURIComponent(`${study.id}/${trial.number}`)}`,
     peers: unique(study.trials.flatMap((other) => other.runs)),
   });
 }
@@ -48,12 +46,12 @@ function trialTable(study) {
   const front = study.objectives.length > 1 ? "front" : "best";
   const columns = [
     { title: "trial", show: button, sort: (trial) => trial.number },
-    { title: "state", show: (trial) => stateWord(trial.state), sort: (trial) => trial.state },
+    { title: "state", show: (trial) => trial.state, sort: (trial) => trial.state },
     ...study.objectives.map((name, index) => ({ title: name, show: (trial) => fixed(trial.values[index]),
       sort: (trial) => trial.values[index], number: true, highFirst: study.maximize[index] })),
     { title: front, show: (trial) => (trial.on_front ? "★" : ""), sort: (trial) => (trial.on_front ? 1 : 0), highFirst: true },
     ...params.map((name) => ({ title: breakable(name), show: (trial) => trial.params[name] ?? DASH,
-      sort: (trial) => asNumber(trial.params[name]), number: true, highFirst: false })),
+      sort: (trial) => asNumber(trial.params[name]), number: areNumbers(study, name), highFirst: false, class: "param" })),
   ];
   const start = { column: study.objectives.length > 1 ? 2 + study.objectives.length : 2, descending: study.objectives.length > 1 || study.maximize[0] };
   const table = sortableTable(`trials of ${study.name}`, columns, { sort: start, rowClass: (trial) => (trial.on_front ? "front" : null) });
@@ -67,6 +65,10 @@ function trialTable(study) {
 /** "0.002" as a number, "uniform" as it is. */
 function asNumber(text) {
   return text !== undefined && text !== "" && Number.isFinite(Number(text)) ? Number(text) : text;
+}
+
+function areNumbers(study, name) {
+  return study.trials.every((trial) => !trial.params[name] || typeof asNumber(trial.params[name]) === "number");
 }
 
 /** A trial that can be clicked and reached with the keyboard. */

@@ -25,12 +25,14 @@ function tiles(run) {
   const seconds = DATA.runs.reduce((sum, each) => sum + (each.seconds ?? 0), 0);
   const scales = unique(DATA.runs.map((each) => each.scale)).filter(Boolean);
   const trials = DATA.studies.reduce((sum, study) => sum + study.trials.length, 0);
+  const commitNames = unique(DATA.runs.map((each) => each.commit.replace("+", ""))).filter(Boolean);
+  const word = (things, name) => (things.length === 1 ? name : `${name}s`);
   const entries = [
-    [DATA.runs.length, "runs", finished === DATA.runs.length ? "all finished" : `${finished} finished`, "runs"],
-    [run.length, "tables with runs", `of ${DATA.tables.length} tables`, "tables"],
-    [DATA.studies.length, "studies", plural(trials, "trial"), "searches"],
-    [unique(DATA.runs.map((each) => each.commit.replace("+", ""))).filter(Boolean).length, "commits", commitRemark(), "commits"],
-    [scales.length, scales.length === 1 ? "scale" : "scales", scales.join(", ") || DASH, "runs"],
+    [DATA.runs.length, word(DATA.runs, "run"), finished === DATA.runs.length ? "all finished" : `${finished} finished`, "runs"],
+    [run.length, `${word(run, "table")} with runs`, `of ${DATA.tables.length} tables`, "tables"],
+    [DATA.studies.length, DATA.studies.length === 1 ? "study" : "studies", plural(trials, "trial"), "searches"],
+    [commitNames.length, word(commitNames, "commit"), commitRemark(), "commits"],
+    [scales.length, word(scales, "scale"), scales.join(", ") || DASH, "runs"],
     [duration(seconds), "of computing", "sum over runs", "runs"],
   ];
   return el("div", { class: "tiles" }, entries.map(([value, name, more, target]) =>
@@ -45,45 +47,42 @@ function commitRemark() {
 /** One line per table with runs: how far it is, and whether it agrees with the paper. */
 function overview(run) {
   const main = (table) => table.columns[mainColumn(table)];
-  const ranked = (table, field) => bestRow(table, mainColumn(table), field);
-  const label = (table, field) => (ranked(table, field) < 0 ? DASH : breakable(table.rows[ranked(table, field)]));
+  const best = (table, field) => bestRows(table, field).map((row) => table.rows[row]).join(", ");
   const rho = (table, name) => table.orders[name]?.[0] ?? null;
   const rhoText = (table, name) => (isNumber(rho(table, name)) ? [`${rho(table, name) > 0 ? "+" : ""}${fixed(rho(table, name))}`, el("small", { class: "muted" }, ` n=${table.orders[name][1]}`)] : DASH);
   const there = (table) => table.cells.filter((row) => row.some((cell) => isNumber(cell.mean))).length;
   const seeds = (table) => extent(table.cells.flat().map((cell) => cell.seeds || null));
   const columns = [
-    { title: "table", show: (table) => el("a", { href: `#${table.id}` }, `${table.name}`), sort: (table) => table.name },
+    { title: "table", show: (table) => [el("a", { href: `#${table.id}` }, table.name), table.extra ? [" ", el("small", { class: "muted" }, breakable(table.extra))] : null], sort: (table) => table.name },
     { title: "scale", show: (table) => el("span", { class: `badge ${table.scale}` }, table.scale || DASH), sort: (table) => table.scale },
     { title: "rows run", show: (table) => `${there(table)} of ${table.rows.length}`, sort: (table) => there(table) / table.rows.length, number: true },
     { title: "seeds", show: (table) => (seeds(table) ? unique(seeds(table)).join("–") : DASH), sort: (table) => seeds(table)?.[0], number: true },
     { title: "main column", show: (table) => breakable(main(table)), sort: main },
     { title: "order of rows, ρ", show: (table) => rhoText(table, main(table)), sort: (table) => rho(table, main(table)), number: true },
-    { title: "best of ours", show: (table) => label(table, "mean") },
-    { title: "best published of these rows", show: (table) => label(table, "published") },
-    { title: "same?", show: (table) => sameText(table, ranked(table, "mean"), ranked(table, "published")),
-      sort: (table) => Number(ranked(table, "mean") === ranked(table, "published")), highFirst: true, class: "same" },
+    { title: "best of ours", show: (table) => breakable(best(table, "rank") || DASH) },
+    { title: "best published", show: (table) => breakable(best(table, "published_rank") || DASH) },
+    { title: "same?", show: sameText, sort: (table) => Number(sameText(table) === "✓ yes"), highFirst: true, class: "same" },
   ];
   const table = sortableTable("tables with runs", columns);
   table.update(run);
   return el("div", {}, el("h3", {}, "Tables with runs"), table.box,
-    el("p", { class: "muted" }, "ρ: Spearman's rank correlation between our means and the published values over n rows; +1 is the same order."));
+    el("p", { class: "muted" }, "ρ: Spearman's rank correlation between our means and the published values over n rows; +1 is the same order. ",
+      "Best of ours: of the rows with all seeds. ", comparisonHint()));
 }
 
-/** The row that is best in a column by `field`, of the rows that have both values; -1: none. */
-function bestRow(table, column, field) {
-  const both = table.cells.map((row, index) => ({ cell: row[column], index }))
-    .filter(({ cell }) => isNumber(cell.mean) && isNumber(cell.published));
-  if (both.length < 2 || table.best[column] === "none") return -1;
-  return sortedRows(both, ({ cell }) => cell[field], table.best[column] === "highest")[0].index;
+/** Rows that are first in the main column by `field`, "rank" or "published_rank"; ties are several. */
+function bestRows(table, field) {
+  const column = mainColumn(table);
+  return table.cells.flatMap((row, index) => (row[column][field] === 1 ? [index] : []));
 }
 
-/** Whether the best row is the paper's, and where it is not, whether ours can tell the two apart. */
-function sameText(table, ours, published) {
-  if (ours < 0) return DASH;
-  if (ours === published) return "✓ yes";
-  const [a, b] = [ours, published].map((row) => table.cells[row][mainColumn(table)]);
-  const overlap = isNumber(a.low) && isNumber(b.low) && a.low <= b.high && b.low <= a.high;
-  return overlap ? "✗ no (intervals overlap)" : "✗ no";
+/** Whether the best row is the paper's; what ours would give where that one was not run is not known. */
+function sameText(table) {
+  const [ours, published] = [bestRows(table, "rank"), bestRows(table, "published_rank")];
+  if (!ours.length || !published.length) return DASH;
+  if (ours.some((row) => published.includes(row))) return "✓ yes";
+  const run = published.some((row) => isNumber(table.cells[row][mainColumn(table)].mean));
+  return run ? "✗ no" : `${DASH} not run`;
 }
 
 /** Runs by commit. */

@@ -8,7 +8,7 @@ const tableViews = [];
 const BESIDE = 3;
 
 for (const table of DATA.tables) {
-  table.id = slug("table", table.name, table.scale);
+  table.id = placeName("table", table.name, table.scale, table.extra);
   table.decimals = printedDecimals(table);
   table.isRun = table.cells.flat().some((cell) => cell.runs.length || isNumber(cell.mean));
 }
@@ -24,11 +24,17 @@ function renderTables(section) {
   const waiting = DATA.tables.filter((table) => !table.isRun);
   section.append(
     el("p", {}, "Click a number of ours to see the runs behind it: commit, configuration, and the command that repeats them. ",
-      el("b", {}, "Bold"), ": best of its column among ours or among the published; ", el("u", {}, "underlined"), ": second best."),
+      el("b", {}, "Bold"), ": best of its column among ours or among the published; ", el("u", {}, "underlined"), ": second best. ", comparisonHint()),
     tableTools());
   section.append(...run.map((table) => tableCard(table)));
   if (!run.length) section.append(el("p", { class: "empty" }, "No row of a table has been run yet."));
   if (waiting.length) section.append(el("h3", { id: "not-run-yet" }, `Not run yet (${waiting.length})`), ...waiting.map(waitingTable));
+}
+
+/** What intervals of single rows do not say: a paired difference may be clear where they overlap. */
+function comparisonHint() {
+  return ["Intervals of single rows do not answer whether two rows differ; ",
+    el("code", {}, "python -m analysis.compare a=... b=..."), " does, image by image."];
 }
 
 function tableTools() {
@@ -42,7 +48,13 @@ function tableTools() {
 
 function tableTitle(table) {
   const scale = table.scale ? el("span", { class: `badge ${table.scale}` }, `${table.scale} scale`) : null;
-  return [el("span", { class: "paper-name" }, `${table.paper} `), `${table.number} `, scale];
+  const extra = table.extra ? [" ", el("code", { class: "extra", title: "every row of ours was run with it" }, breakable(table.extra))] : null;
+  return [el("span", { class: "paper-name" }, `${table.paper} `), `${table.number} `, scale, extra];
+}
+
+/** Name and number, and the overrides that every row was run with. */
+function fullName(table) {
+  return [table.name, table.number, table.extra].filter(Boolean).join(", ");
 }
 
 function tableCard(table) {
@@ -74,7 +86,7 @@ function waitingTable(table) {
 /** Draws one table for the chosen kinds, order and filter. */
 function tableView(table) {
   const element = el("table", { class: `results columns-${Math.min(table.columns.length, 20)}` });
-  const box = scrollBox(`${table.name}, ${table.number}`, element);
+  const box = scrollBox(fullName(table), element);
   const notes = el("div", { class: "notes" });
   const state = { sort: { column: null, descending: false }, text: "" };
   const draw = (focused) => {
@@ -87,7 +99,7 @@ function tableView(table) {
     if (focused !== undefined) focusHeader(element, focused);
   };
   const view = { box, notes, draw: () => draw(), filter: (text) => {
-    const isNamed = [table.name, table.number, table.caption].join(" ").toLowerCase().includes(text);
+    const isNamed = [table.name, table.number, table.caption, table.extra].join(" ").toLowerCase().includes(text);
     state.text = isNamed ? "" : text;
     draw();
     const card = document.getElementById(table.id);
