@@ -238,7 +238,30 @@ class Given:
         """Label -> counts over a partition, of the folders or files that `key` names."""
         what = "label:folder of what python -m analysis.score wrote, with commas between methods"
         named = self.named(key, what)
-        return {label: open_counts_file(_path(place), partition) for label, place in named.items()}
+        found = {label: open_counts_file(_path(place), partition) for label, place in named.items()}
+        check_same_images({label: [counts] for label, counts in found.items()})
+        return found
+
+
+def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
+    """Refuse a figure that would show methods on different images side by side.
+
+    Args:
+        methods: label -> counts of its seeds.
+
+    Raises:
+        InputError: naming the two.
+    """
+    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
+    (first, reference), *others = every
+    for label, counts in others:
+        if counts.dataset != reference.dataset or set(counts.names) != set(reference.names):
+            raise InputError(
+                f"'{first}' was scored on {len(reference.names)} images of split "
+                f"'{reference.split}', such as '{reference.names[0]}', but '{label}' on "
+                f"{len(counts.names)} of '{counts.split}', such as '{counts.names[0]}'; a figure "
+                "shows methods on the same images of one data set."
+            )
 
 
 def open_counts_file(place: Path, partition: str) -> Counts:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from analysis.arguments import blocks_of
-from analysis.figures.inputs import Given, progress
+from analysis.figures.inputs import Given, check_same_images, progress
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
@@ -149,4 +149,5 @@ def _methods(given: Given) -> dict[str, list[Counts]]:
         label, colon, place = word.partition(":")
         for stored in open_counts(place if colon else label, runs_dir, split):
             found.setdefault(label if colon else stored.label, []).append(stored.counts)
+    check_same_images(found)
     return found

@@ -39,7 +39,7 @@ function regionMap(partition, values, range, label) {
   svg("title", {}, `region ${index + 1}: ${fixed(values[index])}`)));
   const texts = order.map((index) => {
     const place = numberPlace(partition, index, MAP);
-    if (place.room < 9 || place.width < 24) return null;
+    if (place.room < 12 || place.width < 24) return null;
     const size = Math.min(12, place.room - 0.5);
     return svg("text", { x: place.x, y: place.y + size * 0.36, "font-size": size, "text-anchor": "middle",
       style: `fill: ${heat(values[index], range).ink}` }, fixed(values[index], 1));
