@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import threading
-import zipfile
-import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError
+from rgbt.metrics.archive import Archive
 from rgbt.metrics.metric import Absent
 
-FORMAT = "rgbt pixel maps 1"
-"""Written into every file; another number means another layout."""
+ARCHIVE = Archive(
+    "rgbt pixel maps 1", "pixel maps", "it is the maps.npz that python -m analysis.score writes"
+)
 
 BYTES_HOLD = 255
 """Images that are added up in bytes before the sums are moved to wider integers."""
@@ -63,11 +60,7 @@ class PixelMaps:
 
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, format=np.array(FORMAT), **values)
-        partial.replace(path)
+        ARCHIVE.save(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> PixelMaps:
@@ -76,7 +69,7 @@ class PixelMaps:
         Raises:
             InputError: no such file, or not a file of pixel maps.
         """
-        values = _read(path)
+        values = ARCHIVE.load(path)
         return cls(
             intersection=values["intersection"],
             union=values["union"],
@@ -149,25 +142,3 @@ def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
     heat: Heat = np.full(ratio.shape[1:], np.nan)
     np.divide(ratio.sum(0), there, out=heat, where=there > 0)
     return heat
-
-
-def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(
-            f"there is no file of pixel maps '{path}'; python -m analysis.score predictions=... "
-            "writes it."
-        )
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            values = {key: stored[key] for key in stored.files}
-    # TypeError: a lone array of NumPy's other format opens, but is no archive.
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"'{path}' is not a readable file of pixel maps; score the predictions again."
-        ) from error
-    if str(values.get("format")) != FORMAT:
-        raise InputError(
-            f"'{path}' is no file of pixel maps: expected the mark '{FORMAT}', got "
-            f"'{values.get('format')}'; it is the maps.npz that python -m analysis.score writes."
-        )
-    return values

@@ -6,9 +6,6 @@ Letters: ``N`` images, ``R`` regions, ``K`` classes, ``P`` parts, ``H W`` pixels
 
 from __future__ import annotations
 
-import os
-import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice
+from rgbt.metrics.archive import Archive
 from rgbt.metrics.names import DAY, NIGHT
 
-FORMAT = "rgbt spatial statistics 1"
-"""Written into every file; another number means another layout."""
+ARCHIVE = Archive(
+    "rgbt spatial statistics 1",
+    "statistics",
+    "write it with python -m analysis.spatial dataset=... out=...",
+)
 
 MODALITIES = ("rgb", "thermal")
 """Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits."""
@@ -157,18 +158,12 @@ class SpatialStatistics:
 
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         values: dict[str, Any] = {key: getattr(self, key) for key in ARRAYS}
         values |= {key: np.array(getattr(self, key)) for key in (*TEXTS, *LISTS)}
         values |= {f"{NOISE}{name}": noise for name, noise in self.noise.items()}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.zeros(0, bool) if self.night is None else self.night
-        values["format"] = np.array(FORMAT)
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, **values)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
+        ARCHIVE.save(path, values)
 
     @classmethod
     def load(cls, path: Path) -> SpatialStatistics:
@@ -177,7 +172,7 @@ class SpatialStatistics:
         Raises:
             InputError: no such file, or not a file of statistics.
         """
-        values = _read(path)
+        values = ARCHIVE.load(path)
         night = values["night"].astype(bool)
         fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
         fields |= {key: str(values[key]) for key in TEXTS}
@@ -186,21 +181,3 @@ class SpatialStatistics:
             key.removeprefix(NOISE): array for key, array in values.items() if key.startswith(NOISE)
         }
         return cls(night=night if len(night) else None, **fields)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    advice = "write it with python -m analysis.spatial dataset=... out=..."
-    if not path.is_file():
-        raise InputError(f"there is no file of statistics '{path}'; {advice}.")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            values = {key: stored[key] for key in stored.files}
-    # TypeError: a lone array of NumPy's other format opens, but is no archive.
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"'{path}' is not a readable file of statistics; {advice}.") from error
-    if str(values.get("format")) != FORMAT:
-        raise InputError(
-            f"'{path}' is no file of statistics: expected the mark '{FORMAT}', got "
-            f"'{values.get('format')}'; {advice}."
-        )
-    return values

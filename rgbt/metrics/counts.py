@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import zipfile
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
+from rgbt.metrics.archive import Archive
 from rgbt.metrics.names import DAY, NIGHT
 
-FORMAT = "rgbt counts 1"
-"""Written into every file; another number means another layout."""
+ARCHIVE = Archive("rgbt counts 1", "counts", "evaluate the run to write it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,15 +90,10 @@ class Counts:
 
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.array(self.night if self.night is not None else (), dtype=bool)
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, format=np.array(FORMAT), **values)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
+        ARCHIVE.save(path, values)
 
     @classmethod
     def load(cls, path: Path) -> Counts:
@@ -111,7 +102,7 @@ class Counts:
         Raises:
             InputError: no such file, or not a file of counts.
         """
-        values = _read(path)
+        values = ARCHIVE.load(path)
         return cls(
             counts=values["counts"],
             names=tuple(values["names"].tolist()),
@@ -126,22 +117,3 @@ class Counts:
         night = None if self.night is None else tuple(self.night[index] for index in indices)
         names = tuple(self.names[index] for index in indices)
         return replace(self, counts=self.counts[indices], names=names, night=night)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(f"there is no file of counts '{path}'; evaluate the run to write it.")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            values = {key: stored[key] for key in stored.files}
-    # TypeError: a lone array of NumPy's other format opens, but is no archive.
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"'{path}' is not a readable file of counts; evaluate the run again."
-        ) from error
-    if str(values.get("format")) != FORMAT:
-        raise InputError(
-            f"'{path}' is no file of counts: expected the mark '{FORMAT}', got "
-            f"'{values.get('format')}'; evaluate the run again."
-        )
-    return values
