@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arguments import out_folder
 from rgbt.checks import InputError
 from rgbt.tracking.files import write_atomic
 
@@ -113,7 +114,7 @@ def out_path(out: str) -> Path:
     """The file that ``out=`` names, before anything is computed for it.
 
     Raises:
-        InputError: its ending is none of `SUFFIXES`.
+        InputError: its ending is none of `SUFFIXES`, or its folder cannot be written.
     """
     path = Path(out).expanduser()
     if path.suffix.lower() not in SUFFIXES:
@@ -121,6 +122,7 @@ def out_path(out: str) -> Path:
             f"out={out}: expected a name that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
             f", got '{path.suffix}'; for example out=figure.pdf."
         )
+    out_folder(str(path.parent))
     return path
 
 

@@ -26,6 +26,9 @@ from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import Partition
 
 Resize = Literal["refuse", "nearest"]
+MOST_STRETCH = 0.05
+"""Ratio of the aspects of prediction and label, less 1, up to which one is a resized other."""
+
 PARTITIONS: tuple[Partition, ...] = get_args(Partition)
 
 
@@ -189,6 +192,14 @@ class _Counting:
         return np.stack([counter(label, prediction) for counter in self.counters]), differs
 
     def _resized(self, prediction: Array, label: Array, path: Path) -> Array:
+        shapes = (prediction.shape, label.shape)
+        aspects = [height / width for height, width in shapes]
+        if self.options.resize == "nearest" and abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
+            raise InputError(
+                f"{path} is {prediction.shape[0]}x{prediction.shape[1]} pixels and its label "
+                f"{label.shape[0]}x{label.shape[1]}, which is another shape and no other size; is "
+                "it turned, or cropped? write predictions of the whole image."
+            )
         if self.options.resize == "refuse":
             raise InputError(
                 f"{path} is {prediction.shape[0]}x{prediction.shape[1]} pixels but its label is "

@@ -143,8 +143,8 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[StoredR
         raise
     except Exception as error:  # The border to a store that may fail in any way.
         raise RunError(
-            f"MLflow at {shown} cannot be read ({_reason(error)}); start its server, or name "
-            "another store with tracking.uri=..."
+            f"MLflow at {shown} cannot be read ({_reason(error)}); start its server if it "
+            "has one, or name another store with tracking.uri=..."
         ) from error
     places = _Places(client, runs_dir, copies, _beside(uri))
     return [_stored(run, places) for run in runs]

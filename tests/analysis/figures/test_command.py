@@ -318,3 +318,11 @@ def test_methods_on_other_images_are_not_shown_together(
     assert code == 2
     assert "'A' was scored on 12 images of split 'test', such as " in err
     assert "'B' on 11 of 'val'" in err
+
+
+def test_a_file_in_the_place_of_a_folder_is_told_before_drawing(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    out = tmp_path / "file" / "f.pdf"
+    code, _, err = call(ENTRY, "figure=multihead/fig3", f"out={out}")
+    assert code == 2
+    assert "is a file; give a folder" in err

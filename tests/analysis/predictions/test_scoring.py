@@ -137,6 +137,13 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
     assert scored.resized == tuple(LABELS)
 
 
+def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> None:
+    folder = write({name: np.zeros((8, 4), np.uint8) for name in ("00001D", "00002N")})
+    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    with pytest.raises(InputError, match="is 8x4 pixels and its label 4x4, which is another shape"):
+        score_folder(folder, tiny, "test", options)
+
+
 def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> None:
     """3 columns on 4: centres at 0.375, 1.125, 1.875 and 2.625 lie in columns 0, 1, 1, 2."""
     folder = write({name: [[0, 1, 2]] * 3 for name in PREDICTIONS})
