@@ -68,12 +68,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     ]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
-    comparison = compare(a, b, metrics_of(arguments["metrics"], [*a, *b]), settings)
+    metrics = metrics_of(arguments["metrics"], [*a, *b], settings)
+    comparison = compare(a, b, metrics, settings)
     labels = _labels(opened)
     grid = comparison_grid(comparison, labels)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
-    show(escape(said + "\n" + remark(settings)))
+    show(escape("\n".join([said, *part_lines(comparison), remark(settings)])))
     if out is not None:
         _write(out, grid, said, comparison)
     return 0
@@ -100,10 +101,10 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     )
 
 
-def metrics_of(text: str, every: Sequence[Counts]) -> list[str]:
+def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
     """The metrics asked for; "auto": mIoU, Var, every region, and mIoU by day and by night.
 
-    Day and night where all counts tell them apart and hold enough images of them.
+    Day and night where all counts tell them apart and hold enough images of them for `settings`.
     """
     from analysis.uncertainty.blocks import FEWEST
     from rgbt.metrics import names
@@ -112,10 +113,12 @@ def metrics_of(text: str, every: Sequence[Counts]) -> list[str]:
         return [word.strip() for word in text.split(",")]
     regions = [names.region(number + 1) for number in range(every[0].counts.shape[1])]
     told = [counts.parts() for counts in every]
+    # Neighbours of two sequences make no common block: a few images more than the product.
+    fewest = FEWEST * (settings.blocks + 1 if isinstance(settings.blocks, int) else 1)
     parts = [
         names.subset(part, names.MIOU)
         for part in (names.DAY, names.NIGHT)
-        if all(part in each and len(each[part].names) >= FEWEST for each in told)
+        if all(part in each and len(each[part].names) >= fewest for each in told)
     ]
     return [names.MIOU, names.VAR, *regions, *parts]
 
@@ -147,6 +150,14 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
     title = f"{labels[1]} less {labels[0]}: {drawn}, {comparison.partition}"
     header = ("", *labels, "difference", *over, *more, "p (Holm)")
     return Grid(title, header, tuple(rows))
+
+
+def part_lines(comparison: Comparison) -> list[str]:
+    """What was drawn for the scores by day and by night, which are over other images."""
+    from rgbt.metrics.named import parse
+
+    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
+    return [f"{part}: {said}." for part, said in drawn.items() if part is not None]
 
 
 def remark(settings: Resampling) -> str:

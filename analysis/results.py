@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+
+import numpy as np
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder, find_run, runs_in
+from rgbt.tracking.terminal import tell
 
 GROUP = "rgbt.group"
 """Tag that the seeds of one method share (`rgbt.naming`)."""
@@ -51,7 +56,8 @@ def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tu
     """
     root = Path(runs_dir)
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    words = [text] if _of_group(text, root) else split_words(text)
+    is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
+    words = [text] if is_whole else split_words(text)
     found = [stored for word in words for stored in _open(word, root, split)]
     for stored in found:
         if split and stored.counts.split != split:
@@ -63,12 +69,31 @@ def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tu
     for path in paths:
         if paths.count(path) > 1:
             raise InputError(f"'{text}' names {path} twice; one training counts once.")
+    _check_trainings_differ(text, found)
     return tuple(found)
 
 
+def _check_trainings_differ(text: str, found: Sequence[Stored]) -> None:
+    """One seed twice, or equal counts, are no two trainings and would make a method look sure."""
+    for first, second in combinations(found, 2):
+        is_again = (first.label, first.seed) == (second.label, second.seed)
+        if is_again and first.seed is not None:
+            raise InputError(
+                f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
+                f"{second.key}, which differ in what their overrides do not say); name the runs."
+            )
+        is_one = first.label == second.label or not (first.key and second.key)
+        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
+            raise InputError(
+                f"'{text}': {first.path} and {second.path} hold the same counts; one training "
+                "counts once."
+            )
+
+
 def groups_in(runs_dir: Path | str) -> list[str]:
-    """Names of all groups of runs in a folder."""
-    return sorted({_tag(run, GROUP) for run in _runs(Path(runs_dir))} - {""})
+    """Names of all groups with finished runs in a folder."""
+    runs = [run for run in _runs(Path(runs_dir)) if run.result() is not None]
+    return sorted({_tag(run, GROUP) for run in runs} - {""})
 
 
 def label_of(stored: tuple[Stored, ...]) -> str:
@@ -155,6 +180,8 @@ def _of_run(run: RunFolder, split: str) -> Stored:
             f"'{split}'; python -m rgbt.evaluate run={run.path} split={split} out={path} makes "
             "them once it is finished."
         )
+    if run.result() is None:
+        tell(f"{run.path} is not finished; its counts are of a training that goes on.")
     seed = _tag(run, SEED)
     return Stored(
         label=_tag(run, GROUP) or run.path.name,
@@ -166,5 +193,8 @@ def _of_run(run: RunFolder, split: str) -> Stored:
 
 
 def _tag(run: RunFolder, name: str) -> str:
-    description = run.description()
+    try:
+        description = run.description()
+    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
+        return ""
     return "" if description is None else description.tags.get(name, "")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
@@ -95,12 +96,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
             f"{' and '.join(given) or 'neither'}."
         )
     out = out_folder(arguments["out"])
-    if out is not None and arguments["predictions"]:
-        _check_same_method(out, arguments)
     settings = _resampling(arguments)
     if given == ["counts"]:
         counted, remarks = _stored(arguments, overrides), []
+        _check_same_method(out, [name for name, _ in counted])
     else:
+        _check_same_method(out, [_name_of(arguments)])
         scored = _scored(arguments, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
         remarks = remarks_on(scored)
@@ -154,19 +155,22 @@ def write_counts(scored: Scored, out: Path) -> None:
         scored.maps.save(out / "maps.npz")
 
 
-def _check_same_method(out: Path, arguments: dict[str, str]) -> None:
+def _name_of(arguments: dict[str, str]) -> str:
+    return arguments["name"] or Path(arguments["predictions"]).resolve().name
+
+
+def _check_same_method(out: Path | None, names: Sequence[str]) -> None:
     """Refuse a folder with scores of another method: files of both would stand side by side."""
     import csv
 
-    name = arguments["name"] or Path(arguments["predictions"]).resolve().name
-    if not (out / "scores.csv").is_file():
+    if out is None or not (out / "scores.csv").is_file():
         return
     with (out / "scores.csv").open(newline="") as stream:
-        earlier = next(iter(csv.DictReader(stream)), {}).get("method", name)
-    if earlier != name:
+        earlier = dict.fromkeys(row.get("method", "") for row in csv.DictReader(stream))
+    if list(earlier) != list(dict.fromkeys(names)):
         raise InputError(
-            f"out={out} holds scores of '{earlier}'; give '{name}' a folder of its own, or the "
-            "same name with name=..."
+            f"out={out} holds scores of '{', '.join(earlier)}'; give '{', '.join(names)}' a folder "
+            "of its own, or the same name with name=..."
         )
 
 
@@ -271,22 +275,28 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
 
     found: dict[Cell, tuple[float, float]] = {}
     drawn: dict[str, str] = {}
-    for absent in table.conventions():
-        cells = interval_cells(table, absent)
-        estimates = estimate([counts], list(cells), replace(settings, absent=absent))
+    for absent, part in product(table.conventions(), table.num_images):
+        named = interval_cells(table, absent)[part]
+        try:
+            estimates = estimate([counts], list(named), replace(settings, absent=absent))
+        except InputError as error:
+            if part == "all":
+                raise
+            drawn[part] = f"has none ({error})"  # a part that is too small stops nothing else
+            continue
         for metric, each in estimates.items():
             if each.images is not None:
-                found[cells[metric]] = (each.images.low, each.images.high)
-        drawn |= {part: estimates[name].said for part, name in OF_PARTS.items() if name in cells}
+                found[named[metric]] = (each.images.low, each.images.high)
+        drawn[part] = f"of {estimates[OF_PARTS[part]].said}"
     whole_split = drawn.pop("all")
     if not found:
         return replace(
             table, intervals=f"{table.partition}: no intervals, too few images: {whole_split}."
         )
-    parts = "".join(f"; {part} of {said}" for part, said in drawn.items())
+    parts = "".join(f"; {part} {said}" for part, said in drawn.items())
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"({settings.method}, {settings.resamples} resamples of {whole_split}{parts})."
+        f"({settings.method}, {settings.resamples} resamples {whole_split}{parts})."
     )
     return with_intervals(table, found, said)
 

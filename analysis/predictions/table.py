@@ -146,19 +146,19 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
     )
 
 
-def interval_cells(table: ScoreTable, absent: Absent) -> dict[str, Cell]:
-    """The cells that are given intervals, by metric name: mIoU, variance, mIoU of each region.
+def interval_cells(table: ScoreTable, absent: Absent) -> dict[str, dict[str, Cell]]:
+    """The cells that are given intervals: mIoU, that of each region, and Var.
 
-    The mIoU of the whole image stands first, so that blocks of neighbouring images that are made
-    for the first score are the same for every partition, and with them its interval.
+    Returns:
+        part of the images -> metric name -> cell.
     """
     regions = (None, *range(1, table.regions + 1))
-    cells = [
-        replace(cell, images=images, absent=absent)
-        for images in table.num_images
-        for cell in (*(Cell(region=region) for region in regions), Cell(metric="Var"))
-    ]
-    return {cell.metric_name: cell for cell in cells if cell.metric_name is not None}
+    found: dict[str, dict[str, Cell]] = {}
+    for images in table.num_images:
+        plain = (*(Cell(region=region) for region in regions), Cell(metric="Var"))
+        cells = [replace(cell, images=images, absent=absent) for cell in plain]
+        found[images] = {str(cell.metric_name): cell for cell in cells}
+    return found
 
 
 def with_intervals(

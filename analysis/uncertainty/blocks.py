@@ -51,8 +51,10 @@ def make_blocks(
             for.
     """
     sequences = _sequences(names)
-    if choice == "none" or (choice == "auto" and sequences is None):
+    if choice == "none":
         return _singles(len(names))
+    if choice == "auto" and sequences is None:
+        return _singles(len(names), " (their names tell no neighbours)")
     if sequences is None:
         raise InputError(
             f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
@@ -178,5 +180,5 @@ def _joined(count: int, pieces: Sequence[NDArray[np.int64]], said: str) -> Block
     return Blocks(index, len(pieces), said)
 
 
-def _singles(count: int) -> Blocks:
-    return Blocks(np.arange(count), count, f"{count} single images")
+def _singles(count: int, remark: str = "") -> Blocks:
+    return Blocks(np.arange(count), count, f"{count} single images{remark}")

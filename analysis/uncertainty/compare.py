@@ -104,7 +104,9 @@ def compare(
         b: of the second, on the same images.
         metrics: names, see `rgbt.metrics.named`.
         settings: of the resampling.
-        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways.
+        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways. What
+            images and trainings do together is then in both parts of the interval over both, which
+            holds the true difference in at least `level` of all cases.
 
     Raises:
         InputError: other images, classes, regions or labels; fewer than `FEWEST` blocks; no such

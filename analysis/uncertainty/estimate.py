@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -47,11 +48,6 @@ class Estimate:
     trainings: Interval | None
     both: Interval | None
     said: str
-
-    @property
-    def widest(self) -> Interval | None:
-        """The interval that covers most of what is known: both, else over images."""
-        return self.both or self.images
 
 
 def estimate(
@@ -117,5 +113,9 @@ def _of_score(interval: Interval) -> Interval:
 
 
 def image_spread(images: Images, resampled: Values) -> Spread:
-    """Standard error over the draw of the images."""
-    return Spread(float(np.nanstd(resampled)), images.blocks.count - 1)
+    """Standard error over the draw of the images.
+
+    Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error.
+    """
+    count = images.blocks.count
+    return Spread(float(np.nanstd(resampled)) * math.sqrt(count / (count - 1)), count - 1)

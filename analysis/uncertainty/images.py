@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from rgbt.metrics.named import Asked, images_of, parse, values
 from rgbt.randomness import numpy_generator
 
 CHUNK = 500
-"""Resamples computed at once: their counts stay in the cache of the processor."""
+"""Resamples computed at once, which limits the memory that their counts take."""
 
 Scores = NDArray[np.float64]
 
@@ -79,12 +79,13 @@ class Images:
         """Per method (metrics, resamples): mean over seeds; both methods see the same draws."""
         count = self.blocks.count
         even = np.full(count, 1.0 / count)
-
-        def draw(rng: np.random.Generator, size: int) -> list[NDArray[np.float64]]:
-            weights = rng.multinomial(count, even, size).astype(np.float64)
-            return [weights @ method for method in self.methods]
-
-        return self._many(asked, "bootstrap", draw)
+        found = [np.empty((len(asked), self.settings.resamples)) for _ in self.methods]
+        rng = numpy_generator(self.settings.seed, "bootstrap")
+        for chunk in _chunks(self.settings.resamples):
+            weights = rng.multinomial(count, even, chunk.stop - chunk.start).astype(np.float64)
+            for scores, method in zip(found, self.methods, strict=True):
+                scores[:, chunk] = self._scores(asked, weights @ method).mean(1)
+        return found
 
     def swapped(self, asked: Sequence[Asked]) -> list[Scores]:
         """Two methods (metrics, resamples) whose predictions were exchanged on half of the blocks.
@@ -94,15 +95,19 @@ class Images:
         """
         first, second = self.methods
         pairs = math.lcm(len(first), len(second))
-        a = np.tile(first, (pairs // len(first), 1, 1))
-        b = np.tile(second, (pairs // len(second), 1, 1))
-
-        def draw(rng: np.random.Generator, size: int) -> list[NDArray[np.float64]]:
-            flags = rng.integers(0, 2, (size, self.blocks.count)).astype(np.float64)
-            moved = flags @ (b - a)
-            return [a.sum(1)[:, None] + moved, b.sum(1)[:, None] - moved]
-
-        return self._many(asked, "swap", draw)
+        found = [np.zeros((len(asked), self.settings.resamples)) for _ in self.methods]
+        # Pair by pair, with the same draws for each: all at once would not fit into memory.
+        for a, b in (
+            (first[pair % len(first)], second[pair % len(second)]) for pair in range(pairs)
+        ):
+            moved, sums = b - a, (a.sum(0), b.sum(0))
+            rng = numpy_generator(self.settings.seed, "swap")
+            for chunk in _chunks(self.settings.resamples):
+                size = chunk.stop - chunk.start
+                swapped = rng.integers(0, 2, (size, self.blocks.count)).astype(np.float64) @ moved
+                found[0][:, chunk] += self._scores(asked, sums[0] + swapped) / pairs
+                found[1][:, chunk] += self._scores(asked, sums[1] - swapped) / pairs
+        return found
 
     def without_each(self, asked: Sequence[Asked]) -> list[Scores]:
         """Per method (metrics, B): the mean over seeds without one block each (jackknife)."""
@@ -110,19 +115,6 @@ class Images:
             self._scores(asked, method.sum(1, keepdims=True) - method).mean(1)
             for method in self.methods
         ]
-
-    def _many(
-        self,
-        asked: Sequence[Asked],
-        purpose: str,
-        draw: Callable[[np.random.Generator, int], list[NDArray[np.float64]]],
-    ) -> list[Scores]:
-        parts: list[list[Scores]] = [[] for _ in self.methods]
-        rng = numpy_generator(self.settings.seed, purpose)
-        for size in _chunks(self.settings.resamples):
-            for part, summed in zip(parts, draw(rng, size), strict=True):
-                part.append(self._scores(asked, summed).mean(1))
-        return [np.concatenate(part, axis=1) for part in parts]
 
     def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
         """(metrics, ...) percent of summed counts (..., R K K)."""
@@ -159,7 +151,10 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
     )
-    blocks = make_blocks(first.names, settings.blocks, _influence(single))
+    try:
+        blocks = make_blocks(first.names, settings.blocks, _influence(single))
+    except InputError as error:
+        raise InputError(f"{asked.part}: {error}" if asked.part else str(error)) from None
     return Images(
         methods=tuple(_summed(each, blocks) for each in single.methods),
         shape=single.shape,
@@ -249,6 +244,6 @@ def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
     return [[counts.select(kept) for counts in seeds] for seeds in methods]
 
 
-def _chunks(total: int) -> Iterator[int]:
+def _chunks(total: int) -> Iterator[slice]:
     for start in range(0, total, CHUNK):
-        yield min(CHUNK, total - start)
+        yield slice(start, min(start + CHUNK, total))

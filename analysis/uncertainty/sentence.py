@@ -37,7 +37,7 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     size = f"{abs(found.value):.2f}{_unit(found)}"
     if is_told:
         said = f"{start} of {label_b} is {size} {more} than that of {label_a}"
-        return f"{said} ({scores}; {evidence}), {basis}{limit}."
+        return f"{said} ({scores}; {evidence}), {basis}{limit}{_corrected(found, comparison)}."
     here = "As trained here, a" if limit else "A"
     return (
         f"{here} difference in {found.metric} between {label_b} and {label_a} is not shown "
@@ -59,6 +59,14 @@ def _limit(found: Difference) -> str:
     if found.both is not None:
         return ""
     return f"; with {_trainings(found)}, it says nothing about other trainings of the two"
+
+
+def _corrected(found: Difference, comparison: Comparison) -> str:
+    """The p-value among all that were compared, where that is another one."""
+    count = len(comparison.differences)
+    if count == 1:
+        return ""
+    return f"; corrected for all {count} scores compared, {_p(found.p_corrected)}"
 
 
 def _trainings(found: Difference) -> str:

@@ -229,9 +229,18 @@ def find_run(run: str, runs_dir: Path) -> Path:
         if (folder / "config.yaml").is_file():
             return folder.resolve()
     for sent in sorted(runs_dir.glob("*/mlflow.json")):
-        if json.loads(sent.read_text()).get("run_id") == run:
+        if _sent_as(sent) == run:
             return sent.parent.resolve()
     raise InputError(
         f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
         f"{runs_dir.resolve()}; list that folder to see the runs, or name another with runs_dir=..."
     )
+
+
+def _sent_as(sent: Path) -> str | None:
+    """The MLflow run id in ``mlflow.json``; None where the file is damaged."""
+    try:
+        found = json.loads(sent.read_text())
+    except ValueError:
+        return None
+    return found.get("run_id") if isinstance(found, dict) else None

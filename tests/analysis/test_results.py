@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.results import Stored, label_of, open_counts
+from analysis.results import Stored, groups_in, label_of, open_counts
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import Description, RunFolder
@@ -241,3 +241,35 @@ def test_nothing_is_written(runs: Path):
     with pytest.raises(InputError):
         open_counts("nothing", runs)
     assert sorted(os.walk(runs)) == before
+
+
+def test_one_seed_twice_is_no_second_training(runs: Path):
+    make_run(runs, "ddd0", "crm scale=demo", 0)  # same overrides, another default
+    with pytest.raises(InputError, match="names seed 0 of 'crm scale=demo' twice"):
+        open_counts("crm scale=demo", runs)
+
+
+def test_equal_counts_are_one_training(runs: Path, tmp_path: Path):
+    for name in ("one", "other"):
+        some(7).save(tmp_path / f"{name}.npz")
+    with pytest.raises(InputError, match="hold the same counts; one training"):
+        open_counts(f"{tmp_path}/one.npz,{tmp_path}/other.npz", runs)
+
+
+@pytest.mark.parametrize("text", ["{", "{}", "[]"])
+def test_a_damaged_run_stops_nothing_else(runs: Path, tmp_path: Path, text: str):
+    broken = make_run(runs, "eee0", "crm scale=demo", 9)
+    for name in ("run.json", "mlflow.json"):
+        (broken / name).write_text(text)
+    some(7).save(tmp_path / "one.npz")
+    assert len(open_counts(str(tmp_path / "one.npz"), runs)) == 1
+    assert "crm scale=demo" in groups_in(runs)
+    with pytest.raises(InputError, match="is no run folder"):
+        open_counts("mlflow-nobody", runs)
+
+
+def test_an_unfinished_run_is_said(runs: Path, capsys: pytest.CaptureFixture[str]):
+    make_run(runs, "fff0", "new", 0, finished=False)
+    open_counts("fff0", runs)
+    assert "is not finished" in capsys.readouterr().err
+    assert "new" not in groups_in(runs)

@@ -21,6 +21,7 @@ from rgbt.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from rgbt.tracking.folder import Description, RunFolder
 from tests.commands import SPLITS, Call
 from tests.conftest import pair
 
@@ -179,6 +180,7 @@ def test_a_folder_holds_scores_of_one_method(
     arguments = (f"predictions={predictions}", *place(data), "resamples=0", f"out={out}")
     assert score(call, *arguments)[0] == 0
     (out / "counts_test.npz").write_text("of a run")
+    (out / "counts_ring9.npz").write_text("of an earlier call")
     code, _, err = score(call, *arguments, "name=other")
     assert code == 2
     assert "holds scores of 'method'; give 'other' a folder of its own" in err
@@ -203,6 +205,54 @@ def test_day_and_night_say_their_own_blocks(call: Call) -> None:
     settings = Resampling(resamples=100, blocks="none")
     (table,) = score_tables([("m", counts)], settings)
     assert "of 40 single images; day of 28 single images; night of 12 single" in table.intervals
+
+
+def test_a_part_that_is_too_small_stops_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    counts = Counts(
+        counts=rng.integers(0, 50, (100, 2, 3, 3)),
+        names=tuple(f"{number:05d}{'N' if number < 30 else 'D'}" for number in range(100)),
+        night=tuple(number < 30 for number in range(100)),
+        classes=("a", "b", "c"),
+        partition="ring2",
+        dataset="x",
+        split="test",
+    )
+    (table,) = score_tables([("m", counts)], Resampling(resamples=100, blocks=5))
+    assert "of 20 blocks of up to 5" in table.intervals
+    assert "night has none (night: blocks=5: 30 images make 6 blocks" in table.intervals
+    assert {cell.images for cell, each in table.scores.items() if each.low == each.low} == {
+        "all",
+        "day",
+    }
+
+
+def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for seed in (0, 1):
+        run = RunFolder(tmp_path / "runs" / f"aaa{seed}")
+        run.write_config("name: x")
+        run.describe(Description("m", {"rgbt.group": "m", "rgbt.seed": str(seed)}, {}))
+        Counts(
+            counts=rng.integers(0, 50, (12, 2, 3, 3)),
+            names=tuple(map(str, range(12))),
+            night=None,
+            classes=("a", "b", "c"),
+            partition="ring2",
+            dataset="x",
+            split="test",
+        ).save(run.counts_path("test"))
+        run.finish({})
+    out = tmp_path / "out"
+    words = (f"runs_dir={tmp_path / 'runs'}", "resamples=0")
+    code, shown, err = score(call, "counts=m", f"out={out}", *words)
+    assert code == 0, err
+    assert "m seed 0, test" in shown
+    assert "m seed 1, test" in shown
+    # Another method's scores do not go into the same folder, counted here or elsewhere.
+    code, _, err = score(call, "counts=aaa0", f"out={out}", *words)
+    assert code == 2
+    assert "holds scores of 'm seed 0, m seed 1'; give 'm' a folder" in err
 
 
 @pytest.mark.parametrize(

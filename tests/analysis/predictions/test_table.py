@@ -127,8 +127,11 @@ def test_without_day_and_night_there_are_only_all_images() -> None:
 def test_intervals_stand_beside_their_scores(table: ScoreTable) -> None:
     cells = interval_cells(table, "exclude")
     names = ("mIoU", "region/1", "region/2", "Var")
-    assert list(cells) == [f"{part}{name}" for part in ("", "day/", "night/") for name in names]
-    found = with_intervals(table, {cells["region/1"]: (80.04, 85.0)}, "said")
+    assert {part: list(each) for part, each in cells.items()} == {
+        part: [f"{'' if part == 'all' else part + '/'}{name}" for name in names]
+        for part in ("all", "day", "night")
+    }
+    found = with_intervals(table, {cells["all"]["region/1"]: (80.04, 85.0)}, "said")
     assert region_grid(found).rows[1][1] == "83.65 [80.0, 85.0]"
     assert region_grid(found).rows[0][1] == "55.77"
     assert "said" in markdown("Scores", [found], ["a remark"])
@@ -136,7 +139,7 @@ def test_intervals_stand_beside_their_scores(table: ScoreTable) -> None:
 
 def test_the_csv_is_tidy(table: ScoreTable) -> None:
     cells = interval_cells(table, "released")
-    found = with_intervals(table, {cells["night/Var"]: (0.0, 1.5)}, "said")
+    found = with_intervals(table, {cells["night"]["night/Var"]: (0.0, 1.5)}, "said")
     rows = list(csv.DictReader(io.StringIO(tidy_csv([found]))))
     assert tuple(rows[0]) == COLUMNS
     assert len(rows) == len(table.scores) == 3 * 2 * (3 * 2 * 4 + 1)

@@ -173,7 +173,7 @@ def test_blocks_longer_than_a_sequence_are_the_sequences():
 
 def test_auto_without_numbers_draws_single_images():
     names = ["a", "b", "c3"]
-    assert make_blocks(names, "auto", NOTHING).said == "3 single images"
+    assert make_blocks(names, "auto", NOTHING).said.startswith("3 single images (")
 
 
 def test_auto_takes_the_longest_of_the_scores():
@@ -211,7 +211,10 @@ def test_a_number_that_is_the_same_everywhere_is_no_frame(ending):
 
 def test_names_that_tell_no_neighbours():
     names = [f"{letter}_{number}" for number, letter in enumerate("abcdefghijklm")]
-    assert make_blocks(names, "auto", NOTHING).said == "13 single images"
+    assert (
+        make_blocks(names, "auto", NOTHING).said
+        == "13 single images (their names tell no neighbours)"
+    )
     with pytest.raises(InputError, match="tell no neighbouring frames"):
         make_blocks(names, 5, NOTHING)
 

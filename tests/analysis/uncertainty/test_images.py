@@ -167,8 +167,10 @@ def test_swapped_is_the_loop_over_images(monkeypatch, trainings_a: int, training
     b = [counts_of(each) for each in arrays[1][:trainings_b]]
     flags = recorded(monkeypatch, "integers")
     swapped_a, swapped_b = prepare([a, b], ASKED[0], FEW).swapped(ASKED)
-    (only,) = flags
+    only = flags[0]
     assert only.shape == (100, 12)
+    assert len(flags) == math.lcm(trainings_a, trainings_b)
+    assert all((each == only).all() for each in flags)  # every pair sees the same exchanges
     for number in range(0, 100, 23):
         pairs = [
             exchanged(a[place % trainings_a], b[place % trainings_b], only[number])
