@@ -176,8 +176,9 @@ def _counts(
     from rgbt.tracking.terminal import tell
 
     methods = [[stored.counts for stored in each] for each in opened]
-    if {each.path for each in opened[0]} & {each.path for each in opened[1]}:
-        raise InputError("a and b hold the same counts; a method is compared with another one.")
+    shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
+    if shared:
+        raise InputError(f"a and b both hold {min(shared)}; a method is compared with another one.")
     if missing == "leave_out":
         before = len({name for seeds in methods for counts in seeds for name in counts.names})
         methods = common(methods)

@@ -70,6 +70,9 @@ def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tu
         if paths.count(path) > 1:
             raise InputError(f"'{text}' names {path} twice; one training counts once.")
     _check_trainings_differ(text, found)
+    labels = dict.fromkeys(stored.label for stored in found)
+    if len(labels) > 1:
+        tell(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
     return tuple(found)
 
 

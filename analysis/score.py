@@ -56,6 +56,9 @@ OWN = {
     **OF_A_FOLDER,
 }
 MAX_THREADS = 256
+SOURCE = "source.txt"
+"""File of a folder of scores that says what was scored."""
+
 PARTITION_NAMES = get_args(Partition)
 
 OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
@@ -88,6 +91,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     overrides of the data set, such as dataset=mfnet dataset.root=/data/MFNet
     """
     from analysis.predictions.text import remarks_on
+    from rgbt.tracking.files import write_atomic
 
     given = [key for key in ("predictions", "counts") if arguments[key]]
     if len(given) != 1:
@@ -96,12 +100,11 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
             f"{' and '.join(given) or 'neither'}."
         )
     out = out_folder(arguments["out"])
+    _check_same_source(out, _source_of(arguments))
     settings = _resampling(arguments)
     if given == ["counts"]:
         counted, remarks = _stored(arguments, overrides), []
-        _check_same_method(out, [name for name, _ in counted])
     else:
-        _check_same_method(out, [_name_of(arguments)])
         scored = _scored(arguments, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
         remarks = remarks_on(scored)
@@ -109,6 +112,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
             write_counts(scored, out)
     tables = score_tables(counted, settings)
     _show(tables, remarks, out)
+    if out is not None:
+        write_atomic(out / SOURCE, f"{_source_of(arguments)}\n".encode())
     return 0
 
 
@@ -142,12 +147,17 @@ def score_tables(
 
 def write_counts(scored: Scored, out: Path) -> None:
     """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
+    from rgbt.tracking.terminal import tell
+
     out.mkdir(parents=True, exist_ok=True)
-    # Earlier counts and maps would pass for ones of these predictions.
-    for path in (
-        *(p for each in PARTITION_NAMES for p in out.glob(f"counts_{each}*.npz")),
-        out / "maps.npz",
-    ):
+    # The predictions may be other ones than at the last time: earlier counts and maps would pass
+    # for ones of these.
+    earlier = [path for each in PARTITION_NAMES for path in out.glob(f"counts_{each}*.npz")]
+    new = {f"counts_{counts.partition}.npz" for counts in scored.counts}
+    gone = sorted(path.name for path in earlier if path.name not in new)
+    if gone:
+        tell(f"removed from {out}, because counted by an earlier call: {', '.join(gone)}.")
+    for path in (*earlier, out / "maps.npz"):
         path.unlink(missing_ok=True)
     for counts in scored.counts:
         counts.save(out / f"counts_{counts.partition}.npz")
@@ -155,23 +165,22 @@ def write_counts(scored: Scored, out: Path) -> None:
         scored.maps.save(out / "maps.npz")
 
 
-def _name_of(arguments: dict[str, str]) -> str:
-    return arguments["name"] or Path(arguments["predictions"]).resolve().name
-
-
-def _check_same_method(out: Path | None, names: Sequence[str]) -> None:
-    """Refuse a folder with scores of another method: files of both would stand side by side."""
-    import csv
-
+def _check_same_source(out: Path | None, source: str) -> None:
+    """Refuse a folder with other scores: files of both would stand side by side."""
     if out is None or not (out / "scores.csv").is_file():
         return
-    with (out / "scores.csv").open(newline="") as stream:
-        earlier = dict.fromkeys(row.get("method", "") for row in csv.DictReader(stream))
-    if list(earlier) != list(dict.fromkeys(names)):
-        raise InputError(
-            f"out={out} holds scores of '{', '.join(earlier)}'; give '{', '.join(names)}' a folder "
-            "of its own, or the same name with name=..."
-        )
+    noted = out / SOURCE
+    earlier = noted.read_text().strip() if noted.is_file() else "another call"
+    if earlier != source:
+        raise InputError(f"out={out} holds the scores of {earlier}; give {source} its own folder.")
+
+
+def _source_of(arguments: dict[str, str]) -> str:
+    """What is scored, as it is noted in the folder."""
+    if arguments["counts"]:
+        return f"counts={arguments['counts']}"
+    folder = Path(arguments["predictions"]).resolve()
+    return f"predictions={folder} split={arguments['split'] or 'test'}"
 
 
 def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) -> None:

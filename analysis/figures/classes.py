@@ -14,6 +14,7 @@ from analysis.figures.style import (
     new_figure,
     readable,
     region_axis,
+    say_splits,
     series_style,
     styled,
 )
@@ -103,8 +104,13 @@ def _of_part(label: str, counts: Counts, part: str) -> Counts:
 
 
 @styled
-def draw(data: ClassRegions) -> Figure:
-    """One line per class, and the mIoU as a thick black line, all in percent on one axis."""
+def draw(data: ClassRegions, splits: tuple[str, str]) -> Figure:
+    """One line per class, and the mIoU as a thick black line, all in percent on one axis.
+
+    Args:
+        data: the series.
+        splits: that the occupancy and that the mIoU are of; shown where they differ.
+    """
     figure = new_figure(PAGE, 2.8)
     axes = figure.subplots()
     places = np.arange(1, data.shares.shape[1] + 1)
@@ -119,6 +125,7 @@ def draw(data: ClassRegions) -> Figure:
     axes.set(ylim=(0, 105))
     axes.set_ylabel("SOR, percent of the class's\nlargest region" + _and_iou(data))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
+    say_splits(figure, splits)
     return figure
 
 

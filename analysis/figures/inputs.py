@@ -264,6 +264,20 @@ def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
             )
 
 
+def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:
+    """Refuse statistics of one data set beside scores on another; splits may differ.
+
+    Raises:
+        InputError: they are of two data sets.
+    """
+    if statistics.fingerprint != counts.dataset:
+        raise InputError(
+            f"the statistics are of {statistics.dataset}, split '{statistics.split}', and the "
+            f"scores of another data set (images such as '{counts.names[0]}'); measure the data "
+            "set that was scored."
+        )
+
+
 def open_counts_file(place: Path, partition: str) -> Counts:
     """The counts over `partition` of a folder of `analysis.score`, or a file of counts.
 

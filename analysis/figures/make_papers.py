@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.figures.inputs import Given
+from analysis.figures.inputs import Given, check_one_dataset
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def spatialseg_fig2(given: Given) -> Figure:
     counts = {each: given.counts("methods", f"{each}{regions}") for each in STRIPS_AND_RINGS}
     statistics = given.statistics()
     hw = statistics.region_map.shape
+    of_methods = next(iter(counts["ring"].values()))
+    check_one_dataset(statistics, of_methods)
     series = []
     for partition, methods in counts.items():
         aspect = "image" if partition == "ring" else None
@@ -63,7 +65,7 @@ def spatialseg_fig2(given: Given) -> Figure:
         region_map = Regions(regions=regions, **chosen).map((hw[0], hw[1]))
         occupancy = occupancy_over(statistics, region_map)
         series.append(trends.trend(partition, occupancy, methods, chosen["absent"]))
-    return trends.draw(series)
+    return trends.draw(series, splits=(statistics.split, of_methods.split))
 
 
 def spatialseg_fig3(given: Given) -> Figure:
@@ -79,10 +81,10 @@ def spatialseg_fig3(given: Given) -> Figure:
         if len(methods) != 1:
             raise InputError(f"methods: {given.figure} shows one method, got {len(methods)}.")
         method = next(iter(methods.items()))
+        check_one_dataset(statistics, method[1])
     absent: Any = given.choice("absent", ABSENT)
-    return classes.draw(
-        classes.class_regions(statistics, given.choice("part", PARTS), method, absent)
-    )
+    made = classes.class_regions(statistics, given.choice("part", PARTS), method, absent)
+    return classes.draw(made, splits=(statistics.split, method[1].split if method else ""))
 
 
 def spatialseg_fig4(given: Given) -> Figure:
@@ -101,16 +103,18 @@ def spatialseg_fig4(given: Given) -> Figure:
     if not given.has_dataset:
         given.refuse(["names"], "dataset=...")
     picture: Any
+    what = ""
     if given.has_dataset:
         picture = given.dataset.read(_one_name(given)).rgb
     elif sources == ["maps"]:
         pixel_maps = given.maps()
         given.check_split(pixel_maps.split, given.values["maps"])
-        picture = iou_map(pixel_maps)
+        picture, what = iou_map(pixel_maps), f"IoU ({pixel_maps.name}, {pixel_maps.split})"
     else:
-        picture = occupancy_map(given.statistics())
+        statistics = given.statistics()
+        picture, what = occupancy_map(statistics), f"sample occupancy ({statistics.split})"
     region_map = given.regions.map((picture.shape[0], picture.shape[1]))
-    return maps.draw_regions(maps.RegionPicture(picture, region_map, given.regions.name))
+    return maps.draw_regions(maps.RegionPicture(picture, region_map, given.regions.name, what))
 
 
 def spatialseg_fig5(given: Given) -> Figure:

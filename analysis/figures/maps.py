@@ -73,11 +73,13 @@ class RegionPicture:
         picture: (H, W) in 0..1 for a heat map, or (H, W, 3) uint8.
         region_map: (H, W) region of every pixel.
         partition: its name.
+        what: the heat map shows, "" for an image.
     """
 
     picture: NDArray[Any]
     region_map: NDArray[np.uint8]
     partition: str
+    what: str = ""
 
 
 def iou_heat(maps: PixelMaps, regions: Regions, *, beside_part: bool = False) -> HeatMap:
@@ -196,7 +198,8 @@ def draw_heats(heats: Sequence[HeatMap]) -> Figure:
         letter = f"({'ab'[index]}) " if wide else ""
         axes.set_title(f"{letter}{heat.what}: {heat.source}")
         axes.set_xlabel(_three_numbers(heat), fontsize=7)
-    figure.colorbar(shown, ax=list(panels), shrink=0.8, pad=0.015)  # type: ignore[arg-type]
+    what = " or ".join(dict.fromkeys(heat.what for heat in heats))
+    figure.colorbar(shown, ax=list(panels), shrink=0.8, pad=0.015, label=what)  # type: ignore[arg-type]
     return figure
 
 
@@ -221,7 +224,7 @@ def draw_regions(data: RegionPicture) -> Figure:
         if place is not None:
             number(axes, place, str(index + 1))
     if is_map:
-        figure.colorbar(shown, ax=axes, shrink=0.9, pad=0.02)  # type: ignore[arg-type]
+        figure.colorbar(shown, ax=axes, shrink=0.9, pad=0.02, label=data.what)  # type: ignore[arg-type]
     return figure
 
 

@@ -17,6 +17,7 @@ from analysis.figures.style import (
     PAGE,
     SMALL,
     class_legend,
+    folded,
     legend_height,
     new_figure,
     pack,
@@ -192,13 +193,15 @@ def draw(data: Panel, layout: str = "rows") -> Figure:
         data: the panel.
         layout: one of `LAYOUTS`.
     """
-    titles = ("RGB", "thermal", "ground truth", *data.methods)
+    plain = ("RGB", "thermal", "ground truth", *data.methods)
     height, width = data.rows[0].thermal.shape
-    shape = (len(data.rows), len(titles))
+    shape = (len(data.rows), len(plain))
     lines, columns = shape if layout == "rows" else shape[::-1]
     cell = (PAGE - 0.25) / columns
     legend = legend_height(PAGE, len(data.classes))
-    figure = new_figure(PAGE, lines * (cell * height / width + 0.02) + 0.2 + legend)
+    titles = [folded(title, cell if layout == "rows" else cell * height / width) for title in plain]
+    folds = 0.14 * max(title.count("\n") for title in titles) if layout == "rows" else 0.0
+    figure = new_figure(PAGE, lines * (cell * height / width + 0.02) + 0.2 + folds + legend)
     pack(figure)
     grid = figure.subplots(lines, columns, squeeze=False)
     axes = grid if layout == "rows" else grid.T

@@ -17,6 +17,7 @@ from analysis.figures.style import (
     MAP_COLOURS,
     PAGE,
     draw_borders,
+    folded,
     new_figure,
     number,
     show_image,
@@ -102,7 +103,9 @@ def draw_heat(heat: RegionHeat) -> Figure:
     rows = -(-len(heat.profiles) // columns)
     size = COLUMN if columns == 1 else PAGE
     panel = (size - 0.6) / columns
-    figure = new_figure(size, rows * (panel * height / width + 0.2))
+    titles = [folded(f"{each.label} (mIoU {each.miou:.1f})", panel) for each in heat.profiles]
+    lines = 1 + max(title.count("\n") for title in titles)
+    figure = new_figure(size, rows * (panel * height / width + 0.06 + 0.14 * lines) + 0.05)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     places = staircase(heat.region_map, round(NUMBER_WIDTH * width / panel))
     for index, (axes, each) in enumerate(zip(panels, heat.profiles, strict=False)):
@@ -112,7 +115,7 @@ def draw_heat(heat: RegionHeat) -> Figure:
         for place, value in zip(places, each.means, strict=True):
             if place is not None:
                 number(axes, place, "-" if np.isnan(value) else f"{value:.1f}")
-        axes.set_title(f"{each.label} (mIoU {each.miou:.1f})")
+        axes.set_title(titles[index])
     for axes in panels[len(heat.profiles) :]:
         axes.set_axis_off()
     label = "mIoU of the region (%)"

@@ -7,6 +7,7 @@ while something is drawn; `save` keeps text as text in PDF and SVG.
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
@@ -32,6 +33,12 @@ COLUMN, PAGE = 3.4, 7.0
 
 SMALL, NORMAL = 7.0, 8.0
 """Points of the smallest letters (ticks, legends), and of labels and titles."""
+
+LETTERS_PER_INCH = 17
+"""Of labels and titles, on average."""
+
+HANDLE_LETTERS = 7
+"""Letters whose room the line and the gap of a legend's entry take."""
 
 LEGEND_ENTRY = 0.72
 """Inches that a class takes in a legend."""
@@ -227,12 +234,30 @@ def log_axis(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
+def folded(text: str, inches: float) -> str:
+    """`text` on as many lines as it needs to stand within `inches`."""
+    return textwrap.fill(text, max(8, int(inches * LETTERS_PER_INCH)))
+
+
 def series_legend(figure: Figure, axes: Axes, columns: int) -> None:
-    """The legend of one of the panels, below all of them."""
+    """The legend of one of the panels, below all of them; long labels in fewer columns."""
     handles, labels = axes.get_legend_handles_labels()
+    width = figure.get_figwidth()
+    fitting = int(width * LETTERS_PER_INCH / (max(map(len, labels)) + HANDLE_LETTERS))
+    columns = max(1, min(columns, fitting))
+    labels = [folded(label, width - 0.6) for label in labels]
+    lines = -(-len(labels) // columns)
+    figure.set_figheight(figure.get_figheight() + 0.14 * (lines - 1))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.2)
 
 
 def readable(name: str) -> str:
     """A class name as text: "car_stop" -> "car stop"."""
     return name.replace("_", " ")
+
+
+def say_splits(figure: Figure, splits: tuple[str, str]) -> None:
+    """Above the figure, that occupancy and scores are of two splits, where they are."""
+    occupancy, scores = splits
+    if scores and occupancy != scores:
+        figure.suptitle(f"SOR: split {occupancy}; scores: split {scores}", fontsize=SMALL)

@@ -16,6 +16,7 @@ from analysis.figures.style import (
     PAGE,
     new_figure,
     region_axis,
+    say_splits,
     series_legend,
     styled,
 )
@@ -98,8 +99,13 @@ def trend(
 
 
 @styled
-def draw(trends: Sequence[Trend]) -> Figure:
-    """One panel per partition; methods by colour, IoU in full and accuracy in open markers."""
+def draw(trends: Sequence[Trend], splits: tuple[str, str]) -> Figure:
+    """One panel per partition; methods by colour, IoU in full and accuracy in open markers.
+
+    Args:
+        trends: of the partitions.
+        splits: that the occupancy and that the scores are of; shown where they differ.
+    """
     figure = new_figure(PAGE, 2.5)
     panels = figure.subplots(1, len(trends), sharey=True, squeeze=False)[0]
     for index, (axes, each) in enumerate(zip(panels, trends, strict=True)):
@@ -107,6 +113,7 @@ def draw(trends: Sequence[Trend]) -> Figure:
         axes.set_title(f"({'abc'[index]}) {TITLES[each.partition]}")
     panels[0].set_ylabel("change from region 1\n(percent points)")
     series_legend(figure, panels[0], columns=5)
+    say_splits(figure, splits)
     return figure
 
 

@@ -204,6 +204,12 @@ def _like(first: Counts, other: Counts) -> Counts:
             "count both by one partition (rgbt.evaluate regions=..., analysis.score partition=...)."
         )
     if set(other.names) != set(first.names):
+        if not set(other.names) & set(first.names):
+            raise InputError(
+                f"the counts are of different images: such as '{first.names[0]}' (split "
+                f"'{first.split}') and '{other.names[0]}' (split '{other.split}'); score both on "
+                "one split of one data set."
+            )
         only = sorted(set(first.names) ^ set(other.names))
         raise InputError(
             f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "

@@ -41,9 +41,15 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     here = "As trained here, a" if limit else "A"
     return (
         f"{here} difference in {found.metric} between {label_b} and {label_a} is not shown "
-        f"({scores}; {evidence}), {basis}{limit}; with this much, one below about "
-        f"{found.interval.half:.2f}{_unit(found)} cannot be seen."
+        f"({scores}; {evidence}), {basis}{limit}; {_unseen(found, found.interval)}."
     )
+
+
+def _unseen(found: Difference, interval: Interval) -> str:
+    """How large a difference had to be; or that interval and test say two things."""
+    if 0.0 not in interval:
+        return "the interval leaves 0 out, the exchange test does not confirm it"
+    return f"with this much, one below about {interval.half:.2f}{_unit(found)} cannot be seen"
 
 
 def _basis(found: Difference, comparison: Comparison) -> str:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -181,11 +182,21 @@ def test_a_folder_holds_scores_of_one_method(
     assert score(call, *arguments)[0] == 0
     (out / "counts_test.npz").write_text("of a run")
     (out / "counts_ring9.npz").write_text("of an earlier call")
-    code, _, err = score(call, *arguments, "name=other")
+    twin = tmp_path / "elsewhere" / predictions.name  # of the same name
+    shutil.copytree(predictions, twin)
+    code, _, err = score(call, f"predictions={twin}", *arguments[1:])
     assert code == 2
-    assert "holds scores of 'method'; give 'other' a folder of its own" in err
+    assert (
+        f"holds the scores of predictions={predictions} split=test; give predictions={twin}" in err
+    )
+    code, _, err = score(call, f"counts={out}", "resamples=0", f"out={out}")
+    assert code == 2
+    assert f"give counts={out} its own folder" in err
     # The same method again: nothing of the first time is left, and nothing of others is touched.
-    assert score(call, *arguments, "partition=ring", "regions=3")[0] == 0
+    code, _, err = score(call, *arguments, "partition=ring", "regions=3")
+    assert code == 0
+    assert "removed from" in err
+    assert "counts_ring5.npz, counts_ring9.npz, counts_vertical5.npz" in err
     left = {path.name for path in out.glob("*.npz")}
     assert left == {"counts_ring3.npz", "counts_test.npz", "maps.npz"}
 
@@ -252,7 +263,7 @@ def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
     # Another method's scores do not go into the same folder, counted here or elsewhere.
     code, _, err = score(call, "counts=aaa0", f"out={out}", *words)
     assert code == 2
-    assert "holds scores of 'm seed 0, m seed 1'; give 'm' a folder" in err
+    assert "holds the scores of counts=m; give counts=aaa0 its own folder" in err
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_a_class_that_occurs_nowhere_has_no_share_and_is_said_so(tmp_path: Path)
     labels = np.minimum(two_images(), 1)
     data = class_regions(statistics(labels, HALVES, None))
     assert np.isnan(data.shares[1]).all()
-    assert "color cone (none)" in texts(draw(data), tmp_path)
+    assert "color cone (none)" in texts(draw(data, ("test", "test")), tmp_path)
 
 
 def test_miou_of_a_method_over_the_same_regions(tmp_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_miou_of_a_method_over_the_same_regions(tmp_path: Path) -> None:
     method = "CRM-B", counts(matrices, "vertical2")
     data = class_regions(statistics(two_images(), HALVES, None), "all", method)
     np.testing.assert_allclose(data.miou, [62.5, 100])
-    found = texts(draw(data), tmp_path)
+    found = texts(draw(data, ("test", "test")), tmp_path)
     assert {"car", "color cone", "mIoU (CRM-B)"} <= set(found)
 
 
@@ -60,7 +60,9 @@ def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
     data = class_regions(stats, "night", ("CRM-B", known))
     np.testing.assert_allclose(data.miou, [100, 100])
     np.testing.assert_allclose(class_regions(stats, "day", ("CRM-B", known)).miou, [62.5, 62.5])
-    assert "region (vertical2); images of the night" in texts(draw(data), tmp_path)
+    assert "region (vertical2); images of the night" in texts(
+        draw(data, ("test", "test")), tmp_path
+    )
     for night in (None, (False, False)):
         with pytest.raises(InputError, match="counts of 'CRM-B' hold no image of the night"):
             class_regions(stats, "night", ("CRM-B", replace(by_day, night=night)))

@@ -14,6 +14,7 @@ import pytest
 from analysis.figures.__main__ import OF_FIGURES, OWN, main
 from analysis.figures.catalogue import FIGURES
 from analysis.predictions.scoring import Options, score_folder
+from analysis.statistics.data import SpatialStatistics
 from rgbt.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
@@ -44,7 +45,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         scored.maps.save(folder / method / "maps.npz")
     labels = np.random.default_rng(0).integers(0, 3, (20, 64, 96), dtype=np.uint8)
     night = np.arange(20) % 2 == 0
-    statistics(labels, strips(5, "ring"), night).save(folder / "statistics.npz")
+    measured = statistics(labels, strips(5, "ring"), night)
+    replace(measured, fingerprint=dataset.fingerprint()).save(folder / "statistics.npz")
     (folder / "scores.csv").write_text("class,variant,tc,ca\ncar,(G),60,50\n")
     return folder
 
@@ -326,3 +328,16 @@ def test_a_file_in_the_place_of_a_folder_is_told_before_drawing(call: Call, tmp_
     code, _, err = call(ENTRY, "figure=multihead/fig3", f"out={out}")
     assert code == 2
     assert "is a file; give a folder" in err
+
+
+@pytest.mark.parametrize("figure", ["spatialseg/fig2", "spatialseg/fig3"])
+def test_statistics_of_another_data_set_are_refused(
+    call: Call, made: Path, tmp_path: Path, figure: str
+) -> None:
+    other = replace(SpatialStatistics.load(made / "statistics.npz"), fingerprint="other")
+    other.save(tmp_path / "statistics.npz")
+    words = [word for word in arguments(figure, made) if not word.startswith("statistics")]
+    words.append(f"statistics={tmp_path}")
+    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
+    assert code == 2
+    assert "the scores of another data set" in err

@@ -56,6 +56,7 @@ def test_draws_three_panels_and_five_series(tmp_path: Path) -> None:
         )
         for each in ("vertical", "horizontal", "ring")
     ]
-    found = texts(draw(series), tmp_path)
+    found = texts(draw(series, ("train", "test")), tmp_path)
+    assert "SOR: split train; scores: split test" in found
     assert {"IoU (CRM (B))", "Acc (CRM (B))", "IoU (RTF)", "Acc (RTF)", "SOR"} <= set(found)
     assert "(c) rings (inside to outside)" in found
