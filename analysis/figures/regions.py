@@ -103,7 +103,7 @@ def draw_heat(heat: RegionHeat) -> Figure:
     rows = -(-len(heat.profiles) // columns)
     size = COLUMN if columns == 1 else PAGE
     panel = (size - 0.6) / columns
-    titles = [folded(f"{each.label} (mIoU {each.miou:.1f})", panel) for each in heat.profiles]
+    titles = [f"{folded(each.label, panel - 0.2)}\nmIoU {each.miou:.1f}" for each in heat.profiles]
     lines = 1 + max(title.count("\n") for title in titles)
     figure = new_figure(size, rows * (panel * height / width + 0.06 + 0.14 * lines) + 0.05)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()

@@ -273,7 +273,7 @@ def test_commas_in_brackets_belong_to_the_name(call: Call, made: Path, tmp_path:
     runs = f"CRM [1,2]:{folder}, {other}"
     code, _, err = call(ENTRY, "figure=regions/heat", f"out={out}", f"runs={runs}")
     assert code == 0, err
-    assert "CRM [1,2] (mIoU" in out.read_text()
+    assert "CRM [1,2]" in out.read_text()
 
 
 def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ function tiles(run) {
   const commitNames = unique(DATA.runs.map((each) => each.commit.replace("+", ""))).filter(Boolean);
   const word = (things, name) => (things.length === 1 ? name : `${name}s`);
   const entries = [
-    [DATA.runs.length, word(DATA.runs, "run"), finished === DATA.runs.length ? "all finished" : `${finished} finished`, "runs"],
+    [DATA.runs.length, word(DATA.runs, "run"), !DATA.runs.length ? "none yet" : finished === DATA.runs.length ? "all finished" : `${finished} finished`, "runs"],
     [run.length, `${word(run, "table")} with runs`, `of ${DATA.tables.length} tables`, "tables"],
     [DATA.studies.length, DATA.studies.length === 1 ? "study" : "studies", plural(trials, "trial"), "searches"],
     [commitNames.length, word(commitNames, "commit"), commitRemark(), "commits"],
