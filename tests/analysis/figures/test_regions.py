@@ -111,7 +111,7 @@ def test_draws_values_names_and_what_the_intervals_cover(tmp_path: Path) -> None
     for number in (2, 3):
         found = texts(draw_profiles(profiles[:number]), tmp_path)
         assert {"95 % intervals over images", "1 seed, 40 images", "region (ring2)"} <= set(found)
-        assert f"mIoU {profiles[1].miou:.1f}" in found
+        assert f"m1 (mIoU {profiles[1].miou:.1f})" in found
 
 
 def test_undefined_regions_are_drawn_as_a_dash(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ function tiles(run) {
   const commitNames = unique(DATA.runs.map((each) => each.commit.replace("+", ""))).filter(Boolean);
   const word = (things, name) => (things.length === 1 ? name : `${name}s`);
   const entries = [
-    [DATA.runs.length, word(DATA.runs, "run"), !DATA.runs.length ? "none yet" : finished === DATA.runs.length ? "all finished" : `${finished} finished`, "runs"],
+    [DATA.runs.length, word(DATA.runs, "run"), finishedRemark(finished), "runs"],
     [run.length, `${word(run, "table")} with runs`, `of ${DATA.tables.length} tables`, "tables"],
     [DATA.studies.length, DATA.studies.length === 1 ? "study" : "studies", plural(trials, "trial"), "searches"],
     [commitNames.length, word(commitNames, "commit"), commitRemark(), "commits"],
@@ -37,6 +37,11 @@ function tiles(run) {
   ];
   return el("div", { class: "tiles" }, entries.map(([value, name, more, target]) =>
     el("a", { class: "tile", href: `#${target}` }, el("strong", {}, String(value)), el("span", {}, name), el("small", {}, more))));
+}
+
+function finishedRemark(finished) {
+  if (!DATA.runs.length) return "none yet";
+  return finished === DATA.runs.length ? "all finished" : `${finished} finished`;
 }
 
 function commitRemark() {
