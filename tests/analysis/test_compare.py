@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.compare import OWN, main, settings_of
+from analysis.compare import OWN, comparison_csv, main, metrics_of, settings_of
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
 from rgbt.command import plain_command
@@ -282,3 +283,19 @@ def test_help_is_light():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "missing   refuse, or leave_out" in done.stdout
+
+
+def test_csv_tells_the_trainings_of_each():
+    a, b = pair()
+    (found,) = csv.DictReader(
+        io.StringIO(comparison_csv(compare([a, b], [b], ["mIoU"], Resampling(resamples=100))))
+    )
+    assert (found["seeds_a"], found["seeds_b"]) == ("2", "1")
+
+
+@pytest.mark.parametrize(("nights", "expected"), [(9, False), (10, True)])
+def test_auto_takes_parts_of_ten_images(nights: int, expected: bool):
+    a, _ = pair()
+    told = replace(a, night=tuple(index < nights for index in range(len(a.names))))
+    metrics = metrics_of("auto", [told], Resampling())
+    assert ("night/mIoU" in metrics) == expected

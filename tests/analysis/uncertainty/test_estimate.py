@@ -240,3 +240,13 @@ def test_no_such_metric(metric: str, sentence: str):
 def test_settings_out_of_range(changes, sentence: str):
     with pytest.raises(InputError, match=sentence):
         Resampling(**changes)
+
+
+def test_no_score_is_below_zero():
+    """Two trainings whose variance over regions differs by much: Student's interval is cut."""
+    wide = [drawn(trainings=1, tilt=tilt)[0] for tilt in (0.1, 0.9)]
+    found = estimate(wide, ["Var"], SETTINGS)["Var"]
+    assert found.trainings is not None
+    assert found.both is not None
+    assert found.value - stats.t.ppf(0.975, 1) * found.sd / math.sqrt(2) < 0
+    assert (found.trainings.low, found.both.low) == (0.0, 0.0)

@@ -10,7 +10,7 @@ import pytest
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty import images as room
-from analysis.uncertainty.images import Images, common, prepare
+from analysis.uncertainty.images import Images, _influence, common, prepare
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
@@ -345,3 +345,15 @@ def test_no_image_common_to_all_of_three():
 
 def test_classes_are_those_of_the_population():
     assert prepare([drawn(12, 1)], ASKED[0], FEW).classes == CLASSES
+
+
+def test_blocks_are_made_for_accuracy_and_miou_of_both_methods_and_their_difference():
+    """Rows: scores of the first method, of the second, and second less first."""
+    arrays = Population().pair(np.random.default_rng(0), 12, 1, Population(skill=2.0))
+    methods = [[counts_of(each[0])] for each in arrays]
+    single = prepare(methods, ASKED[0], replace(FEW, blocks="none"))
+    auto = replace(single, settings=replace(single.settings, blocks="auto"))
+    rows = _influence(auto)
+    first, second = auto.without_each([parse("mIoU"), parse("pixel_accuracy")])
+    assert rows.shape == (6, 12)
+    np.testing.assert_allclose(rows, np.concatenate([first, second, second - first]))
