@@ -114,7 +114,7 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     if long_run <= 0:
         return 1
     length = (2.0 * slope**2 / (4.0 / 3.0 * long_run**2)) ** (1 / 3) * count ** (1 / 3)
-    return max(1, math.ceil(length))
+    return max(1, math.ceil(float(length)))
 
 
 def _last_correlated(correlations: NDArray[np.float64], count: int) -> int:

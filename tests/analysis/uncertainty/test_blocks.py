@@ -60,7 +60,7 @@ def politis_white(series: np.ndarray) -> int:
         return 1
     d_hat = 4 / 3 * g_zero**2
     length = (2 * g_hat**2 / d_hat) ** (1 / 3) * n ** (1 / 3)
-    return int(min(max(1, math.ceil(length)), n // 3))
+    return max(1, math.ceil(length))
 
 
 @pytest.mark.parametrize("keeps", [0.0, 0.3, 0.6, 0.9, -0.5])
