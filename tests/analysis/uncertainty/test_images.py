@@ -313,7 +313,7 @@ def test_other_predictions_of_the_same_labels_are_no_other_labels():
     a, b = drawn(12, 2)
     changed = b.counts.copy()
     changed[7, 1, 0] = np.roll(changed[7, 1, 0], 1)
-    prepare([[a], [replace(b, counts=changed)]], ASKED[0], FEW)
+    assert prepare([[a], [replace(b, counts=changed)]], ASKED[0], FEW).images == 12
 
 
 # What both hold.
