@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.arguments import blocks_of, decimal, out_folder, refuse_others, whole
+from analysis.arguments import MOST, blocks_of, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 
@@ -88,7 +88,7 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     """
     from typing import cast
 
-    from analysis.uncertainty.settings import MOST, Method, Resampling
+    from analysis.uncertainty.settings import Method, Resampling
     from rgbt.metrics.metric import Absent
 
     return Resampling(

@@ -20,6 +20,7 @@ from analysis.arguments import (
     refuse_others,
     whole,
 )
+from analysis.bar import progress
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
@@ -129,19 +130,15 @@ def score_tables(
     Raises:
         InputError: blocks that cannot be made of these images.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     from analysis.predictions.table import score_table
 
     tables = [score_table(counts, name) for name, counts in counted]
     if settings is None:
         return tables
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("resampling", total=len(tables))
+    with progress("resampling", len(tables)) as advance:
         for index, (_, counts) in enumerate(counted):
             tables[index] = _with_intervals(tables[index], counts, settings)
-            progress.advance(task)
+            advance()
     return tables
 
 
@@ -211,17 +208,13 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
 
 def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from analysis.predictions.scoring import score_folder
 
     refuse_others(overrides, ("dataset",), list(OWN))
     dataset, options = dataset_of(overrides), _options(arguments)
     folder, split = Path(arguments["predictions"]), arguments["split"] or "test"
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("counting", total=len(dataset.names(split)))
-        return score_folder(folder, dataset, split, options, lambda: progress.advance(task))
+    with progress("counting", len(dataset.names(split))) as advance:
+        return score_folder(folder, dataset, split, options, advance)
 
 
 def _options(arguments: dict[str, str]) -> Options:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from analysis.arguments import MOST, dataset_of, decimal, out_folder, refuse_others, whole
+from analysis.bar import progress
 from rgbt.checks import InputError, check_choice
 from rgbt.command import built, plain_command
 
@@ -119,16 +120,12 @@ def _regions(values: dict[str, str]) -> Regions:
 
 
 def _collect(dataset: DataSet, split: str, settings: Settings) -> SpatialStatistics:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from analysis.statistics.collect import collect
     from rgbt.tracking.terminal import tell
 
     left_out: list[str] = []
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("measuring", total=len(dataset.names(split)))
-        stats = collect(dataset, split, settings, lambda: progress.advance(task), left_out.append)
+    with progress("measuring", len(dataset.names(split))) as advance:
+        stats = collect(dataset, split, settings, advance, left_out.append)
     for sentence in sorted(left_out):
         tell(f"left out: {sentence}")
     return stats

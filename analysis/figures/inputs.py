@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.arguments import MOST, decimal, whole
+from analysis.bar import progress
 from rgbt.checks import InputError, check_choice, nearest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from omegaconf import DictConfig
 
     from analysis.predictions.maps import PixelMaps
@@ -296,17 +294,6 @@ def open_counts_file(place: Path, partition: str) -> Counts:
             "partition with python -m analysis.score."
         )
     return Counts.load(path)
-
-
-@contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar on stderr; yields what to call after each of `total` steps."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda: bar.advance(task)
 
 
 def _file(text: str, name: str) -> Path:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from analysis.arguments import blocks_of
-from analysis.figures.inputs import Given, check_same_images, progress
+from analysis.bar import progress
+from analysis.figures.inputs import Given, check_same_images
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:

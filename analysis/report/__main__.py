@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from analysis.arguments import out_folder, refuse_others, whole
+from analysis.arguments import MOST, out_folder, refuse_others, whole
 from rgbt.checks import InputError
 from rgbt.command import built, plain_command, readable_paths
 
 OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000"}
 
-FEWEST, MOST = 100, 1_000_000
+FEWEST = 100
 """Resamples."""
 
 TOLD = 5
