@@ -114,6 +114,21 @@ class Output(NamedTuple):
     aux: dict[str, Tensor]
 
 
+class Frame(NamedTuple):
+    """One of two frames of a scene in a training step (`rgbt.schemes.temporal`).
+
+    Attributes:
+        output: what the network returned for it.
+        batch: its images and labels.
+        logits: (B, K, H, W) float, dense class scores whose softmax are class probabilities; also
+            for networks that return masks and classes of queries.
+    """
+
+    output: Output
+    batch: Batch
+    logits: Tensor
+
+
 class Phase(NamedTuple):
     """One backward pass and optimiser step: optimiser name and named, weighted loss parts."""
 

@@ -17,8 +17,8 @@ from rgbt.checks import InputError, nearest
 Choice = str | int | float | bool | None | tuple["Choice", ...]
 """What a parameter can be; lists of the file are tuples here."""
 
-_RANGE = ("type", "low", "high", "step", "log", "when", "needs")
-KEYS = {"float": _RANGE, "int": _RANGE, "categorical": ("type", "choices", "when", "needs")}
+_RANGE = ("type", "low", "high", "step", "log", "when")
+KEYS = {"float": _RANGE, "int": _RANGE, "categorical": ("type", "choices", "when")}
 """Keys of an entry, by its type."""
 
 
@@ -63,11 +63,11 @@ def read_entry(key: str, entry: Any, earlier: Mapping[str, Parameter]) -> Parame
     Args:
         key: of the entry.
         entry: mapping with the keys of `KEYS`. ``when`` maps earlier keys to a value or a list of
-            values. ``needs`` says what must be built before the parameter can be searched.
+            values.
         earlier: parameters above it, by key.
 
     Raises:
-        InputError: the first mistake, or what the entry needs.
+        InputError: the first mistake.
     """
     if not _is_key(key):
         raise _wrong(key, "expected a key as it stands before the = of an override")
@@ -82,10 +82,7 @@ def read_entry(key: str, entry: Any, earlier: Mapping[str, Parameter]) -> Parame
         if name not in KEYS[kind]:
             raise _wrong(key, f"'{name}' is no key of type {kind}; {nearest(name, KEYS[kind])}")
     values = _choices(key, entry) if kind == "categorical" else _range(key, kind, entry)
-    parameter = Parameter(key=key, type=kind, when=_conditions(key, entry, earlier), **values)
-    if entry.get("needs") is not None:
-        raise _wrong(key, f"cannot be searched yet, it needs {entry['needs']}")
-    return parameter
+    return Parameter(key=key, type=kind, when=_conditions(key, entry, earlier), **values)
 
 
 def _wrong(key: str, what: str) -> InputError:

@@ -8,7 +8,6 @@ import hydra
 import pytest
 from omegaconf import DictConfig
 
-from rgbt.checks import InputError
 from rgbt.config import check, conf_dir, flatten, register_resolvers
 from sweeps.settings import read_settings
 from sweeps.space.samplers import build_pruner, build_sampler
@@ -16,8 +15,6 @@ from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, pla
 from tests.models.golden import compose
 
 FILES = sorted(path.stem for path in (conf_dir() / "search").glob("*.yaml"))
-UNBUILT = {"temporal"}
-"""Searches whose parameters do not exist yet."""
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -52,7 +49,7 @@ def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None
     build_pruner(pruner.pop("kind"), pruner, objectives)
 
 
-@pytest.mark.parametrize("name", sorted(set(FILES) - UNBUILT))
+@pytest.mark.parametrize("name", FILES)
 def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
     known = flatten(compose(f"+search={name}"))
     parameters = parse_space(space_of(name))
@@ -66,15 +63,6 @@ def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
             assert str(value).startswith("${px:") or values[key] == value
 
 
-@pytest.mark.parametrize("name", sorted(UNBUILT))
-def test_what_does_not_exist_yet_is_said_and_its_data_are_sound(name: str) -> None:
-    space = space_of(name)
-    with pytest.raises(InputError, match="cannot be searched yet, it needs the scheme of"):
-        parse_space(space)
-    data = {key: {k: v for k, v in entry.items() if k != "needs"} for key, entry in space.items()}
-    assert [(one.low, one.high) for one in parse_space(data)] == [(0.5, 2.0), (0.5, 2.0)]
-
-
 def test_ranges_hold_the_published_values() -> None:
     """SpatialSeg, Tables III, IV, V, and the weights of both releases."""
     sigma, patch, alpha = parse_space(space_of("grbm"))
@@ -84,6 +72,8 @@ def test_ranges_hold_the_published_values() -> None:
     published = {one.key: one.choices for one in parse_space(space_of("grbm_discrete"))}
     assert published["masker.sigma_div"] == (1, 2, 4, 8, 16, 32)
     assert published["loss.spatial.alpha"] == (0, 1, 1.5, 2, 2.5, 3)
+    # Temporal, Table III: 0.5, 1 and 2 for both.
+    assert [(one.low, one.high) for one in parse_space(space_of("temporal"))] == [(0.5, 2.0)] * 2
     released = flatten(compose("+experiment=crm"))
     for parameter in parse_space(space_of("loss")):
         assert parameter.low < released[parameter.key] < parameter.high

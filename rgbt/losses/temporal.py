@@ -1,0 +1,128 @@
+"""What two frames of a scene cost together (Temporal, Eq. 4).
+
+How the second frame is made and how the first prediction is brought into it is not known here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.losses.consistency import con, con_acc
+from rgbt.losses.dice import Form, dice, single
+from rgbt.types import IGNORE, Frame, Loss
+
+Second = Literal["none", "dice", "con", "con_acc"]
+"""What the second frame costs beside its segmentation loss."""
+
+OWN = ("dice", "con", "con_acc")
+
+
+class TemporalLoss:
+    """Segmentation of both frames, Dice of the first, and Dice or consistency of the second.
+
+        L = seg_1 + alpha dice_1 + seg_2 + beta X
+
+    Source: Temporal, Eq. (4) with X = con; Table I for the other X, and for what is left out.
+    Released: alpha = beta = 1; X is dice, con or con_acc.
+
+    Args:
+        segmentation: seg, of each frame by itself. Paper and released: cross-entropy.
+        alpha: finite, >= 0; with 0, the Dice loss of the first frame is not computed.
+        beta: finite, >= 0; 0 if and only if `second` is "none".
+        second: X: Dice loss of the second frame (`rgbt.losses.dice`), or the first prediction
+            against the second (`rgbt.losses.consistency`).
+        form: of the Dice and the consistency losses, see there.
+
+    Attributes:
+        reads: what `segmentation` reads; None where it does not say.
+        reads_warped: whether X compares the second frame with the first.
+
+    Raises:
+        InputError: a coefficient out of its range; a beta without a loss, a loss without a beta.
+    """
+
+    def __init__(
+        self, *, segmentation: Loss, alpha: float, beta: float, second: Second, form: Form
+    ) -> None:
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not 0 <= value < math.inf:
+                raise InputError(f"loss.{name} must be finite and at least 0, got {value:g}.")
+        if second == "none" and beta:
+            raise InputError(
+                f"loss.beta={beta:g} weighs nothing with loss.second=none; set loss.beta=0, or "
+                "choose loss.second=dice, con or con_acc."
+            )
+        if second != "none" and not beta:
+            raise InputError(
+                f"loss.beta=0 leaves nothing of loss.second={second}; set loss.second=none, or a "
+                "loss.beta above 0."
+            )
+        self.segmentation = segmentation
+        self.alpha = alpha
+        self.beta = beta
+        self.second = second
+        self.form: Form = form
+        self.reads = getattr(segmentation, "reads", None)
+        self.reads_warped = second in ("con", "con_acc")
+
+    def __call__(
+        self,
+        first: Frame,
+        second: Frame,
+        warped: Tensor | None,
+        valid: Tensor,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        """The weighted parts, which add up to L.
+
+        Args:
+            first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
+            second: frame 2, of the same sizes.
+            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; what `reads_warped`
+                asks for. Whether a gradient goes through it is for the caller to decide.
+            valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
+                "con" and "con_acc".
+            generator: of the segmentation loss, frame 1 first.
+
+        Returns:
+            name -> () float32: the parts of the segmentation loss, passes summed, as <part>_1 and
+            <part>_2 (seg_dice_1 where it has a dice of its own); "dice_1"; "dice_2", "con" or
+            "con_acc".
+
+        Raises:
+            InputError: a network that `segmentation` cannot read.
+            ValueError: shapes that do not fit; no `warped` where it is read.
+        """
+        parts = {}
+        for number, frame in ((1, first), (2, second)):
+            found = self.segmentation(frame.output, frame.batch, generator)
+            for name, values in found.items():
+                parts[f"{'seg_' * (name in OWN)}{name}_{number}"] = values.sum()
+        if self.alpha:
+            parts["dice_1"] = self.alpha * self._dice(first)
+        if self.second == "dice":
+            parts["dice_2"] = self.beta * self._dice(second)
+        elif self.reads_warped:
+            parts[self.second] = self.beta * self._against(second, warped, valid)
+        return parts
+
+    def _dice(self, frame: Frame) -> Tensor:
+        return dice(_probabilities(frame), frame.batch.label, self.form)
+
+    def _against(self, second: Frame, warped: Tensor | None, valid: Tensor) -> Tensor:
+        if warped is None:
+            raise ValueError(f"warped: needed for the part {self.second}, got None.")
+        probabilities = _probabilities(second)
+        if self.second == "con":
+            return con(warped, probabilities, valid, self.form)
+        label = second.batch.label.where(valid, IGNORE)
+        return con_acc(warped, probabilities, label, self.form)
+
+
+def _probabilities(frame: Frame) -> Tensor:
+    return single(frame.logits).softmax(1)

@@ -1,0 +1,320 @@
+"""The loss of two frames: by its parts, against the release, and as the configuration builds it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.config import build, check_node
+from rgbt.losses import temporal as module
+from rgbt.losses.consistency import con, con_acc
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.dice import dice
+from rgbt.losses.temporal import TemporalLoss
+from rgbt.types import Frame, Output
+from tests.models.golden import FOLDER, compose, requires_golden
+
+NOTHING = torch.Generator()
+
+
+def loss_of(**changes: Any) -> TemporalLoss:
+    settings: dict[str, Any] = {
+        "segmentation": CrossEntropy(class_weights=None),
+        "alpha": 1.0,
+        "beta": 1.0,
+        "second": "con",
+        "form": "paper",
+    }
+    return TemporalLoss(**(settings | changes))
+
+
+@pytest.fixture
+def frames(make_batch: Any) -> tuple[Frame, Frame, Tensor, Tensor]:
+    """Two frames of two images and four classes, the first as the second sees it, what it sees."""
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(3, 2, 4, 6, 7, generator=generator)
+    labels = torch.randint(0, 4, (2, 2, 6, 7), generator=generator)
+    labels[:, 0, 0] = 255
+
+    def frame(i: int) -> Frame:
+        scores = logits[i].clone().requires_grad_()
+        return Frame(Output(scores, {}), make_batch(labels[i]), scores)
+
+    valid = torch.rand(2, 6, 7, generator=generator) < 0.8
+    return frame(0), frame(1), logits[2].softmax(1), valid
+
+
+TABLE_1 = {  # Temporal, Table I: alpha, beta, second -> parts beside the two cross-entropies
+    "B": (0, 0, "none", []),
+    "C": (0, 1, "dice", ["dice_2"]),
+    "D": (0, 1, "con", ["con"]),
+    "E": (0, 1, "con_acc", ["con_acc"]),
+    "F": (1, 0, "none", ["dice_1"]),
+    "G": (1, 1, "dice", ["dice_1", "dice_2"]),
+    "H": (1, 1, "con", ["dice_1", "con"]),
+    "I": (1, 1, "con_acc", ["dice_1", "con_acc"]),
+}
+
+
+@pytest.mark.parametrize("variant", TABLE_1)
+def test_the_variants_of_table_1(variant: str, frames: Any) -> None:
+    alpha, beta, second, names = TABLE_1[variant]
+    loss = loss_of(alpha=alpha, beta=beta, second=second)
+    assert loss.reads_warped == (second in ("con", "con_acc"))
+    first, other, warped, valid = frames
+    parts = loss(first, other, warped if loss.reads_warped else None, valid, NOTHING)
+    assert list(parts) == ["cross_entropy_1", "cross_entropy_2", *names]
+    for part in parts.values():
+        assert part.shape == ()
+        assert part > 0
+    torch.stack(list(parts.values())).sum().backward()
+    for frame in (first, other):
+        assert frame.logits.grad is not None
+        assert frame.logits.grad.any()
+
+
+@pytest.mark.parametrize("form", ["paper", "released"])
+def test_values(form: Any, frames: Any) -> None:
+    first, second, warped, valid = frames
+    p1, p2 = first.logits.softmax(1), second.logits.softmax(1)
+    label = second.batch.label.masked_fill(~valid, 255)  # what frame 1 does not show
+    expected = {
+        "dice": dice(p2, second.batch.label, form),
+        "con": con(warped, p2, valid, form),
+        "con_acc": con_acc(warped, p2, label, form),
+    }
+    for name, value in expected.items():
+        loss = loss_of(alpha=0.5, beta=2.0, second=name, form=form)
+        parts = loss(first, second, warped, valid, NOTHING)
+        assert torch.equal(parts["dice_2" if name == "dice" else name], 2 * value)
+        assert torch.equal(parts["dice_1"], 0.5 * dice(p1, first.batch.label, form))
+        for number, frame in ((1, first), (2, second)):
+            seg = F.cross_entropy(frame.logits, frame.batch.label, ignore_index=255)
+            assert torch.allclose(parts[f"cross_entropy_{number}"], seg)
+
+
+def test_without_alpha_no_dice_is_computed(frames: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "dice", None)
+    first, second, warped, valid = frames
+    assert "con" in loss_of(alpha=0.0)(first, second, warped, valid, NOTHING)
+
+
+def test_a_gradient_reaches_the_first_frame_through_the_warp(frames: Any) -> None:
+    first, second, _, valid = frames
+    warped = first.logits.softmax(1).flip(3)
+    parts = loss_of()(first, second, warped, valid, NOTHING)
+    (gradient,) = torch.autograd.grad(parts["con"], first.logits)
+    assert gradient.any()
+
+
+def test_half_precision_logits(frames: Any) -> None:
+    first, second, warped, valid = frames
+    half = [frame._replace(logits=frame.logits.detach().bfloat16()) for frame in (first, second)]
+    single = [frame._replace(logits=frame.logits.float()) for frame in half]
+    for name in ("dice", "con", "con_acc"):
+        loss = loss_of(second=name)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = loss(*half, warped.bfloat16(), valid, NOTHING)
+        expected = loss(*single, warped.bfloat16().float(), valid, NOTHING)
+        for key, part in found.items():
+            assert part.dtype == torch.float32
+            assert torch.equal(part, expected[key]), key
+
+
+def test_masks_of_queries(make_problem: Any, make_criterion: Any) -> None:
+    criterion, generator = make_criterion(), torch.Generator().manual_seed(3)
+    frames = []
+    for seed in (0, 1):
+        output, batch = make_problem(3, 1, 2, seed=seed)
+        logits = torch.randn(2, 5, *batch.label.shape[1:], generator=generator)
+        frames.append(Frame(output, batch, logits))
+    valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
+    loss = loss_of(segmentation=criterion)
+    assert loss.reads == "masks"
+    warped = frames[0].logits.softmax(1)
+    parts = loss(*frames, warped, valid, torch.Generator().manual_seed(5))
+    # The set criterion has a dice of its own.
+    segmentation = ["class_1", "mask_1", "seg_dice_1", "class_2", "mask_2", "seg_dice_2"]
+    assert list(parts) == [*segmentation, "dice_1", "con"]
+    generator = torch.Generator().manual_seed(5)
+    alone = [criterion(frame.output, frame.batch, generator) for frame in frames]
+    expected = [values.sum() for each in alone for values in each.values()]
+    assert torch.equal(torch.stack([parts[name] for name in segmentation]), torch.stack(expected))
+
+
+def test_passes_are_summed(frames: Any) -> None:
+    def two_passes(*_: Any) -> dict[str, Tensor]:
+        return {"some": torch.tensor([1.0, 2.0])}
+
+    loss = loss_of(segmentation=two_passes, alpha=0.0, beta=0.0, second="none")
+    assert loss.reads is None
+    first, second, _, valid = frames
+    parts = loss(first, second, None, valid, NOTHING)
+    assert parts == {"some_1": torch.tensor(3.0), "some_2": torch.tensor(3.0)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"alpha": -0.5}, r"^loss\.alpha must be finite and at least 0, got -0\.5\.$"),
+        ({"alpha": float("nan")}, r"^loss\.alpha .* got nan\.$"),
+        ({"beta": float("inf")}, r"^loss\.beta .* got inf\.$"),
+        ({"second": "none"}, r"^loss\.beta=1 .* loss\.second=none; set loss\.beta=0"),
+        ({"beta": 0.0}, r"^loss\.beta=0 .* loss\.second=con; set loss\.second=none"),
+    ],
+)
+def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        loss_of(**changes)
+
+
+def test_raises(frames: Any) -> None:
+    first, second, warped, valid = frames
+    with pytest.raises(ValueError, match="warped: needed for the part con"):
+        loss_of()(first, second, None, valid, NOTHING)
+    with pytest.raises(ValueError, match="warped"):
+        loss_of()(first, second, warped[:, :, 1:], valid, NOTHING)
+
+
+def built(*overrides: str) -> TemporalLoss:
+    node = compose(*overrides).loss
+    check_node(node, "loss")
+    loss = build(node)
+    assert isinstance(loss, TemporalLoss)
+    return loss
+
+
+@pytest.mark.parametrize("form", ["paper", "released"])
+def test_the_files_build(form: str) -> None:
+    loss = built(f"loss=temporal_{form}")
+    found = (loss.alpha, loss.beta, loss.second, loss.form, loss.reads, loss.reads_warped)
+    assert found == (1.0, 1.0, "con", form, "scores", True)
+    loss = built(f"loss=temporal_{form}", "loss.alpha=0.5", "loss.beta=0", "loss.second=none")
+    assert (loss.alpha, loss.beta, loss.second, loss.reads_warped) == (0.5, 0, "none", False)
+
+
+@pytest.mark.parametrize("criterion", ["set_criterion", "set_criterion_spatial"])
+@pytest.mark.parametrize("form", ["paper", "released"])
+def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> None:
+    config = compose(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
+    loss = built(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
+    assert loss.reads == build(config.model).predicts == "masks"
+    assert config.loss.segmentation == compose(f"loss={criterion}").loss
+
+
+@pytest.mark.parametrize(
+    "wrong", ["loss.second=concc", "loss.form=printed", "loss.alpha=much", "loss.gamma=1"]
+)
+def test_unknown_words_name_their_key(wrong: str) -> None:
+    key, _ = wrong.split("=")
+    with pytest.raises(InputError, match=f"^'{key}'"):
+        check_node(compose("loss=temporal_paper", f"++{wrong}").loss, "loss")
+
+
+class Recorded:
+    """One case of the release: inputs by recipe, stored results."""
+
+    def __init__(self, name: str, make_batch: Callable[..., Any]) -> None:
+        spec = importlib.util.spec_from_file_location("fill", FOLDER / "fill.py")
+        assert spec is not None
+        assert spec.loader is not None
+        self.fill = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(self.fill)
+        facts = json.loads((FOLDER / "losses.json").read_text())
+        recipe = facts["recipes"]["temporal_loss"][name]
+        self.name, self.arrays = name, np.load(FOLDER / "losses.npz")
+        self.about = facts["outputs"]
+        logits = [
+            torch.from_numpy(recipe["logit_scale"] * self.fill.normal(seed, recipe["shape"]))
+            for seed in recipe["logit_seeds"]
+        ]
+        height, width = recipe["shape"][2:]
+        labels = [
+            np.stack(
+                [
+                    self.fill.labels(seed, height, width, classes, recipe["cell"])
+                    for seed, classes in zip(seeds, recipe["classes"], strict=True)
+                ]
+            )
+            for seeds in recipe["label_seeds"]
+        ]
+        for number, label in enumerate(labels, 1):
+            assert self.deviation(f"labels{number}", label) == 0
+        self.frames = [
+            Frame(Output(scores, {}), make_batch(torch.from_numpy(label)), scores)
+            for scores, label in zip((x.requires_grad_() for x in logits), labels, strict=False)
+        ]
+        self.warped = logits[2].softmax(1)
+
+    def deviation(self, key: str, found: Any) -> float:
+        """Largest difference from what is stored."""
+        key = f"temporal_loss.{self.name}.{key}"
+        value = np.asarray(found)
+        if self.about[key]["stored"] == "sampled":
+            count = self.about[key]["count"]
+            value = value.ravel()[self.fill.sample_positions(key, value.size, count)]
+        return float(np.abs(value - self.arrays[key].astype(value.dtype)).max())
+
+
+@requires_golden
+@pytest.mark.parametrize("name", ["soft", "peaked", "background_only"])
+def test_released_values_and_gradients(name: str, make_batch: Any) -> None:
+    case = Recorded(name, make_batch)
+    first, second = case.frames
+    valid = torch.ones_like(second.batch.label, dtype=torch.bool)
+    for which in ("dice", "con", "con_acc"):
+        loss = loss_of(second=which, form="released")
+        parts = loss(first, second, case.warped.detach(), valid, NOTHING)
+        own = "dice_2" if which == "dice" else which
+        values = {"ce1": "cross_entropy_1", "ce2": "cross_entropy_2", "dice1": "dice_1"}
+        values[own.replace("_2", "2")] = own
+        if which != "dice":
+            values[f"{which}_from_probabilities"] = which
+        for key, part in values.items():
+            assert case.deviation(key, parts[part].detach()) <= 1e-5, key
+        part, frame = ("dice_1", first) if which == "dice" else (which, second)
+        (gradient,) = torch.autograd.grad(parts[part], frame.logits)
+        assert case.deviation(f"grad.{part.replace('_1', '1')}", gradient) <= 5e-10
+
+
+def test_printed_numbers_of_a_small_case(make_batch: Any) -> None:
+    """Nine classes, 2x3 pixels; numbers computed with the released modules (paper: by formula)."""
+    c, y, x = torch.meshgrid(
+        *(torch.arange(n, dtype=torch.float64) for n in (9, 2, 3)), indexing="ij"
+    )
+    logits = [
+        torch.sin(c + 0.7 * y + 0.3 * x)[None],
+        torch.cos(0.5 * c - 0.4 * y + 0.9 * x)[None],
+    ]
+    batch = make_batch(torch.tensor([[[0, 1, 2], [2, 0, 4]]]))
+    first, second = (Frame(Output(scores, {}), batch, scores) for scores in logits)
+    valid = torch.ones(1, 2, 3, dtype=torch.bool)
+
+    def found(which: str, form: str) -> dict[str, Tensor]:
+        loss = loss_of(second=which, form=form)
+        return loss(first, second, first.logits.softmax(1), valid, NOTHING)
+
+    released = found("dice", "released") | found("con", "released") | found("con_acc", "released")
+    expected = {
+        "cross_entropy_1": 2.288202,
+        "cross_entropy_2": 2.019732,
+        "dice_1": 0.281165,
+        "dice_2": 0.279143,
+        "con": 0.892285,
+        "con_acc": 0.325286,
+    }
+    assert {key: part.item() for key, part in released.items()} == pytest.approx(expected, abs=1e-6)
+    paper = found("con", "paper") | found("con_acc", "paper")
+    assert paper["con"].item() == pytest.approx(0.892285, abs=1e-6)
+    assert paper["con_acc"].item() == pytest.approx(0.992046, abs=1e-6)
+    p = first.logits.softmax(1)
+    assert con(p, p, valid, "released").item() == pytest.approx(0.881330, abs=1e-6)
