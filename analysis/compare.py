@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from analysis.arguments import MOST, blocks_of, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
-    from analysis.results import Stored
+    from analysis.results import Frames, Stored
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.tracking.tables import Grid
@@ -24,6 +24,7 @@ OWN = {
     "b": "",
     "metrics": "auto",
     "split": "",
+    "frames": "",
     "missing": "refuse",
     "level": "0.95",
     "resamples": "10000",
@@ -43,7 +44,10 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     a, b      each a run (folder, config key or MLflow run id), a file of counts (.npz, of
               rgbt.evaluate or analysis.score), a group of runs ("grbm sigma_div=2": all its seeds),
               or several of these with commas: seeds of one method
-    metrics   mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night
+    metrics   mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night;
+              of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA
+    frames    of runs, counts of pairs of frames (python -m rgbt.consistency run=...): aligned or
+              released (virtual views), next (consecutive frames); default: of single frames
     missing   refuse, or leave_out: compare the images that both hold
     level     of the intervals;  resamples: their number;  seed: of the draws
     method    percentile or bca: how intervals over images are taken from the resamples
@@ -61,10 +65,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
     refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
+    frames = _frames(arguments["frames"])
     out = out_folder(arguments["out"])
     _check_given(arguments)
     opened = [
-        open_counts(arguments[side], arguments["runs_dir"], arguments["split"]) for side in "ab"
+        open_counts(arguments[side], arguments["runs_dir"], arguments["split"], frames)
+        for side in "ab"
     ]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
@@ -86,8 +92,6 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     Raises:
         InputError: a value that is no number, or out of range.
     """
-    from typing import cast
-
     from analysis.uncertainty.settings import Method, Resampling
     from rgbt.metrics.metric import Absent
 
@@ -102,25 +106,33 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The metrics asked for; "auto": mIoU, Var, every region, and mIoU by day and by night.
+    """The metrics asked for; "auto": those that the counts are known by, also by day and by night.
 
-    Day and night where all counts tell them apart and hold enough images of them for `settings`.
+    Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
+    of their protocol (by day, by night). Day and night where all counts tell them apart and hold
+    enough images of them for `settings`.
     """
     from analysis.uncertainty.blocks import FEWEST
     from rgbt.metrics import names
+    from rgbt.metrics.pairs import HEADLINES, protocol_of
 
     if text != "auto":
         return [word.strip() for word in text.split(",")]
-    regions = [names.region(number + 1) for number in range(every[0].counts.shape[1])]
+    headlines: tuple[str, ...] = (names.MIOU,)
+    by_region = [names.VAR, *map(names.region, range(1, every[0].counts.shape[1] + 1))]
+    protocol = protocol_of(every[0].partition)
+    if protocol is not None:
+        headlines, by_region = HEADLINES[protocol], []
     told = [counts.parts() for counts in every]
     # Neighbours of two sequences make no common block: a few images more than the product.
     fewest = FEWEST * (settings.blocks + 1 if isinstance(settings.blocks, int) else 1)
     parts = [
-        names.subset(part, names.MIOU)
+        names.subset(part, metric)
         for part in (names.DAY, names.NIGHT)
         if all(part in each and len(each[part].names) >= fewest for each in told)
+        for metric in headlines
     ]
-    return [names.MIOU, names.VAR, *regions, *parts]
+    return [*headlines, *by_region, *parts]
 
 
 def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
@@ -186,6 +198,14 @@ def _counts(
         if left:
             tell(f"{left} of {before} images are not in all counts and were left out.")
     return methods[0], methods[1]
+
+
+def _frames(text: str) -> Frames:
+    from rgbt.metrics.pairs import PROTOCOLS
+
+    if text:
+        check_choice("frames", text, PROTOCOLS)
+    return cast("Frames", text)
 
 
 def _check_given(arguments: dict[str, str]) -> None:

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.pairs import Protocol, file_name, protocol_of
 from rgbt.tracking.folder import RunFolder, find_run, runs_in
 from rgbt.tracking.terminal import tell
 
@@ -19,6 +21,9 @@ GROUP = "rgbt.group"
 """Tag that the seeds of one method share (`rgbt.naming`)."""
 
 SEED = "rgbt.seed"
+
+Frames = Literal["", "aligned", "released", "next"]
+"""Counts of single frames, or of pairs of frames by one protocol."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,9 @@ class Stored:
     counts: Counts
 
 
-def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tuple[Stored, ...]:
+def open_counts(
+    text: str, runs_dir: Path | str = "runs", split: str = "", frames: Frames = ""
+) -> tuple[Stored, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
@@ -49,22 +56,20 @@ def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tu
             between them.
         runs_dir: where runs lie.
         split: "": the test split of runs, and whatever a file holds.
+        frames: of runs, counts of single frames, or of pairs of frames by one protocol
+            (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
 
     Raises:
-        InputError: there is no such thing, a run has no counts of the split, or a file is of
-            another one.
+        InputError: there is no such thing, a run has no counts of the split or of pairs, or a file
+            is of others.
     """
     root = Path(runs_dir)
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
     is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
     words = [text] if is_whole else split_words(text)
-    found = [stored for word in words for stored in _open(word, root, split)]
+    found = [stored for word in words for stored in _open(word, root, split, frames)]
     for stored in found:
-        if split and stored.counts.split != split:
-            raise InputError(
-                f"{stored.path} is of split '{stored.counts.split}', but split={split} was asked "
-                "for; leave split= out, or name counts of that split."
-            )
+        _check_asked_for(stored, split, frames)
     paths = [stored.path for stored in found]
     for path in paths:
         if paths.count(path) > 1:
@@ -74,6 +79,20 @@ def open_counts(text: str, runs_dir: Path | str = "runs", split: str = "") -> tu
     if len(labels) > 1:
         tell(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
     return tuple(found)
+
+
+def _check_asked_for(stored: Stored, split: str, frames: Frames) -> None:
+    counts = stored.counts
+    if split and counts.split != split:
+        raise InputError(
+            f"{stored.path} is of split '{counts.split}', but split={split} was asked for; leave "
+            "split= out, or name counts of that split."
+        )
+    if frames and protocol_of(counts.partition) != frames:
+        raise InputError(
+            f"{stored.path} is by {counts.partition}, but frames={frames} was asked for; leave "
+            "frames= out, or name a run or what python -m rgbt.consistency run=... counted so."
+        )
 
 
 def _check_trainings_differ(text: str, found: Sequence[Stored]) -> None:
@@ -115,13 +134,13 @@ def split_words(text: str) -> list[str]:
     return words
 
 
-def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
+def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[Stored]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
         return [_of_file(path)]
     grouped = _of_group(word, runs_dir)
     if grouped:
-        return [_of_run(folder, split) for folder in grouped]
+        return [_of_run(folder, split, frames) for folder in grouped]
     if _is_folder(path) and not (path / "config.yaml").is_file():
         return [_of_scores(path)]
     try:
@@ -133,7 +152,7 @@ def _open(word: str, runs_dir: Path, split: str) -> list[Stored]:
             f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
             f"counts (.npz){known}."
         ) from error
-    return [_of_run(RunFolder(folder), split)]
+    return [_of_run(RunFolder(folder), split, frames)]
 
 
 def _is_folder(path: Path) -> bool:
@@ -161,7 +180,8 @@ def _of_scores(folder: Path) -> Stored:
 def _of_file(path: Path) -> Stored:
     """A file of counts, called like its folder where its own name says only what it holds."""
     path = path.resolve()
-    label = path.parent.name if path.stem.startswith("counts_") else path.stem
+    folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
+    label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem
     return Stored(label, "", None, path, Counts.load(path))
 
 
@@ -173,16 +193,9 @@ def _runs(runs_dir: Path) -> list[RunFolder]:
     return runs_in(runs_dir) if runs_dir.is_dir() else []
 
 
-def _of_run(run: RunFolder, split: str) -> Stored:
+def _of_run(run: RunFolder, split: str, frames: Frames) -> Stored:
     split = split or "test"
-    path = run.counts_path(split)
-    if not path.is_file():
-        there = [each.stem.removeprefix("counts_") for each in run.path.glob("counts_*.npz")]
-        raise InputError(
-            f"{run.path} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
-            f"'{split}'; python -m rgbt.evaluate run={run.path} split={split} out={path} makes "
-            "them once it is finished."
-        )
+    path = _pairs_of_frames(run, split, frames) if frames else _single_frames(run, split)
     if run.result() is None:
         tell(f"{run.path} is not finished; its counts are of a training that goes on.")
     seed = _tag(run, SEED)
@@ -193,6 +206,30 @@ def _of_run(run: RunFolder, split: str) -> Stored:
         path=path,
         counts=Counts.load(path),
     )
+
+
+def _single_frames(run: RunFolder, split: str) -> Path:
+    path = run.counts_path(split)
+    if not path.is_file():
+        there = [each.stem.removeprefix("counts_") for each in run.path.glob("counts_*.npz")]
+        raise InputError(
+            f"{run.path} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
+            f"'{split}'; python -m rgbt.evaluate run={run.path} split={split} out={path} makes "
+            "them once it is finished."
+        )
+    return path
+
+
+def _pairs_of_frames(run: RunFolder, split: str, protocol: Protocol) -> Path:
+    path = run.path / file_name(protocol, split)
+    if not path.is_file():
+        frames = "next" if protocol == "next" else "virtual"
+        raise InputError(
+            f"{run.path} has no counts of pairs of frames {path.relative_to(run.path)}; python -m "
+            f"rgbt.consistency run={run.path} split={split} frames={frames} makes them once it is "
+            "finished."
+        )
+    return path
 
 
 def _tag(run: RunFolder, name: str) -> str:

@@ -9,7 +9,7 @@ from rgbt.checks import InputError
 from rgbt.command import plain_command
 
 OF_FIGURES = (
-    *("maps", "statistics", "methods", "scores", "runs", "runs_dir", "names", "pick", "rows"),
+    *("maps", "statistics", "methods", "runs", "runs_dir", "frames", "names", "pick", "rows"),
     *("layout", "split", "part", "regions", "absent", "estimator", "average", "patches", "seed"),
     *("band", "resamples", "level", "blocks", "size", "format", "suffix"),
 )
@@ -31,7 +31,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     runs         runs, groups or files of counts, with commas; label:run,label:run names them, and
                  entries with one label are seeds of one method
     runs_dir     folder of runs (runs)
-    scores       CSV of TC and CA: class,variant,tc,ca
+    frames       pairs of frames of temporal/fig5: aligned or released (virtual views), or next
+                 (consecutive frames), as python -m rgbt.consistency counts them
     split        split of the data set or of the runs (test; for statistics: train); a file that
                  holds another one is refused
     part         all, day or night

@@ -103,9 +103,8 @@ FIGURES: dict[str, Entry] = {
     "spatialseg/fig9": _panel("qualitative results on another data set"),
     "temporal/fig5": Entry(
         "TC and CA of variants by class",
-        "scores=file.csv with the columns class,variant,tc,ca: needs TC and CA counts, which no "
-        "command writes yet",
-        ("scores",),
+        f"{RUNS}, with counts of pairs of frames (python -m rgbt.consistency)",
+        ("frames", *OF_RUNS),
         (),
         make_papers.temporal_fig5,
     ),

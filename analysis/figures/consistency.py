@@ -2,23 +2,39 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.figures.style import COLOURS, MARKERS, PAGE, new_figure, readable, styled
-from rgbt.checks import InputError, check_range
+from analysis.figures.style import (
+    COLOURS,
+    MARKERS,
+    PAGE,
+    SMALL,
+    new_figure,
+    readable,
+    series_legend,
+    styled,
+)
+from rgbt.checks import InputError
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.named import value
+from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
+from rgbt.metrics.scores import class_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEADER = ("class", "variant", "tc", "ca")
+TITLES: dict[Protocol, str] = {
+    "aligned": "virtual views, first frame brought into the second",
+    "released": "virtual views, frames as they lie (as released)",
+    "next": "consecutive frames",
+}
 
 
 @dataclass(frozen=True)
@@ -26,13 +42,15 @@ class ClassConsistency:
     """TC and CA of variants by class.
 
     Attributes:
+        protocol: how the frames were compared.
         classes: C names.
         variants: V names, e.g. "(G) Ours-dice".
-        tc: (V, C) percent, temporal consistency.
-        ca: (V, C) percent, consistent accuracy; never above `tc`, whose numerator holds its own
-            and whose denominator its own holds (Temporal, Fig. 4).
+        tc: (V, C) percent, temporal consistency, mean over seeds; NaN: nothing to score.
+        ca: (V, C) percent, consistent accuracy by the union of the protocol; never above `tc`,
+            whose numerator holds its own and whose denominator its own holds (Temporal, Fig. 4).
     """
 
+    protocol: Protocol
     classes: tuple[str, ...]
     variants: tuple[str, ...]
     tc: NDArray[np.float64]
@@ -40,119 +58,72 @@ class ClassConsistency:
 
     def means(self) -> dict[str, tuple[float, float]]:
         """Variant -> mean TC and CA over classes: the cells of the paper's Table I."""
-        rows = zip(self.variants, self.tc.mean(1), self.ca.mean(1), strict=True)
+        rows = zip(self.variants, class_mean(self.tc), class_mean(self.ca), strict=True)
         return {name: (float(tc), float(ca)) for name, tc, ca in rows}
 
 
-def class_consistency(
-    scores: Mapping[tuple[str, str], tuple[float, float]],
-) -> ClassConsistency:
-    """The series of Fig. 5, classes and variants in the order in which they first occur.
+def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -> ClassConsistency:
+    """The series of Fig. 5.
 
     Args:
-        scores: (class, variant) -> (TC, CA) in percent.
+        methods: variant -> counts of pairs of frames of its seeds, of one protocol.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: a class without a variant that others have, or CA above TC.
+        InputError: counts of single frames, or of different protocols or classes.
     """
-    classes = tuple(dict.fromkeys(name for name, _ in scores))
-    variants = tuple(dict.fromkeys(variant for _, variant in scores))
-    both = np.empty((2, len(variants), len(classes)))
-    for row, variant in enumerate(variants):
-        for column, name in enumerate(classes):
-            if (name, variant) not in scores:
-                raise InputError(
-                    f"scores: there is no TC and CA of class '{name}' for '{variant}'; give every "
-                    "class for every variant."
-                )
-            both[:, row, column] = scores[name, variant]
-    if (both[1] > both[0]).any():
-        row, column = np.argwhere(both[1] > both[0])[0]
-        raise InputError(
-            f"scores: CA of '{classes[column]}' for '{variants[row]}' is {both[1, row, column]:g}, "
-            f"above its TC {both[0, row, column]:g}, which cannot be; are the columns exchanged?"
-        )
-    return ClassConsistency(classes, variants, both[0], both[1])
-
-
-def read_scores(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
-    """Scores from a CSV file with the columns class, variant, tc, ca (percent).
-
-    Example:
-        class,variant,tc,ca
-        car,(G) Ours-dice,61.2,55.0
-
-    Raises:
-        InputError: no such file, not UTF-8, other columns, a value that is no percentage, a line
-            twice, or a line with more values than columns.
-    """
-    if not path.is_file():
-        raise InputError(f"scores={path}: there is no such file; expected CSV {','.join(HEADER)}.")
-    found: dict[tuple[str, str], tuple[float, float]] = {}
-    for line in _lines(path):
-        key = (line["class"], line["variant"])
-        if key in found:
-            raise InputError(f"scores={path}: class '{key[0]}' of '{key[1]}' stands there twice.")
-        found[key] = (_percent(path, line, "tc"), _percent(path, line, "ca"))
-    if not found:
-        raise InputError(f"scores={path}: there is no line below the columns.")
-    return found
-
-
-def _lines(path: Path) -> list[dict[str, str]]:
-    """The lines below the header, each with exactly its columns."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(
-            f"scores={path} is no CSV file in UTF-8 ({error}); save it as one, with the columns "
-            f"{','.join(HEADER)}."
-        ) from error
-    header, lines = (rows[0], rows[1:]) if rows else ([], [])
-    if tuple(header) != HEADER:
-        raise InputError(
-            f"scores={path}: expected the columns {','.join(HEADER)}, got "
-            f"{','.join(header) or 'none'}."
-        )
-    for line in lines:
-        if len(line) != len(HEADER):
+    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
+    (first, reference), *others = every
+    for label, counts in others:
+        if (counts.partition, counts.classes) != (reference.partition, reference.classes):
             raise InputError(
-                f"scores={path}: '{','.join(line)}' has {len(line)} values for the {len(HEADER)} "
-                f"columns {','.join(HEADER)}; put quotes around a name with a comma."
+                f"runs: '{first}' was counted by {reference.partition} over "
+                f"{', '.join(reference.classes)}, but '{label}' by {counts.partition} over "
+                f"{', '.join(counts.classes)}; give counts of one protocol and data set."
             )
-    return [dict(zip(HEADER, line, strict=True)) for line in lines]
+    protocol = protocol_of(reference.partition)
+    if protocol is None:
+        raise InputError(
+            f"runs: the counts of '{first}' ({reference.partition}) are of single frames; python "
+            "-m rgbt.consistency run=... counts the pairs of a run."
+        )
+    tc, ca = (
+        np.array([_by_class(seeds, score, absent) for seeds in methods.values()])
+        for score in HEADLINES[protocol]
+    )
+    return ClassConsistency(protocol, reference.classes, tuple(methods), tc, ca)
 
 
-def _percent(path: Path, line: Mapping[str, str], column: str) -> float:
-    where = f"scores={path}: {column} of '{line['class']}' for '{line['variant']}'"
-    try:
-        value = float(line[column])
-    except ValueError as error:
-        raise InputError(f"{where} must be a number, got '{line[column]}'.") from error
-    check_range(where, value, 0, 100)
-    return value
+def _by_class(seeds: Sequence[Counts], score: str, absent: Absent) -> NDArray[np.float64]:
+    """(C,) percent, mean over seeds."""
+    metrics = [names.of_class(name, score) for name in seeds[0].classes]
+    by_seed = [[value(metric, counts, absent) for metric in metrics] for counts in seeds]
+    return np.asarray(np.mean(by_seed, axis=0), np.float64)
 
 
 @styled
 def draw(data: ClassConsistency) -> Figure:
-    """TC as full and CA as open marker, joined by a line; variants side by side in each class."""
+    """TC as full and CA as open marker, joined by a line; variants side by side in each class.
+
+    The legend holds the means over classes.
+    """
     figure = new_figure(PAGE, 2.6)
     axes = figure.subplots()
     places = np.arange(len(data.classes))
     step = min(0.2, 0.7 / len(data.variants))
-    for index, variant in enumerate(data.variants):
+    union = " (released)" if HEADLINES[data.protocol][1] == names.CA_RELEASED else ""
+    for index, (variant, (tc, ca)) in enumerate(data.means().items()):
         x = places + (index - (len(data.variants) - 1) / 2) * step
         colour = COLOURS[index % len(COLOURS)]
-        mark = {"marker": MARKERS[index % len(MARKERS)], "linestyle": "none", "color": colour}
+        mark: Any = {"marker": MARKERS[index % len(MARKERS)], "linestyle": "none", "color": colour}
         axes.vlines(x, data.ca[index], data.tc[index], color=colour, linewidth=0.8)
-        axes.plot(x, data.tc[index], label=f"{variant}, TC", **mark)  # type: ignore[arg-type]
-        open_mark = mark | {"markerfacecolor": "white"}
-        axes.plot(x, data.ca[index], label=f"{variant}, CA", **open_mark)  # type: ignore[arg-type]
+        label = f"{variant} (TC {tc:.1f}, CA {ca:.1f})"
+        axes.plot(x, data.tc[index], label=label, clip_on=False, **mark)
+        axes.plot(x, data.ca[index], markerfacecolor="white", clip_on=False, **mark)
     axes.set_xticks(places, [readable(name) for name in data.classes])
     axes.grid(visible=False, axis="x")
     axes.set_ylim(bottom=0)
-    axes.set_ylabel("percent")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(data.variants))
+    axes.set_ylabel(f"percent: TC full,\nCA{union} open")
+    axes.set_title(TITLES[data.protocol], fontsize=SMALL)
+    series_legend(figure, axes, columns=len(data.variants))
     return figure

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from analysis.predictions.maps import PixelMaps
+    from analysis.results import Frames
     from analysis.statistics.data import SpatialStatistics
     from rgbt.data.mfnet import MFNet
     from rgbt.metrics.counts import Counts
@@ -231,6 +232,27 @@ class Given:
         settings = Settings(regions=self.regions)
         with progress("measuring", len(self.dataset.names(split))) as advance:
             return collect(self.dataset, split, settings, advance)
+
+    def runs(self, frames: Frames = "") -> dict[str, list[Counts]]:
+        """Label -> counts of its seeds, of ``runs=``; entries with one label are one method's.
+
+        Args:
+            frames: see `analysis.results.open_counts`.
+
+        Raises:
+            InputError: not given, no such counts, or methods on different images.
+        """
+        from analysis.results import open_counts, split_words
+
+        what = "runs, groups or files of counts, with commas; label:run names one"
+        runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
+        found: dict[str, list[Counts]] = {}
+        for word in split_words(self.need("runs", what)):
+            label, colon, place = word.partition(":")
+            for stored in open_counts(place if colon else label, runs_dir, split, frames):
+                found.setdefault(label if colon else stored.label, []).append(stored.counts)
+        check_same_images(found)
+        return found
 
     def counts(self, key: str, partition: str) -> dict[str, Counts]:
         """Label -> counts over a partition, of the folders or files that `key` names."""

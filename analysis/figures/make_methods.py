@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from analysis.arguments import blocks_of
 from analysis.bar import progress
-from analysis.figures.inputs import Given, check_same_images
+from analysis.figures.inputs import Given
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from analysis.figures.panels import ReadPrediction
     from analysis.figures.profiles import Profile
     from analysis.predictions.images import Reader
-    from rgbt.metrics.counts import Counts
 
 ABSENT = ("released", "exclude")
 LEAST, MOST_PIXELS = 16, 4096
@@ -92,9 +91,7 @@ def region_heat(given: Given) -> Figure:
 
     image_hw = _image_hw(given.get("size", "480x640"))
     absent: Any = given.choice("absent", ABSENT)
-    methods = [
-        profiles.means_only(label, seeds, absent) for label, seeds in _methods(given).items()
-    ]
+    methods = [profiles.means_only(label, seeds, absent) for label, seeds in given.runs().items()]
     return regions.draw_heat(regions.region_heat(methods, image_hw))
 
 
@@ -130,25 +127,10 @@ def _profiles(given: Given) -> list[Profile]:
         blocks=blocks_of(given.get("blocks", "auto")),
         absent=absent,
     )
-    methods = _methods(given)
+    methods = given.runs()
     made = []
     with progress("resampling", len(methods)) as advance:
         for label, seeds in methods.items():
             made.append(profile(label, seeds, settings, band))
             advance()
     return made
-
-
-def _methods(given: Given) -> dict[str, list[Counts]]:
-    """Label -> counts of its seeds; entries with one label are seeds of one method."""
-    from analysis.results import open_counts, split_words
-
-    text = given.need("runs", "runs, groups or files of counts, with commas; label:run names one")
-    runs_dir, split = Path(given.get("runs_dir", "runs")).expanduser(), given.get("split", "")
-    found: dict[str, list[Counts]] = {}
-    for word in split_words(text):
-        label, colon, place = word.partition(":")
-        for stored in open_counts(place if colon else label, runs_dir, split):
-            found.setdefault(label if colon else stored.label, []).append(stored.counts)
-    check_same_images(found)
-    return found

@@ -5,7 +5,6 @@ Everything heavy is imported when a figure is made, so that the list of figures 
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.figures.inputs import Given, check_one_dataset
@@ -143,10 +142,9 @@ def temporal_fig5(given: Given) -> Figure:
     """TC and CA by class."""
     from analysis.figures import consistency
 
-    path = given.need("scores", "a CSV file with the columns class,variant,tc,ca (percent)")
-    return consistency.draw(
-        consistency.class_consistency(consistency.read_scores(Path(path).expanduser()))
-    )
+    frames: Any = given.choice("frames", ("aligned", "released", "next"))
+    absent: Any = given.choice("absent", ABSENT)
+    return consistency.draw(consistency.class_consistency(given.runs(frames), absent))
 
 
 def multihead_fig3(given: Given) -> Figure:

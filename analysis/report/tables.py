@@ -124,7 +124,8 @@ def _rho(rho: float, rows: int) -> tuple[float | None, int]:
 def _notes(table: Table) -> tuple[str, ...]:
     """What the file says beside its values, one sentence each."""
     needed = [f"Cannot be run yet, needs {table.needs}."] if table.needs else []
-    columns = [
+    columns = [f"{each.name}: not in the paper." for each in table.columns if not each.printed]
+    columns += [
         f"{each.name}: not computed, needs {each.needs}." for each in table.columns if each.needs
     ]
     rows = [f"{row.label}: {remark}" for row in table.rows for remark in row.remarks]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import Asked, images_of, parse, values
+from rgbt.metrics.pairs import protocol_of
 from rgbt.randomness import numpy_generator
 
 CHUNK = 500
@@ -51,6 +52,7 @@ class Images:
             whole numbers below 2^53, so that sums are exact.
         shape: (R, K, K).
         classes: K names.
+        partition: of the regions, or of pairs of frames.
         images: N.
         blocks: how the images are drawn.
         settings: of the resampling.
@@ -59,6 +61,7 @@ class Images:
     methods: tuple[NDArray[np.float64], ...]
     shape: tuple[int, int, int]
     classes: tuple[str, ...]
+    partition: str
     images: int
     blocks: Blocks
     settings: Resampling
@@ -119,8 +122,8 @@ class Images:
     def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
         """(metrics, ...) percent of summed counts (..., R K K)."""
         by_region = summed.reshape(*summed.shape[:-1], *self.shape)
-        absent = self.settings.absent
-        return np.stack([values(each, by_region, self.classes, absent) for each in asked])
+        given = (by_region, self.classes, self.partition, self.settings.absent)
+        return np.stack([values(each, *given) for each in asked])
 
 
 def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampling) -> Images:
@@ -147,6 +150,7 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         methods=tuple(each.astype(np.float64) for each in flat),
         shape=(regions, classes, classes),
         classes=first.classes,
+        partition=first.partition,
         images=len(first.names),
         blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
@@ -155,13 +159,8 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         blocks = make_blocks(first.names, settings.blocks, _influence(single))
     except InputError as error:
         raise InputError(f"{asked.part}: {error}" if asked.part else str(error)) from None
-    return Images(
-        methods=tuple(_summed(each, blocks) for each in single.methods),
-        shape=single.shape,
-        classes=single.classes,
-        images=single.images,
-        blocks=blocks,
-        settings=settings,
+    return replace(
+        single, methods=tuple(_summed(each, blocks) for each in single.methods), blocks=blocks
     )
 
 
@@ -169,12 +168,15 @@ WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
 """Scores that tell how far neighbouring images are alike, whatever is asked for: the one that
 counts, and the one that shows likeness most clearly."""
 
+WATCHED_PAIRS = (parse(names.TC), parse(names.CA))
+"""The same for counts of pairs of frames."""
+
 
 def _influence(single: Images) -> Scores:
     """(L, N) how much each image moves the scores of every method, and their difference."""
     if single.settings.blocks != "auto":
         return np.empty((0, single.images))
-    moved = single.without_each(WATCHED)
+    moved = single.without_each(WATCHED if protocol_of(single.partition) is None else WATCHED_PAIRS)
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
     return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
 
@@ -199,9 +201,11 @@ def _like(first: Counts, other: Counts) -> Counts:
             f"{', '.join(other.classes)}; score both on one data set."
         )
     if other.partition != first.partition:
+        of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
+        how = "rgbt.evaluate regions=..., analysis.score partition=..."
         raise InputError(
             f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
-            "count both by one partition (rgbt.evaluate regions=..., analysis.score partition=...)."
+            f"count both by one partition ({'rgbt.consistency frames=...' if of_pairs else how})."
         )
     if set(other.names) != set(first.names):
         if not set(other.names) & set(first.names):
@@ -222,8 +226,13 @@ def _like(first: Counts, other: Counts) -> Counts:
             "the counts do not agree about which images were taken at night; score both on one "
             "data set."
         )
-    labelled = [each.counts.sum(-1).astype(np.int64) for each in (first, same)]
-    unequal = np.flatnonzero((labelled[0] != labelled[1]).any((1, 2)))
+    # Of pairs of frames the label is no row of the matrices but says which matrix it is.
+    within = -1 if protocol_of(first.partition) is None else (-2, -1)
+    labelled = [
+        each.counts.sum(within, dtype=np.int64).reshape(len(each.names), -1)
+        for each in (first, same)
+    ]
+    unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
     if len(unequal):
         raise InputError(
             f"'{first.names[unequal[0]]}' holds other labels in the one than in the other counts "

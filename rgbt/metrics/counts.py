@@ -21,11 +21,13 @@ class Counts:
     """How often each class was predicted as which, per image and region.
 
     Attributes:
-        counts: (N, R, K, K) int32 or int64, rows = label, columns = prediction.
+        counts: (N, R, K, K) int32 or int64, rows = label, columns = prediction. Of pairs of frames
+            they hold something else: see `rgbt.metrics.pairs`.
         names: names of the N images.
         night: whether each image was taken at night; None where the data set does not say.
         classes: names of the K classes.
-        partition: name of the regions, e.g. "ring5" (`rgbt.metrics.metric.Regions.name`).
+        partition: name of the regions, e.g. "ring5" (`rgbt.metrics.metric.Regions.name`); of pairs
+            of frames protocol and number of sets, e.g. "aligned3".
         dataset: fingerprint of the data set.
         split: split that the images come from.
 

@@ -1,7 +1,8 @@
 """Scores by the names that tables and comparisons give them, from counts.
 
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
-(mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``.
+(mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
+counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.metrics import names
+from rgbt.metrics import names, pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import (
@@ -38,7 +39,17 @@ MEANS: dict[str, Callable[[Matrices, Absent], Scores]] = {
 }
 """Scores of (..., K, K) matrices as fractions (...)."""
 
-FORMS = ("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>")
+OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+    names.TC: pairs.tc,
+    names.CA: pairs.ca,
+    names.CA_RELEASED: pairs.ca_released,
+}
+"""Scores by class of (..., S (K + 1), K, K) counts of pairs of frames as fractions (..., K)."""
+
+FORMS = (
+    *("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>"),
+    *(names.of_class("<name>", score) for score in OF_PAIRS),
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,7 @@ class Asked:
     Attributes:
         metric: the name.
         part: "day", "night", or None for all images.
-        score: a mean over classes, "Var", "IoU" or "acc".
+        score: a mean over classes, "Var", "IoU", "acc", or one of `OF_PAIRS`.
         class_name: of one class alone, or None.
         region: number from 1, or None for the whole image.
     """
@@ -69,7 +80,7 @@ def parse(metric: str) -> Asked:
     words = metric.split("/")
     part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
     match words:
-        case [score] if score in MEANS or score == names.VAR:
+        case [score] if score in MEANS or score in OF_PAIRS or score == names.VAR:
             return Asked(metric, part, score)
         case ["region", number] if _is_number(number):
             return Asked(metric, part, names.MIOU, region=int(number))
@@ -77,9 +88,11 @@ def parse(metric: str) -> Asked:
             return Asked(metric, part, "IoU", name)
         case ["class", name, "acc"] if name:
             return Asked(metric, part, "acc", name)
+        case ["class", name, score] if name and score in OF_PAIRS:
+            return Asked(metric, part, score, name)
         case ["class", name, "region", number] if name and _is_number(number):
             return Asked(metric, part, "IoU", name, int(number))
-    known = nearest("/".join(words), [*MEANS, names.VAR, *FORMS])
+    known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *FORMS])
     raise InputError(
         f"'{metric}' is not a metric; {known}; day/ or night/ may stand before each of them."
     )
@@ -97,15 +110,16 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
         percent 0..100; the variance in squared percent points. NaN: nothing to score.
 
     Raises:
-        InputError: no such metric, class or region, or images that are not told apart.
+        InputError: no such metric, class or region, a metric that such counts do not have, or
+            images that are not told apart.
     """
     asked = parse(metric)
     by_region = images_of(asked, counts).by_region()
-    return float(values(asked, by_region, counts.classes, absent))
+    return float(values(asked, by_region, counts.classes, counts.partition, absent))
 
 
 def values(
-    asked: Asked, by_region: Matrices, classes: tuple[str, ...], absent: Absent
+    asked: Asked, by_region: Matrices, classes: tuple[str, ...], partition: str, absent: Absent
 ) -> NDArray[np.float64]:
     """The score of many summed counts at once, e.g. one per resample.
 
@@ -113,14 +127,20 @@ def values(
         asked: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images.
         classes: K names.
+        partition: of the counts, which tells those of pairs of frames.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Returns:
         (...) percent; the variance in squared percent points. NaN: nothing to score.
 
     Raises:
-        InputError: no such class or region.
+        InputError: no such class or region, or a metric that such counts do not have.
     """
+    check_kind(asked, partition)
+    if asked.score in OF_PAIRS:
+        by_class = 100.0 * OF_PAIRS[asked.score](by_region, absent)
+        has_class = asked.class_name is not None
+        return _of_class(asked, by_class, classes) if has_class else class_mean(by_class)
     if asked.score == names.VAR:
         return variance(miou(by_region, absent))
     if asked.region is None:
@@ -135,15 +155,41 @@ def values(
     if asked.class_name is None:
         return 100.0 * MEANS[asked.score](matrices, absent)
     score = recall if asked.score == "acc" else iou
-    return 100.0 * score(matrices, absent)[..., _class_index(asked, classes)]
+    return _of_class(asked, 100.0 * score(matrices, absent), classes)
+
+
+def check_kind(asked: Asked, partition: str) -> None:
+    """Refuse a score of pairs of frames from counts of single ones, and the other way round.
+
+    Args:
+        asked: the score.
+        partition: of the counts.
+
+    Raises:
+        InputError: such counts do not have it.
+    """
+    of_pairs = pairs.protocol_of(partition) is not None
+    if of_pairs and asked.score not in OF_PAIRS:
+        raise InputError(
+            f"'{asked.metric}' is a score of single frames, but these counts ({partition}, of "
+            "python -m rgbt.consistency run=...) are of pairs of frames; ask for "
+            f"{', '.join(OF_PAIRS)}, or name counts of single frames."
+        )
+    if not of_pairs and asked.score in OF_PAIRS:
+        raise InputError(
+            f"'{asked.metric}' is a score of pairs of frames, but these counts ({partition}) are "
+            "of single frames; python -m rgbt.consistency run=... counts the pairs of a run."
+        )
 
 
 def images_of(asked: Asked, counts: Counts) -> Counts:
     """The images that a metric is over: all, those of the day or those of the night.
 
     Raises:
-        InputError: the split does not hold both, or the data set does not tell them apart.
+        InputError: the split does not hold both, the data set does not tell them apart, or such
+            counts do not have the metric.
     """
+    check_kind(asked, counts.partition)
     if asked.part is None:
         return counts
     parts = counts.parts()
@@ -159,10 +205,13 @@ def _is_number(text: str) -> bool:
     return text.isdecimal() and int(text) >= 1
 
 
-def _class_index(asked: Asked, classes: tuple[str, ...]) -> int:
+def _of_class(
+    asked: Asked, by_class: NDArray[np.float64], classes: tuple[str, ...]
+) -> NDArray[np.float64]:
+    """(..., K) -> (...)."""
     if asked.class_name not in classes:
         raise InputError(
             f"'{asked.metric}': the data set of the run has no class '{asked.class_name}'; "
             f"{nearest(str(asked.class_name), classes)}."
         )
-    return classes.index(asked.class_name)
+    return np.asarray(by_class[..., classes.index(asked.class_name)])

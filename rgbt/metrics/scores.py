@@ -4,8 +4,11 @@ Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (
 kept. Scores are fractions 0..1; variances are in squared percent points, as the papers print them.
 
 A class without a pixel to count (0 / 0) scores, by `absent`:
-    "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables.
-    "exclude":  NaN and is left out of means, as in the RTFNet and Temporal releases.
+    "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
+                and in the averages that the RTFNet and Temporal releases report. (These two keep
+                NaN for the class; the scalars that Temporal sends to TensorBoard are plain means,
+                NaN where a class is.)
+    "exclude":  NaN and is left out of means, as in the CMX release.
 """
 
 from __future__ import annotations
@@ -37,19 +40,19 @@ def iou(counts: Matrices, absent: Absent) -> Scores:
         (..., K).
     """
     right, labelled, predicted = _sums(counts)
-    return _ratio(right, labelled + predicted - right, absent)
+    return ratio(right, labelled + predicted - right, absent)
 
 
 def recall(counts: Matrices, absent: Absent) -> Scores:
     """``TP / (TP + FN)`` of each class, "Acc" in the papers' tables. Shapes as in `iou`."""
     right, labelled, _ = _sums(counts)
-    return _ratio(right, labelled, absent)
+    return ratio(right, labelled, absent)
 
 
 def precision(counts: Matrices, absent: Absent) -> Scores:
     """``TP / (TP + FP)`` of each class. Shapes as in `iou`."""
     right, _, predicted = _sums(counts)
-    return _ratio(right, predicted, absent)
+    return ratio(right, predicted, absent)
 
 
 def f1(counts: Matrices, absent: Absent) -> Scores:
@@ -59,7 +62,7 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
     never found right; here that is 0 under both settings.
     """
     right, labelled, predicted = _sums(counts)
-    return _ratio(2 * right, labelled + predicted, absent)
+    return ratio(2 * right, labelled + predicted, absent)
 
 
 def class_mean(scores: Scores) -> Scores:
@@ -169,7 +172,8 @@ def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
     return right, labelled, predicted
 
 
-def _ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
+def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
+    """``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
     return _divide(part, whole, 0.0 if absent == "released" else np.nan)
 
 

@@ -19,6 +19,7 @@ from rgbt.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from tests.analysis.figures.drawn import counts, statistics, strips
+from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call
 
 ENTRY = plain_command(OWN, main)
@@ -47,7 +48,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     night = np.arange(20) % 2 == 0
     measured = statistics(labels, strips(5, "ring"), night)
     replace(measured, fingerprint=dataset.fingerprint()).save(folder / "statistics.npz")
-    (folder / "scores.csv").write_text("class,variant,tc,ca\ncar,(G),60,50\n")
+    for method, agree in (("a", 0.5), ("b", 0.7)):
+        pairs_of(12, agree).save(folder / method / "pairs.npz")
     return folder
 
 
@@ -73,7 +75,7 @@ def arguments(figure: str, folder: Path) -> list[str]:
         "statistics folder": [f"statistics={folder}"],
         "methods": [f"methods=A:{folder / 'a'},B:{folder / 'b'}"],
         "one": [f"methods=A:{folder / 'a'}"],
-        "scores": [f"scores={folder / 'scores.csv'}"],
+        "pairs": [f"runs=A:{folder / 'a' / 'pairs.npz'},B:{folder / 'b' / 'pairs.npz'}"],
         "runs": [
             f"runs=A:{folder / 'a' / 'counts_ring5.npz'},B:{folder / 'b' / 'counts_ring5.npz'}"
         ],
@@ -91,7 +93,7 @@ def arguments(figure: str, folder: Path) -> list[str]:
         "spatialseg/fig6": ("dataset",),
         "spatialseg/fig8": ("dataset", "methods", "different"),
         "spatialseg/fig9": ("dataset", "methods"),
-        "temporal/fig5": ("scores",),
+        "temporal/fig5": ("pairs",),
         "temporal/fig6": ("dataset", "methods", "columns"),
         "crm/fig4": ("dataset", "one"),
         "crm/fig5": ("dataset", "patches"),
@@ -116,7 +118,8 @@ SAID = {
     "spatialseg/fig1": (
         "(a) IoU: a, test, all images",
         "(b) sample occupancy: toy, train, night",
-    )
+    ),
+    "temporal/fig5": ("virtual views, first frame brought into the second",),
 }
 """Texts of the drawn figure."""
 
@@ -153,7 +156,6 @@ def test_lists_every_figure_with_what_it_needs(call: Call) -> None:
         (line,) = [line for line in out.splitlines() if line.split()[:1] == [name]]
         assert entry.shows in line
         assert entry.needs in line
-    assert "no command writes yet" in out
 
 
 def test_keys_of_figures_are_keys_of_the_command() -> None:
@@ -174,7 +176,9 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         (["figure=spatialseg/fig8", "out=f.pdf"], "needs methods=..., label:folder of predicted"),
         (["figure=spatialseg/fig8", "out=f.pdf", "methods=a:b"], "needs dataset=..."),
         (["figure=crm/fig5", "out=f.pdf"], "needs dataset=..."),
-        (["figure=temporal/fig5", "out=f.pdf"], "needs scores=..., a CSV file"),
+        (["figure=temporal/fig5", "out=f.pdf"], "needs runs=..., runs, groups or files of counts"),
+        (["figure=temporal/fig5", "out=f.pdf", "frames=all"], "frames: 'all' is not a choice"),
+        (["figure=regions/heat", "out=f.pdf", "frames=next"], "'frames' has no effect on figure="),
         (["figure=regions/heat", "out=f.pdf"], "needs runs=..."),
         (["figure=regions/heat", "out=f.pdf", "size=big"], "size must be HEIGHTxWIDTH"),
         (["figure=regions/heat", "out=f.pdf", "size=99999999x9"], "16 to 4096 pixels each"),
@@ -243,6 +247,11 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
         ("spatialseg/fig2", ["regions=3"], "lacks counts_vertical3.npz (it holds counts_h"),
         ("spatialseg/fig1", ["metric=vertical5"], "no centre and no edge"),
         ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
+        ("regions/profile", ["runs={folder}/a/pairs.npz"], "'region/1' is a score of single"),
+        ("regions/heat", ["runs={folder}/a/pairs.npz"], "'aligned3' is not a partition"),
+        ("temporal/fig5", ["runs={folder}/a/counts_ring5.npz"], "by ring5, but frames=aligned was"),
+        ("temporal/fig5", ["frames=released"], "by aligned3, but frames=released was asked for"),
+        ("temporal/fig5", ["split=val"], "is of split 'test', but split=val was asked for"),
         ("regions/profile", ["level=high"], "level=high: expected a number such as 0.95"),
         ("regions/profile", ["band=seeds"], "band=seeds needs at least two seeds, but 'A' has one"),
     ],
@@ -250,7 +259,7 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
 def test_input_that_does_not_fit(
     call: Call, made: Path, tmp_path: Path, figure: str, change: list[str], sentence: str
 ) -> None:
-    words = [*arguments(figure, made), *change]
+    words = [*arguments(figure, made), *(word.format(folder=made) for word in change)]
     code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
     assert code == 2
     assert sentence in " ".join(err.split())

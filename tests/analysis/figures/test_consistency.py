@@ -2,83 +2,102 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from analysis.figures.consistency import class_consistency, draw, read_scores
+from analysis.figures.consistency import class_consistency, draw
 from rgbt.checks import InputError
-from tests.analysis.figures.drawn import texts
-
-LINES = (
-    "class,variant,tc,ca",
-    "car,(G),60,50",
-    "car,(H),70,55",
-    "car_stop,(G),20,10",
-    "car_stop,(H),40,12",
-)
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
+from tests.analysis.figures.drawn import counts, texts
+from tests.analysis.uncertainty.simulated import CLASSES, pairs_of
 
 
-def written(folder: Path, *lines: str) -> Path:
-    path = folder / "scores.csv"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+def alike(share: int, partition: str = "aligned1") -> Counts:
+    """Pairs that agree on class 0 in `share` of 100 pixels; the others are class 1 in frame 2."""
+    pairs = np.zeros((3, 2, 2), int)
+    pairs[0, 0] = share, 100 - share
+    return counts(pairs, partition)
 
 
-def test_series_and_their_means(tmp_path: Path) -> None:
-    data = class_consistency(read_scores(written(tmp_path, *LINES)))
-    assert data.classes == ("car", "car_stop")
+def test_series_by_hand_and_their_means() -> None:
+    # Seeds of one variant are averaged: 80 and 90 percent.
+    data = class_consistency({"(G)": [alike(60)], "(H)": [alike(80), alike(90)]}, "released")
+    assert data.protocol == "aligned"
+    assert data.classes == ("class0", "class1")
     assert data.variants == ("(G)", "(H)")
-    np.testing.assert_array_equal(data.tc, [[60, 20], [70, 40]])
-    np.testing.assert_array_equal(data.ca, [[50, 10], [55, 12]])
-    assert data.means() == {"(G)": (40, 30), "(H)": (55, 33.5)}
+    np.testing.assert_allclose(data.tc, [[60, 0], [85, 0]])
+    np.testing.assert_allclose(data.ca, [[60, 0], [85, 0]])
+    assert list(data.means()) == ["(G)", "(H)"]
+    np.testing.assert_allclose(list(data.means().values()), [(30, 30), (42.5, 42.5)])
 
 
-def test_draws_every_series_and_class(tmp_path: Path) -> None:
-    found = texts(draw(class_consistency(read_scores(written(tmp_path, *LINES)))), tmp_path)
-    assert {"(G), TC", "(G), CA", "(H), TC", "(H), CA", "car", "car stop"} <= set(found)
+def test_ca_is_by_the_union_of_the_protocol() -> None:
+    for partition, union in (
+        ("aligned1", 100),
+        ("next1", 100),
+        ("released1", 100 + 60 + 100 - 120),
+    ):
+        data = class_consistency({"(G)": [alike(60, partition)]}, "released")
+        np.testing.assert_allclose(data.ca, [[100 * 60 / union, 0]])
+
+
+def test_classes_without_pixels_count_as_asked() -> None:
+    nothing = alike(100)  # class 1 is nowhere
+    assert class_consistency({"(G)": [nothing]}, "released").means() == {"(G)": (50, 50)}
+    data = class_consistency({"(G)": [nothing]}, "exclude")
+    np.testing.assert_array_equal(data.tc, [[100, np.nan]])
+    assert data.means() == {"(G)": (100, 100)}
+
+
+def test_is_what_the_metrics_are() -> None:
+    seeds = [pairs_of(10, 0.6, seed) for seed in range(2)]
+    data = class_consistency({"ours": seeds}, "released")
+    for column, name in enumerate(CLASSES):
+        for row, score in ((data.tc, "TC"), (data.ca, "CA")):
+            metric = f"class/{name}/{score}"
+            expected = np.mean([value(metric, each, "released") for each in seeds])
+            assert row[0, column] == pytest.approx(expected)
+
+
+def test_draws_every_series_and_class_with_means(tmp_path: Path) -> None:
+    data = class_consistency({"(G)": [alike(60)], "(H)": [alike(80)]}, "released")
+    found = texts(draw(data), tmp_path)
+    assert {"(G) (TC 30.0, CA 30.0)", "(H) (TC 40.0, CA 40.0)", "class0", "class1"} <= set(found)
+    assert "virtual views, first frame brought into the second" in found
 
 
 @pytest.mark.parametrize(
-    ("lines", "sentence"),
+    ("partition", "title", "axis"),
     [
-        (("class,variant,tc", "car,(G),1"), "expected the columns class,variant,tc,ca"),
-        ((), "expected the columns"),
-        (LINES[:1], "no line below"),
-        ((*LINES, "car,(G),1,1"), "stands there twice"),
-        (
-            (*LINES[:2], "bike,(G),much,1"),
-            "tc of 'bike' for '\\(G\\)' must be a number, got 'much'",
-        ),
-        ((*LINES[:2], "bike,(G),120,1"), r"must lie in \[0, 100\], got 120"),
-        ((*LINES[:2], "bike,(G),nan,1"), r"must lie in \[0, 100\], got nan"),
-        (LINES[:4], "no TC and CA of class 'car_stop' for '\\(H\\)'"),
-        ((LINES[0], "car,(G),50,60"), "above its TC 50"),
-        ((LINES[0], "car,(G),60,50,40"), r"'car,\(G\),60,50,40' has 5 values for the 4 columns"),
-        ((LINES[0], "car,(G),60"), r"has 3 values for the 4 columns"),
-        ((LINES[0], 'car,"(G),60,50'), r"is no CSV file in UTF-8"),
+        ("released1", "virtual views, frames as they lie (as released)", "CA (released) open"),
+        ("next1", "consecutive frames", "CA open"),
     ],
 )
-def test_bad_files_are_told_in_one_sentence(
-    tmp_path: Path, lines: tuple[str, ...], sentence: str
+def test_says_how_frames_were_compared(
+    tmp_path: Path, partition: str, title: str, axis: str
 ) -> None:
-    with pytest.raises(InputError, match=sentence):
-        class_consistency(read_scores(written(tmp_path, *lines)))
+    data = class_consistency({"(G)": [alike(60, partition)]}, "exclude")
+    found = texts(draw(data), tmp_path)
+    assert title in found
+    assert any(text.endswith(axis) for text in found)
 
 
-def test_files_that_are_not_text_in_utf_8(tmp_path: Path) -> None:
-    path = tmp_path / "scores.csv"
-    path.write_bytes("class,variant,tc,ca\nFahrrad,größer,60,50\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r"scores\.csv is no CSV file in UTF-8"):
-        read_scores(path)
+def test_counts_of_single_frames_are_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"counts of 'x' \(ring2\) are of single .*consistency run="
+    ):
+        class_consistency({"x": [counts(np.ones((2, 2, 2), int))]}, "released")
 
 
-def test_names_with_commas_stand_in_quotes(tmp_path: Path) -> None:
-    path = written(tmp_path, LINES[0], 'car,"ours, dice",60,50', "", 'bike,"ours, dice",30,20')
-    assert class_consistency(read_scores(path)).variants == ("ours, dice",)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no such file"):
-        read_scores(tmp_path / "none.csv")
+@pytest.mark.parametrize(
+    "other",
+    [alike(60, "released1"), replace(alike(60), classes=("road", "car"))],
+    ids=["protocol", "classes"],
+)
+def test_what_is_not_of_one_kind_is_refused(other: Counts) -> None:
+    with pytest.raises(InputError, match="give counts of one protocol and data set"):
+        class_consistency({"x": [alike(60)], "y": [other]}, "released")

@@ -68,7 +68,7 @@ def data(runs_dir: Path) -> ReportData:
 @pytest.fixture(autouse=True)
 def few_tables(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the first time: reading all published tables takes a second."""
-    names = ["spatialseg/table3", "temporal/table1"]
+    names = ["spatialseg/table3", "temporal/table1", "temporal/table4"]
     own = tables.table_names
 
     def some() -> list[str]:
@@ -225,8 +225,12 @@ def test_tables_that_wait_are_listed_with_what_they_need(data: ReportData) -> No
     assert table.command == "python -m sweeps.reproduce table=spatialseg/table3 seeds=3 scale=demo"
     cell = table.cells[3][table.columns.index("mIoU")]
     assert (cell.mean, cell.published, cell.runs) == (None, 61.79, ())
-    temporal = table_of(data, "temporal/table1")
-    assert "temporal losses" in temporal.cells[1][0].reason
+    temporal = table_of(data, "temporal/table4")
+    cmnext = temporal.cells[temporal.rows.index("CMNeXt")]
+    assert cmnext[0].reason == "the network CMNeXt"
+    columns = table_of(data, "temporal/table1").columns
+    assert columns[-4:] == ("TC", "CA", "TC aligned", "CA aligned")
+    assert "TC aligned: not in the paper." in table_of(data, "temporal/table1").notes
 
 
 def test_the_search_has_its_front(data: ReportData) -> None:

@@ -14,7 +14,7 @@ from analysis.uncertainty.images import Images, _influence, common, prepare
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
-from tests.analysis.uncertainty.simulated import CLASSES, Population, counts_of
+from tests.analysis.uncertainty.simulated import CLASSES, Population, counts_of, pairs_of
 
 METRICS = ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "class/cone/region/1")
 ASKED = [parse(metric) for metric in METRICS]
@@ -118,6 +118,23 @@ def test_resampled_is_the_loop_over_images(monkeypatch: pytest.MonkeyPatch, abse
     assert resampled.shape == (len(METRICS), 100)
     for number in range(0, 100, 7):
         expected = looped(seeds, only[number], absent)
+        np.testing.assert_allclose(resampled[:, number], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("absent", ["released", "exclude"])
+def test_pairs_of_frames_are_drawn_with_all_their_sets(monkeypatch: pytest.MonkeyPatch, absent):
+    seeds = [pairs_of(14, 0.6, seed) for seed in range(2)]
+    metrics = ("TC", "CA", "CA_released", "class/cone/TC")
+    weights = recorded(monkeypatch, "multinomial")
+    images = prepare([seeds], parse("TC"), replace(FEW, absent=absent))
+    (resampled,) = images.resampled([parse(metric) for metric in metrics])
+    (only,) = weights
+    assert only.shape == (100, 14)
+    for number in range(0, 100, 7):
+        expected = [
+            np.mean([value(metric, weighted(each, only[number]), absent) for each in seeds])
+            for metric in metrics
+        ]
         np.testing.assert_allclose(resampled[:, number], expected, rtol=1e-12)
 
 
@@ -309,6 +326,16 @@ def test_other_labels():
         prepare([[a], [replace(b, counts=changed)]], ASKED[0], FEW)
 
 
+def test_other_labels_of_pairs_of_frames():
+    """The label says which matrix a pixel is in; both predictions may differ."""
+    a, b = pairs_of(20, 0.5), pairs_of(20, 0.9, seed=1)
+    prepare([[a], [b]], parse("TC"), FEW)
+    changed = b.counts.copy()
+    changed[7, [0, 1], 0, 0] += [-1, 1]
+    with pytest.raises(InputError, match=r"'00007D' holds other labels .*1 images do"):
+        prepare([[a], [replace(b, counts=changed)]], parse("TC"), FEW)
+
+
 def test_other_predictions_of_the_same_labels_are_no_other_labels():
     a, b = drawn(12, 2)
     changed = b.counts.copy()
@@ -357,3 +384,12 @@ def test_blocks_are_made_for_accuracy_and_miou_of_both_methods_and_their_differe
     first, second = auto.without_each([parse("mIoU"), parse("pixel_accuracy")])
     assert rows.shape == (6, 12)
     np.testing.assert_allclose(rows, np.concatenate([first, second, second - first]))
+
+
+def test_blocks_of_pairs_are_made_for_their_own_scores():
+    counts = pairs_of(40, 0.5)
+    single = prepare([[counts]], parse("TC"), FEW)
+    watched = [parse("TC"), parse("CA")]
+    expected = single.without_each(watched)[0]
+    found = _influence(replace(single, settings=replace(FEW, blocks="auto")))
+    np.testing.assert_allclose(found, expected)

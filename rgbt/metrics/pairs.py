@@ -1,0 +1,201 @@
+"""Pairs of frames: temporal consistency (TC) and consistent accuracy (CA) from counts.
+
+Counts of pairs are ordinary `rgbt.metrics.counts.Counts` of shape (N, S (K + 1), K, K): entry
+``[s (K + 1) + y, p1, p2]`` is the number of pixels that set s of second frames labels y (K: no
+class), and that are p1 in the prediction of the first and p2 in that of the second frame. Their
+partition, e.g. "aligned3", is the protocol and S:
+
+    "aligned":  the first prediction is brought into the second frame; pixels count that the first
+                frame shows and that have a label (Temporal, Fig. 4).
+    "released": the first prediction stays where it is, every pixel counts (Temporal release).
+    "next":     as "aligned", between a frame and the one that was taken after it.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.metrics import names
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Protocol = Literal["aligned", "released", "next"]
+PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
+
+HEADLINES: dict[Protocol, tuple[str, str]] = {
+    "aligned": (names.TC, names.CA),
+    "released": (names.TC, names.CA_RELEASED),
+    "next": (names.TC, names.CA),
+}
+"""The two scores that a protocol is known by: the paper's, and what its release computes."""
+
+Map: TypeAlias = "NDArray[np.integer] | Tensor"
+
+
+def partition_name(protocol: Protocol, sets: int) -> str:
+    """What counts of pairs carry as their partition: "aligned3"."""
+    return f"{protocol}{sets}"
+
+
+def protocol_of(partition: str) -> Protocol | None:
+    """The protocol of a partition; None: the counts are of single frames."""
+    found = re.fullmatch(r"([a-z]+)\d+", partition)
+    return next((each for each in PROTOCOLS if found and found[1] == each), None)
+
+
+def file_name(protocol: Protocol, split: str) -> str:
+    """Where counts of pairs lie inside a run folder."""
+    return f"evaluations/consistency_{protocol}_{split}.npz"
+
+
+def pair_counts(
+    first: Map, second: Map, label: Map, num_classes: int, valid: Map | None = None
+) -> NDArray[np.int64]:
+    """Counts of one pair of frames; several sets of second frames are put one after the other.
+
+    One histogram over ``(min(label, K) K + first) K + second``, in numbers as narrow as they fit;
+    pixels that do not count have a row K + 1, which is dropped.
+
+    Args:
+        first: (H, W) integer 0..K-1, prediction of the first frame as the protocol compares it;
+            anything 0..255 where not `valid`.
+        second: (H, W) integer 0..K-1, prediction of the second frame.
+        label: (H, W) integer 0..255, of the second frame; K and above is no class.
+        num_classes: K, 1..255.
+        valid: (H, W) bool, pixels that count; None: all.
+
+    Returns:
+        (K + 1, K, K): label (row K: no class), first, second. Those of several images add.
+
+    Raises:
+        ValueError: shapes differ, or a prediction that counts is no class.
+    """
+    # Whoever derives scores alone, as tables and comparisons do, need not wait for PyTorch.
+    import torch
+
+    from rgbt.metrics.confusion import LANES
+
+    classes = num_classes
+    if not 1 <= classes <= 255:
+        raise ValueError(f"num_classes must lie in [1, 255], got {classes}.")
+    first_HW, second_HW, label_HW = (
+        torch.as_tensor(each).to(torch.uint8) for each in (first, second, label)
+    )
+    valid_HW = None if valid is None else torch.as_tensor(valid).bool().to(torch.uint8)
+    _check_shapes(first_HW, second_HW, label_HW, valid_HW)
+    if valid_HW is not None:
+        first_HW = first_HW * valid_HW
+    _check_classes(first_HW, classes, "first")
+    _check_classes(second_HW, classes, "second")
+    size = (classes + 2) * classes**2
+    row_HW = label_HW.clamp(max=classes).to(torch.int16 if LANES * size <= 2**15 else torch.int32)
+    if valid_HW is not None:
+        row_HW = torch.maximum(row_HW, (1 - valid_HW).to(row_HW.dtype) * (classes + 1))
+    joint = row_HW.mul_(classes).add_(first_HW).mul_(classes).add_(second_HW)
+    # Neighbours fall into the same bin: two copies of the histogram take turns, see `confusion`.
+    lane = torch.arange(joint.shape[1], device=joint.device) % LANES * size
+    counted = torch.bincount((joint + lane.to(joint.dtype)).view(-1), minlength=LANES * size)
+    shape = (LANES, classes + 2, classes, classes)
+    found: NDArray[np.int64] = counted.view(shape).sum(0)[: classes + 1].cpu().numpy()
+    return found
+
+
+def tc(pairs: Matrices, absent: Absent) -> Scores:
+    """Temporal consistency of each class: IoU of the two predictions.
+
+        |P1 = P2 = c| / |P1 = c or P2 = c|,  of every set alone, then the mean over the S sets
+
+    Pixels without a label count where the protocol counted them.
+
+    Source: Temporal, Fig. 4; release, evaluation code.
+
+    Args:
+        pairs: (..., S (K + 1), K, K), summed over images.
+        absent: a class that neither frame of a set shows: "released" 0 (the release, whose
+            denominator has 1e-10 more); "exclude" NaN, left out of the mean over the sets.
+
+    Returns:
+        (..., K) fractions 0..1; NaN where no set shows the class.
+
+    Raises:
+        ValueError: the rows are no whole number of sets.
+    """
+    return _over_sets(iou(_by_set(pairs).sum(-3), absent))
+
+
+def ca(pairs: Matrices, absent: Absent) -> Scores:
+    """Consistent accuracy of each class: both predictions and the label over their exact union.
+
+        |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
+
+    Source: Temporal, Fig. 4 (E over A + ... + G). Arguments, result and errors as of `tc`.
+    """
+    three, sizes, overlaps = _triples(pairs)
+    return _over_sets(ratio(three, sizes - overlaps + three, absent))
+
+
+def ca_released(pairs: Matrices, absent: Absent) -> Scores:
+    """`ca` as coded, which counts what two of the three share, and not the third, twice.
+
+        |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
+
+    Never above `ca`.
+
+    Source: Temporal release, evaluation code.
+    """
+    three, sizes, _ = _triples(pairs)
+    return _over_sets(ratio(three, sizes - 2 * three, absent))
+
+
+def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
+    """What all three say, the sum of the three sizes, that of the overlaps of two: (..., S, K)."""
+    by_set = _by_set(pairs)
+    labelled = by_set[..., :-1, :, :]
+    frames = by_set.sum(-3)
+    three = np.einsum("...ccc->...c", labelled)
+    sizes = frames.sum(-1) + frames.sum(-2) + labelled.sum((-1, -2))
+    overlaps = _diagonal(frames) + _diagonal(labelled.sum(-1)) + _diagonal(labelled.sum(-2))
+    return three, sizes, overlaps
+
+
+def _by_set(pairs: Matrices) -> Scores:
+    """(..., S, K + 1, K, K); float64, whose sums of whole numbers are exact."""
+    *leading, rows, classes, _ = pairs.shape
+    if rows % (classes + 1):
+        raise ValueError(
+            f"pairs: expected S x {classes + 1} rows (labels of {classes} classes, and none), got "
+            f"{rows}."
+        )
+    return np.asarray(pairs, np.float64).reshape(*leading, -1, classes + 1, classes, classes)
+
+
+def _over_sets(scores: Scores) -> Scores:
+    """(..., S, K) -> (..., K)."""
+    return class_mean(np.swapaxes(scores, -1, -2))
+
+
+def _diagonal(matrices: Scores) -> Scores:
+    return np.diagonal(matrices, axis1=-2, axis2=-1)
+
+
+def _check_shapes(*maps: Tensor | None) -> None:
+    shapes = [tuple(each.shape) for each in maps if each is not None]
+    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
+        raise ValueError(
+            "first, second, label and valid: expected maps H x W of one shape, got "
+            f"{', '.join(map(str, shapes))}."
+        )
+
+
+def _check_classes(prediction_HW: Tensor, classes: int, name: str) -> None:
+    if int(prediction_HW.max()) >= classes:
+        raise ValueError(
+            f"{name}: expected classes 0..{classes - 1}, got {int(prediction_HW.max())}."
+        )

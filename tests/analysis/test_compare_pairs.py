@@ -1,0 +1,157 @@
+"""``python -m analysis.compare frames=...``: differences in TC and CA from counts of pairs."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from analysis.compare import OWN, main, metrics_of
+from analysis.results import open_counts
+from analysis.uncertainty import Resampling, compare
+from rgbt.checks import InputError
+from rgbt.command import plain_command
+from rgbt.metrics.named import value
+from rgbt.metrics.pairs import PROTOCOLS, file_name
+from tests.analysis.test_results import make_run
+from tests.analysis.uncertainty.simulated import pairs_of
+from tests.commands import Call, assert_one_sentence
+
+ENTRY = plain_command(OWN, main)
+FAST = ("resamples=200", "blocks=none")
+IMAGES = 40
+NIGHT = tuple(place < 15 for place in range(IMAGES))
+AGREE = {"plain": 0.5, "temporal": 0.7}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two groups of two seeds, with pairs by two protocols; a run without any."""
+    runs = tmp_path_factory.mktemp("pairs") / "runs"
+    for group, agree in AGREE.items():
+        for seed in range(2):
+            folder = make_run(runs, f"{group}{seed}", group, seed)
+            (folder / "evaluations").mkdir()
+            for protocol in ("aligned", "released"):
+                counts = pairs_of(IMAGES, agree, seed, NIGHT)
+                partition = f"{protocol}3"
+                replace(counts, partition=partition).save(folder / file_name(protocol, "test"))
+    make_run(runs, "bare0", "bare", 0)
+    return runs
+
+
+def groups(runs: Path) -> tuple[str, ...]:
+    return f"runs_dir={runs}", "a=plain", "b=temporal"
+
+
+def test_a_difference_in_tc_has_its_interval_over_images_and_seeds(
+    call: Call, runs: Path, tmp_path: Path
+):
+    words = (*groups(runs), *FAST, "frames=aligned", f"out={tmp_path}")
+    code, out, err = call(ENTRY, *words)
+    assert (code, err) == (0, "")
+    assert "temporal less plain: 40 single images, aligned3" in out
+    assert "The TC of temporal is " in out
+    assert "over 2 trainings each and 40 images" in out
+    rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))
+    auto = ["TC", "CA", "day/TC", "day/CA", "night/TC", "night/CA"]
+    assert [row["metric"] for row in rows] == auto
+    mean = {
+        group: sum(value("TC", pairs_of(IMAGES, agree, seed), "released") for seed in (0, 1)) / 2
+        for group, agree in AGREE.items()
+    }
+    assert float(rows[0]["a"]) == pytest.approx(mean["plain"])
+    assert float(rows[0]["difference"]) == pytest.approx(mean["temporal"] - mean["plain"])
+    assert 0 < float(rows[0]["both_low"]) < mean["temporal"] - mean["plain"]
+
+
+def test_metrics_that_are_asked_for(call: Call, runs: Path, tmp_path: Path):
+    metrics = "CA,class/car/TC,night/class/cone/CA_released"
+    words = (*groups(runs), *FAST, "frames=released", f"metrics={metrics}", f"out={tmp_path}")
+    assert call(ENTRY, *words)[0] == 0
+    lines = (tmp_path / "comparison.csv").read_text().splitlines()[1:]
+    assert [line.split(",")[0] for line in lines] == metrics.split(",")
+
+
+def test_seeds_of_one_method_are_no_difference():
+    same = [pairs_of(IMAGES, 0.5, seed) for seed in range(4)]
+    settings = Resampling(resamples=400, blocks="none")
+    (found,) = compare(same[:2], same[2:], ["TC"], settings).differences
+    assert found.both is not None
+    assert 0.0 in found.both
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_auto_metrics_are_those_of_the_protocol(protocol):
+    counts = replace(pairs_of(IMAGES, 0.5, night=NIGHT), partition=f"{protocol}3")
+    second = "CA_released" if protocol == "released" else "CA"
+    whole = ["TC", second]
+    parts = [f"{part}/{metric}" for part in ("day", "night") for metric in whole]
+    assert metrics_of("auto", [counts], Resampling()) == [*whole, *parts]
+    one_part = replace(counts, night=None)
+    assert metrics_of("auto", [counts, one_part], Resampling()) == whole
+
+
+def test_runs_groups_and_files_are_opened(runs: Path):
+    found = open_counts("plain", runs, frames="released")
+    assert [each.key for each in found] == ["plain0", "plain1"]
+    path = runs / "plain1" / file_name("aligned", "test")
+    for frames in ("aligned", ""):
+        (file,) = open_counts(str(path), runs, frames=frames)
+        # Of the file's name nothing tells whose counts it holds.
+        assert (file.label, file.counts.partition) == ("plain1", "aligned3")
+
+
+def test_files_compare_without_frames(call: Call, runs: Path):
+    files = [
+        f"{side}={runs}/{run}0/{file_name('aligned', 'test')}" for side, run in zip("ab", AGREE)
+    ]
+    code, out, _ = call(ENTRY, *files, *FAST)
+    assert code == 0
+    assert "temporal0 less plain0: 40 single images, aligned3" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["frames=virtual"], "frames: 'virtual' is not a choice; known: aligned, next, released"),
+        (
+            ["a=plain0", "b=bare0", "metrics=TC"],
+            "'TC' is a score of pairs of frames, but these counts (ring2) are of",
+        ),
+        (["frames=aligned", "metrics=mIoU"], "'mIoU' is a score of single frames, but these"),
+        (["frames=aligned", "metrics=TC,Var"], "'Var' is a score of single frames, but these"),
+        (["frames=aligned", "metrics=region/1"], "python -m rgbt.consistency run=..."),
+        (["frames=aligned", "metrics=class/cat/TC"], "no class 'cat'; did you mean 'car'?"),
+        (["frames=next"], "plain0 split=test frames=next makes them once it is finished"),
+        (
+            ["frames=aligned", "split=val"],
+            "no counts of pairs of frames evaluations/consistency_al",
+        ),
+        (["frames=aligned", "b=bare"], "python -m rgbt.consistency run="),
+        (["frames=aligned", "b=bare"], "bare0 split=test frames=virtual makes them"),
+        (["frames=aligned", "b={runs}/bare0/counts_test.npz"], "is by ring2, but frames=aligned"),
+        (
+            ["frames=aligned", "b={runs}/temporal0/evaluations/consistency_released_test.npz"],
+            "is by released3, but frames=aligned was asked for",
+        ),
+        (
+            ["a=plain0", "b={runs}/temporal0/evaluations/consistency_released_test.npz"],
+            "counts by ring2 cannot be compared with counts by released3",
+        ),
+    ],
+)
+def test_nonsense_is_refused(call: Call, runs: Path, words: list[str], sentence: str):
+    given = dict(word.split("=", 1) for word in (*groups(runs), *FAST))
+    given |= dict(word.format(runs=runs).split("=", 1) for word in words)
+    code, out, err = call(ENTRY, *(f"{key}={text}" for key, text in given.items()))
+    assert (code, out) == (2, "")
+    assert_one_sentence(err, sentence)
+
+
+def test_two_protocols_are_not_compared(runs: Path):
+    a, b = (open_counts("plain0", runs, frames=each)[0].counts for each in ("aligned", "released"))
+    with pytest.raises(InputError, match="by one partition \\(rgbt.consistency frames="):
+        compare([a], [b], ["TC"], Resampling())

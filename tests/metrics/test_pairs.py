@@ -1,0 +1,332 @@
+"""TC and CA by hand, by sets of pixels, and against the released evaluation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rgbt.metrics.pairs import (
+    HEADLINES,
+    PROTOCOLS,
+    ca,
+    ca_released,
+    file_name,
+    pair_counts,
+    partition_name,
+    protocol_of,
+    tc,
+)
+from rgbt.metrics.scores import class_mean
+
+SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
+GOLDEN = SHARED / "golden" / "losses.npz"
+BOTH = ["released", "exclude"]
+
+FIRST = np.array([[0, 1, 1, 2], [2, 2, 0, 0]], np.uint8)
+SECOND = np.array([[0, 1, 2, 2], [2, 1, 0, 1]], np.uint8)
+LABEL = np.array([[0, 1, 2, 2], [1, 2, 0, 1]], np.uint8)
+
+
+def maps(seed: int, classes: int = 5, hw: tuple[int, int] = (23, 31)) -> tuple[Any, Any, Any, Any]:
+    """Two predictions that often agree with each other and the label, which has gaps; a mask."""
+    rng = np.random.default_rng(seed)
+    label = rng.integers(0, classes, hw).astype(np.uint8)
+    first = np.where(rng.random(hw) < 0.7, label, rng.integers(0, classes, hw)).astype(np.uint8)
+    second = np.where(rng.random(hw) < 0.7, first, rng.integers(0, classes, hw)).astype(np.uint8)
+    label[rng.random(hw) < 0.1] = 255
+    return first, second, label, rng.random(hw) < 0.8
+
+
+def by_sets_of_pixels(first, second, label, valid, classes: int) -> dict[str, list[float]]:
+    """TC, CA and the coded CA of each class; NaN for 0 / 0."""
+    found: dict[str, list[float]] = {"tc": [], "ca": [], "coded": []}
+    for number in range(classes):
+        one, two, truth = (
+            set(np.flatnonzero((each == number) & valid)) for each in (first, second, label)
+        )
+        three = len(one & two & truth)
+        coded = len(one) + len(two) + len(truth) - 2 * three
+        for name, part, whole in (
+            ("tc", len(one & two), len(one | two)),
+            ("ca", three, len(one | two | truth)),
+            ("coded", three, coded),
+        ):
+            found[name].append(part / whole if whole else np.nan)
+    return found
+
+
+# Counting.
+
+
+def test_counts_by_hand() -> None:
+    first = np.array([[0, 1], [1, 1]], np.uint8)
+    second = np.array([[0, 0], [1, 1]], np.uint8)
+    label = np.array([[0, 1], [1, 255]], np.uint8)
+    counts = pair_counts(first, second, label, 2)
+    # [label, first, second]: (0, 0, 0), (1, 1, 0), (1, 1, 1) and, without a label, (2, 1, 1).
+    expected = [[[1, 0], [0, 0]], [[0, 0], [1, 1]], [[0, 0], [0, 1]]]
+    assert counts.tolist() == expected
+    assert counts.dtype == np.int64
+    dropped = np.array([[True, False], [True, False]])
+    assert pair_counts(first, second, label, 2, dropped).tolist() == [
+        [[1, 0], [0, 0]],
+        [[0, 0], [0, 1]],
+        [[0, 0], [0, 0]],
+    ]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("classes", [1, 2, 9, 24, 25, 40, 150])
+def test_equal_to_a_loop_over_pixels(classes: int, masked: bool) -> None:
+    # 24 and 25 classes: the numbers of the histogram grow from 16 to 32 bits.
+    first, second, label, valid = maps(classes, classes)
+    chosen = valid if masked else np.ones_like(valid)
+    expected = np.zeros((classes + 1, classes, classes), int)
+    np.add.at(expected, (np.minimum(label, classes)[chosen], first[chosen], second[chosen]), 1)
+    found = pair_counts(first, second, label, classes, valid if masked else None)
+    assert np.array_equal(found, expected)
+
+
+def test_the_most_classes_fit() -> None:
+    last = np.full((2, 3), 254, np.uint8)
+    found = pair_counts(last, last, np.array([[254, 255, 0]] * 2), 255, last > 0)
+    assert found[254, 254, 254] == found[255, 254, 254] == found[0, 254, 254] == 2
+    assert found.sum() == 6
+
+
+def test_tensors_arrays_and_types_count_alike() -> None:
+    first, second, label, valid = maps(0)
+    expected = pair_counts(first, second, label, 5, valid)
+    wide = [torch.from_numpy(each.astype(np.int64)) for each in (first, second, label)]
+    assert np.array_equal(pair_counts(*wide, 5, torch.from_numpy(valid)), expected)
+    assert np.array_equal(pair_counts(wide[0], second, label, 5, valid.astype(np.uint8)), expected)
+
+
+def test_inputs_are_left_as_they_are() -> None:
+    given = maps(1)
+    kept = [each.copy() for each in given]
+    pair_counts(*given[:3], 5, given[3])
+    assert all(np.array_equal(each, copy) for each, copy in zip(given, kept, strict=True))
+
+
+def test_what_does_not_count_need_be_no_class() -> None:
+    """The first prediction brought into the second frame is nothing where that shows more."""
+    first = np.array([[255, 1]], np.uint8)
+    second = label = np.array([[0, 1]], np.uint8)
+    assert pair_counts(first, second, label, 2, first < 2).sum() == 1
+    with pytest.raises(ValueError, match=r"first: expected classes 0\.\.1, got 255"):
+        pair_counts(first, second, label, 2)
+
+
+def test_refuses_what_cannot_be_counted() -> None:
+    zeros = np.zeros((4, 4), np.uint8)
+    with pytest.raises(ValueError, match=r"one shape, got \(4, 4\), \(4, 5\), \(4, 4\)"):
+        pair_counts(zeros, np.zeros((4, 5), np.uint8), zeros, 3)
+    with pytest.raises(ValueError, match=r"\(4, 4\), \(4,\)"):
+        pair_counts(zeros, zeros, zeros, 3, np.ones(4, bool))
+    with pytest.raises(ValueError, match="maps H x W"):
+        pair_counts(zeros[None], zeros[None], zeros[None], 3)
+    with pytest.raises(ValueError, match=r"second: expected classes 0\.\.2, got 3"):
+        pair_counts(zeros, zeros + 3, zeros, 3)
+    with pytest.raises(ValueError, match="num_classes"):
+        pair_counts(zeros, zeros, zeros, 256)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_counts_on_the_gpu() -> None:
+    given = maps(2)
+    there = [torch.from_numpy(each).cuda() for each in given]
+    expected = pair_counts(*given[:3], 5, given[3])
+    assert np.array_equal(pair_counts(there[0], there[1], there[2], 5, there[3]), expected)
+
+
+# Scores.
+
+
+@pytest.mark.parametrize("absent", BOTH)
+def test_scores_by_hand(absent) -> None:
+    counts = pair_counts(FIRST, SECOND, LABEL, 3)
+    np.testing.assert_allclose(tc(counts, absent), [2 / 3, 1 / 4, 2 / 4])
+    np.testing.assert_allclose(ca(counts, absent), [2 / 3, 1 / 5, 1 / 4])
+    np.testing.assert_allclose(ca_released(counts, absent), [2 / 3, 1 / 6, 1 / 7])
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("masked", [False, True])
+def test_equal_to_sets_of_pixels(seed: int, masked: bool) -> None:
+    first, second, label, valid = maps(seed, 9, (6, 9))
+    chosen = valid & (label < 9) if masked else np.ones_like(valid)
+    counts = pair_counts(first, second, label, 9, chosen if masked else None)
+    expected = by_sets_of_pixels(first, second, label, chosen, 9)
+    np.testing.assert_allclose(tc(counts, "exclude"), expected["tc"])
+    np.testing.assert_allclose(ca(counts, "exclude"), expected["ca"])
+    np.testing.assert_allclose(ca_released(counts, "exclude"), expected["coded"])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_coded_ca_is_never_above_the_exact_one_and_neither_above_tc(seed: int) -> None:
+    counts = pair_counts(*maps(seed)[:3], 5)
+    assert (ca_released(counts, "released") <= ca(counts, "released")).all()
+    assert (ca_released(counts, "released") < ca(counts, "released")).any()
+    assert (ca(counts, "released") <= tc(counts, "released")).all()
+
+
+def test_both_forms_of_ca_agree_without_an_overlap_of_two_alone() -> None:
+    first = np.array([[0, 1, 2, 0]])
+    second = np.array([[0, 2, 0, 1]])
+    label = np.array([[0, 0, 1, 2]])
+    counts = pair_counts(first, second, label, 3)
+    assert np.array_equal(ca(counts, "released"), ca_released(counts, "released"))
+
+
+def test_a_consistent_predictor_scores_all_under_aligned() -> None:
+    """Wrong everywhere, but alike in both frames; what frame 1 does not show does not count."""
+    rng = np.random.default_rng(0)
+    scene = rng.integers(0, 4, (20, 40))
+    first_view, second = scene[:, :30], scene[:, 6:36]  # the camera turns by 6 pixels
+    warped = np.full((20, 30), 255)
+    warped[:, :24] = first_view[:, 6:]
+    label = (second + 1) % 4
+    aligned = pair_counts(warped, second, label, 4, warped < 255)
+    assert tc(aligned, "exclude").tolist() == [1.0] * 4
+    assert ca(aligned, "exclude").tolist() == [0.0] * 4
+    right = pair_counts(warped, second, second, 4, warped < 255)
+    assert ca(right, "exclude").tolist() == [1.0] * 4
+    # Left where it was, the first prediction meets the second one by chance alone.
+    released = pair_counts(first_view, second, second, 4)
+    assert (tc(released, "released") < 0.3).all()
+
+
+def test_pixels_without_a_label_are_kept_apart() -> None:
+    first = np.array([[0, 1, 1]])
+    second = np.array([[0, 1, 0]])
+    label = np.array([[0, 255, 1]])
+    released = pair_counts(first, second, label, 2)
+    np.testing.assert_allclose(tc(released, "released"), [1 / 2, 1 / 2])
+    np.testing.assert_allclose(ca_released(released, "released"), [1 / 2, 0])
+    np.testing.assert_allclose(ca(released, "released"), [1 / 2, 0])
+    aligned = pair_counts(first, second, label, 2, label < 2)
+    np.testing.assert_allclose(tc(aligned, "released"), [1 / 2, 0])
+
+
+def test_absent_classes_by_hand() -> None:
+    # Class 1 is labelled and never predicted; class 2 is nowhere.
+    nothing, label = np.zeros((1, 4), np.uint8), np.array([[0, 0, 0, 1]])
+    counts = pair_counts(nothing, nothing, label, 3)
+    np.testing.assert_array_equal(tc(counts, "released"), [1, 0, 0])
+    np.testing.assert_array_equal(tc(counts, "exclude"), [1, np.nan, np.nan])
+    np.testing.assert_array_equal(ca(counts, "exclude"), [3 / 4, 0, np.nan])
+    np.testing.assert_array_equal(ca(counts, "released"), [3 / 4, 0, 0])
+
+
+@pytest.mark.parametrize(("absent", "expected"), [("released", 1 / 3), ("exclude", 1 / 2)])
+def test_the_mean_is_over_sets_not_over_their_pixels(absent, expected: float) -> None:
+    # Class 0: alike in 1 of 1 pixel, in 0 of 9, and in the third set nowhere. Pooled: 1 / 10.
+    one, none = np.zeros((1, 1), np.uint8), np.zeros((1, 9), np.uint8)
+    sets = [
+        pair_counts(one, one, one, 2),
+        pair_counts(none, none + 1, none, 2),
+        pair_counts(none + 1, none + 1, none + 1, 2),
+    ]
+    counts = np.concatenate(sets)
+    assert counts.shape == (9, 2, 2)
+    assert tc(counts, absent)[0] == pytest.approx(expected)
+    assert ca(counts, absent)[0] == pytest.approx(expected)
+    assert tc(sum(sets), absent)[0] == pytest.approx(1 / 10)
+
+
+def test_leading_dimensions_are_kept() -> None:
+    counts = np.random.default_rng(0).integers(0, 50, (3, 5, 2 * 5, 4, 4), np.int32)
+    for score in (tc, ca, ca_released):
+        every = score(counts, "released")
+        assert every.shape == (3, 5, 4)
+        np.testing.assert_array_equal(every[1, 2], score(counts[1, 2], "released"))
+        np.testing.assert_array_equal(every, score(counts.astype(np.float64), "released"))
+
+
+def test_sums_do_not_overflow_the_stored_type() -> None:
+    counts = np.full((3, 2, 2), 2**30, np.int32)
+    np.testing.assert_allclose(tc(counts, "released"), [1 / 3, 1 / 3])
+    # Of 12 equal cells each prediction says a class in 6, the label in 4; two of them share 3 + 2
+    # + 2, all three 1: 16 - 7 + 1.
+    np.testing.assert_allclose(ca(counts, "released"), [1 / 10, 1 / 10])
+
+
+def test_rows_that_are_no_whole_number_of_sets() -> None:
+    with pytest.raises(ValueError, match="expected S x 4 rows .* got 5"):
+        tc(np.zeros((5, 3, 3)), "released")
+
+
+# The released evaluation.
+
+
+@pytest.fixture(scope="module")
+def golden() -> Any:
+    if not GOLDEN.exists():
+        pytest.skip("reference material is not beside the checkout")
+    return np.load(GOLDEN)
+
+
+def frames_of(golden: Any, protocol: str) -> list[np.ndarray]:
+    """Counts of the four frames."""
+    found = []
+    for number in range(4):
+        name = f"consistency.frame{number}"
+        second, label = golden[f"{name}.p2"], golden[f"{name}.y2"]
+        if protocol == "aligned":
+            found.append(pair_counts(golden[f"{name}.p12"], second, label, 9, label < 9))
+        else:
+            found.append(pair_counts(golden[f"{name}.p1"], second, label, 9))
+    return found
+
+
+@pytest.mark.parametrize(("protocol", "union"), [("release", ca_released), ("aligned", ca)])
+def test_each_frame_is_equal_to_the_reference(golden: Any, protocol: str, union) -> None:
+    for number, counts in enumerate(frames_of(golden, protocol)):
+        for name, score in (("tc", tc), ("ca", union)):
+            stored = golden[f"consistency.frame{number}.{protocol}.{name}_intersection_union"]
+            # Counts of both are below 3072: equal quotients in this precision are equal counts.
+            expected = np.divide(*stored, out=np.full(9, np.nan), where=stored[1] > 0)
+            np.testing.assert_allclose(score(counts, "exclude"), expected, rtol=1e-14)
+
+
+def test_all_frames_are_equal_to_the_release(golden: Any) -> None:
+    counts = sum(frames_of(golden, "release"))
+    for name, score in (("tc", tc), ("ca", ca_released)):
+        found = score(counts, "released")
+        # 1e-10 in the released denominator moves the quotient by less than 1e-12.
+        expected = golden[f"consistency.release.{name}_per_class"]
+        np.testing.assert_allclose(found, expected, atol=1e-12, rtol=0)
+        mean = golden[f"consistency.release.{name}_mean"]
+        assert class_mean(found) == pytest.approx(float(mean), abs=1e-12)
+
+
+def test_all_frames_are_equal_to_the_aligned_reference(golden: Any) -> None:
+    counts = sum(frames_of(golden, "aligned"))
+    for name, score in (("tc", tc), ("ca", ca)):
+        found = score(counts, "exclude")
+        expected = golden[f"consistency.aligned.{name}_per_class"]
+        np.testing.assert_allclose(found, expected, atol=1e-12, rtol=0)
+        mean = golden[f"consistency.aligned.{name}_mean_present"]
+        assert class_mean(found) == pytest.approx(float(mean), abs=1e-12)
+
+
+# Names.
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_protocol_is_read_from_the_partition(protocol) -> None:
+    assert protocol_of(partition_name(protocol, 3)) == protocol
+    assert file_name(protocol, "val") == f"evaluations/consistency_{protocol}_val.npz"
+    assert HEADLINES[protocol][0] == "TC"
+
+
+@pytest.mark.parametrize("partition", ["ring5", "ring9_released_3_4", "vertical3", "aligned", ""])
+def test_regions_are_no_protocol(partition: str) -> None:
+    assert protocol_of(partition) is None
