@@ -47,6 +47,59 @@ class Poly:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LatePoly:
+    """Poly as the CMX and temporal releases run it: every rate is written after its step.
+
+    The first step goes at the full base rate. Step s, which is step i of epoch e (all from 0), sets
+    the rate of the step after it from a count t, in which an epoch of E steps is taken for C:
+
+        t = C e + i,  T = C epochs,  W = C (epochs of warm-up)
+        factor = t / W where t < W, else (1 - t / T) ** power
+
+    So the second step has rate 0, and where C > E, t jumps by C - E at the start of every epoch.
+    A run of n steps, other than the E epochs of the release, keeps the shape of its curve:
+
+        t = s + e (C / E - 1) n / epochs,  e = floor(s epochs / n),  T = n C / E
+
+    Source: CMX release (E = C), temporal release (E = 1568, C = 1874: computed from the 1873
+    images of another data set).
+
+    Attributes:
+        power: 0.9 in both releases.
+        warmup_steps: of the run, whose W is then warmup_steps C / E.
+        epochs: that the run is divided into.
+        epoch_steps: E, >= 1.
+        counted_steps: C, >= E.
+    """
+
+    power: float
+    warmup_steps: int
+    epochs: int
+    epoch_steps: int
+    counted_steps: int
+
+    def __post_init__(self) -> None:
+        check_range("schedule.power", self.power, 0.0, 100.0)
+        check_range("schedule.warmup_steps", self.warmup_steps, 0, 2**40)
+        check_range("schedule.epochs", self.epochs, 1, 2**40)
+        check_range("schedule.epoch_steps", self.epoch_steps, 1, 2**40)
+        check_range("schedule.counted_steps", self.counted_steps, self.epoch_steps, 2**40)
+
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
+        """See `Schedule`."""
+        if step == 0:
+            return 1.0
+        done = step - 1
+        epoch = done * self.epochs // max_steps
+        # t, W and T of the docstring times E * epochs: whole numbers, so that t = W is met exactly.
+        extra = (self.counted_steps - self.epoch_steps) * max_steps
+        count = done * self.epoch_steps * self.epochs + epoch * extra
+        warmup = self.warmup_steps * self.counted_steps * self.epochs
+        total = max_steps * self.counted_steps * self.epochs
+        return count / warmup if count < warmup else float((1.0 - count / total) ** self.power)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Exponential:
     """``factor ** epoch``, epochs counted from 0 and rounded down.
 

@@ -1,21 +1,21 @@
 """The augmentation chain of CRM and SpatialSeg: resize, crop, colour, flip.
 
 What a configuration names. Results are not padded: networks pad images to a multiple of 32 with
-their mean colour, and losses pad labels with "ignore" (`rgbt.geometry`).
+their mean colour, and losses pad labels with "ignore" (`rgbt.geometry.padding`).
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, check_range
-from rgbt.transforms.example import Example
-from rgbt.transforms.joint import View, draw_view, short_edge_hw, whole_view
+from rgbt.checks import check_choice, check_range
+from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.joint import check_lengths, draw_view, short_edge_hw
 from rgbt.transforms.photometric import ColourJitter
-from rgbt.types import IGNORE, Sample
+from rgbt.types import Sample
 
 
 class CrmTransform:
@@ -83,7 +83,12 @@ class CrmTransform:
         )
         check_choice("transform.colour", colour, ("intended", "released"))
         check_range("transform.flip_probability", flip_probability, 0, 1)
-        self._check_lengths()
+        check_lengths(
+            sizes=sizes,
+            max_size=(max_size,),
+            crop_hw=crop_hw,
+            test_short_edge=(test_short_edge,),
+        )
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example.
@@ -92,7 +97,7 @@ class CrmTransform:
             sample: as it lies on disk; without a label, all pixels are ignored.
             rng: every draw comes from here.
         """
-        source_hw = _hw(sample)
+        source_hw = image_hw(sample)
         resized_hw = source_hw
         if self.sizes is not None:
             short_edge = int(rng.choice(self.sizes))
@@ -100,63 +105,21 @@ class CrmTransform:
         crop_hw = self.crop_hw or resized_hw
         view = draw_view(source_hw, resized_hw, crop_hw, self.flip_probability, rng)
         # Colours change pixel by pixel, so that it does not matter that the flip comes before.
-        rgb = self.jitter.rgb(self._image(sample.rgb, view), rng)
-        thermal = self.jitter.thermal(self._image(sample.thermal, view), rng)
-        return self._example(sample, view, rgb, thermal, view.nearest(_label(sample)))
+        example = viewed(sample, view, self.dtype, track_position=self.track_position)
+        rgb = self.jitter.rgb(example.rgb, rng)
+        thermal = self.jitter.thermal(example.thermal, rng)
+        return replace(
+            example,
+            rgb=rgb.astype(self.dtype, copy=False),
+            thermal=thermal.astype(self.dtype, copy=False),
+        )
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
-        source_hw = _hw(sample)
-        resized_hw = source_hw
-        if self.test_short_edge is not None:
-            resized_hw = short_edge_hw(source_hw, self.test_short_edge, self.max_size)
-        view = whole_view(source_hw, resized_hw)
-        rgb, thermal = self._image(sample.rgb, view), self._image(sample.thermal, view)
-        return self._example(sample, view, rgb, thermal, _label(sample))
-
-    def _image(self, image: NDArray[np.uint8], view: View) -> NDArray[Any]:
-        return view.bilinear(image, self.dtype)
-
-    def _example(
-        self,
-        sample: Sample,
-        view: View,
-        rgb: NDArray[Any],
-        thermal: NDArray[Any],
-        label: NDArray[np.uint8],
-    ) -> Example:
-        return Example(
-            rgb=rgb.astype(self.dtype, copy=False),
-            thermal=thermal.astype(self.dtype, copy=False),
-            label=label,
-            centre_yx=view.centre_yx(),
-            position=view.position() if self.track_position else None,
-            original_hw=view.source_hw,
-            name=sample.name,
+        return evaluated(
+            sample,
+            self.test_short_edge,
+            self.max_size,
+            self.dtype,
+            track_position=self.track_position,
         )
-
-    def _check_lengths(self) -> None:
-        lengths = {
-            "sizes": self.sizes,
-            "max_size": (self.max_size,),
-            "crop_hw": self.crop_hw,
-            "test_short_edge": (self.test_short_edge,),
-        }
-        for key, values in lengths.items():
-            if values is None:
-                continue
-            if not values or any(value is not None and value < 1 for value in values):
-                raise InputError(
-                    f"transform.{key} must hold lengths of at least 1 pixel, got {list(values)}."
-                )
-
-
-def _hw(sample: Sample) -> tuple[int, int]:
-    height, width = sample.thermal.shape
-    return height, width
-
-
-def _label(sample: Sample) -> NDArray[np.uint8]:
-    if sample.label is None:
-        return np.full(_hw(sample), IGNORE, np.uint8)
-    return sample.label

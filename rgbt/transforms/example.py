@@ -1,4 +1,4 @@
-"""What a transform returns."""
+"""What a transform returns, and how it is made of a sample and a view."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
+
+from rgbt.transforms.joint import View, short_edge_hw, whole_view
+from rgbt.types import IGNORE, Sample
 
 
 @dataclass(frozen=True)
 class Example:
-    """A sample after the transform, not padded.
+    """A sample after the transform, not padded to what a network asks for.
 
     Attributes:
         rgb: (H, W, 3), uint8 or float32, 0..255, RGB order.
@@ -33,3 +36,70 @@ class Example:
     position: NDArray[np.float32] | None
     original_hw: tuple[int, int]
     name: str
+
+
+def image_hw(sample: Sample) -> tuple[int, int]:
+    """Size of a sample's images in pixels."""
+    height, width = sample.thermal.shape
+    return height, width
+
+
+def viewed(sample: Sample, view: View, dtype: DTypeLike, *, track_position: bool) -> Example:
+    """RGB, thermal and label of a sample through one view; without a label, all are ignored.
+
+    Args:
+        sample: as it lies on disk.
+        view: of images of its size.
+        dtype: of the images: uint8, rounded, or float32.
+        track_position: whether the example carries the map of source positions.
+    """
+    return _example(sample, view, dtype, view.nearest(_label(sample)), track_position)
+
+
+def evaluated(
+    sample: Sample,
+    short_edge: int | None,
+    max_size: int | None,
+    dtype: DTypeLike,
+    *,
+    track_position: bool,
+) -> Example:
+    """The whole images of a sample, resized where that is asked for; the label as it is.
+
+    Args:
+        sample: as it lies on disk.
+        short_edge: of the images in pixels; None keeps their size.
+        max_size: limit of their long edge in pixels (see `short_edge_hw`).
+        dtype: see `viewed`.
+        track_position: see `viewed`.
+    """
+    source_hw = image_hw(sample)
+    resized_hw = source_hw
+    if short_edge is not None:
+        resized_hw = short_edge_hw(source_hw, short_edge, max_size)
+    view = whole_view(source_hw, resized_hw)
+    return _example(sample, view, dtype, _label(sample), track_position)
+
+
+def _example(
+    sample: Sample,
+    view: View,
+    dtype: DTypeLike,
+    label: NDArray[np.uint8],
+    track_position: bool,
+) -> Example:
+    return Example(
+        rgb=view.bilinear(sample.rgb, dtype),
+        thermal=view.bilinear(sample.thermal, dtype),
+        label=label,
+        centre_yx=view.centre_yx(),
+        position=view.position() if track_position else None,
+        original_hw=view.source_hw,
+        name=sample.name,
+    )
+
+
+def _label(sample: Sample) -> NDArray[np.uint8]:
+    if sample.label is None:
+        return np.full(image_hw(sample), IGNORE, np.uint8)
+    return sample.label

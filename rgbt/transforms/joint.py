@@ -8,13 +8,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from rgbt.checks import InputError
+
 Indices = NDArray[np.int64]
+
+
+class Part(NamedTuple):
+    """A rectangle of an image: its first row and column, and how many it has."""
+
+    top: int
+    left: int
+    height: int
+    width: int
 
 
 @dataclass(frozen=True)
@@ -23,10 +34,11 @@ class View:
 
     Attributes:
         source_hw: size of the original image.
-        resized_hw: size of the whole image after resizing.
+        resized_hw: size of the whole image, or of `part`, after resizing.
         corner_yx: top-left pixel of the window in the resized image.
         window_hw: size of the window; corner + size stay within `resized_hw`.
         flipped: whether the window is mirrored left to right.
+        part: what is resized, as if the rest of the original were not there; None for all of it.
     """
 
     source_hw: tuple[int, int]
@@ -34,11 +46,12 @@ class View:
     corner_yx: tuple[int, int]
     window_hw: tuple[int, int]
     flipped: bool = False
+    part: Part | None = None
 
     def bilinear(self, image: NDArray[np.uint8], dtype: DTypeLike) -> NDArray[Any]:
         """The view of an image, bilinear with half-pixel centres, without antialiasing.
 
-        Equal to resizing the whole image and cutting the window out of it.
+        Equal to resizing all of the image (or its part) and cutting the window out of that.
 
         Args:
             image: (H, W) or (H, W, C), uint8.
@@ -47,10 +60,12 @@ class View:
         Returns:
             window_hw and the same channels, of `dtype`.
         """
-        rows = _aligned_block(self.source_hw[0], self.resized_hw[0], self._span(0))
-        columns = _aligned_block(self.source_hw[1], self.resized_hw[1], self._span(1))
-        block = image[rows.source, columns.source].astype(dtype, copy=False)
-        if self.resized_hw != self.source_hw:
+        top, left, height, width = self._part()
+        rows = _aligned_block(height, self.resized_hw[0], self._span(0))
+        columns = _aligned_block(width, self.resized_hw[1], self._span(1))
+        part = image[top : top + height, left : left + width]
+        block = part[rows.source, columns.source].astype(dtype, copy=False)
+        if self.resized_hw != (height, width):
             # "Exact": whole-number arithmetic for uint8, so that block and whole image round alike
             # and every machine gives the same bits. For float32 it is the ordinary bilinear.
             size = (columns.size, rows.size)
@@ -64,11 +79,13 @@ class View:
 
     def rows(self) -> Indices:
         """(h,) original row of every row of the view."""
-        return nearest_source(self.source_hw[0], self.resized_hw[0])[self._span(0)]
+        part = self._part()
+        return part.top + nearest_source(part.height, self.resized_hw[0])[self._span(0)]
 
     def columns(self) -> Indices:
         """(w,) original column of every column of the view."""
-        columns = nearest_source(self.source_hw[1], self.resized_hw[1])[self._span(1)]
+        part = self._part()
+        columns = part.left + nearest_source(part.width, self.resized_hw[1])[self._span(1)]
         return columns[::-1] if self.flipped else columns
 
     def position(self) -> NDArray[np.float32]:
@@ -93,6 +110,9 @@ class View:
         row = np.abs(self.rows() - self.source_hw[0] // 2).argmin()
         column = np.abs(self.columns() - self.source_hw[1] // 2).argmin()
         return int(row), int(column)
+
+    def _part(self) -> Part:
+        return self.part or Part(0, 0, *self.source_hw)
 
     def _span(self, axis: int) -> slice:
         start = self.corner_yx[axis]
@@ -153,6 +173,21 @@ def short_edge_hw(
         factor = min(factor, max_size / max(source_hw))
     height, width = source_hw
     return int(factor * height + 0.5), int(factor * width + 0.5)
+
+
+def check_lengths(**lengths: tuple[int | None, ...] | None) -> None:
+    """Raise InputError unless all lengths of a transform, by key, are at least 1 pixel.
+
+    Args:
+        lengths: None where the key is not set, and within a list where a length is not.
+    """
+    for key, values in lengths.items():
+        if values is None:
+            continue
+        if not values or any(value is not None and value < 1 for value in values):
+            raise InputError(
+                f"transform.{key} must hold lengths of at least 1 pixel, got {list(values)}."
+            )
 
 
 def nearest_source(source: int, resized: int) -> Indices:

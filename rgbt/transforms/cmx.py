@@ -1,0 +1,146 @@
+"""The augmentation of the CMX release: mirror, resize by a factor, crop with padding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.joint import View, check_lengths
+from rgbt.types import IGNORE, Sample
+
+
+class CmxTransform:
+    """Mirrors, resizes by a drawn factor, crops; what the image does not fill is padding.
+
+    Source: CMX release (training preprocessing). There, padding is 0 in the normalised images.
+    Networks here normalise images themselves (`rgbt.models.inputs`), so padding is their mean
+    colour: 0 for them but for rounding to whole grey levels, and, where thermal is repeated for
+    three channels of different means, but for the distance of each mean from the three's mean.
+
+    Args:
+        flip_probability: in [0, 1].
+        factors: of the size of the file, one is drawn with equal odds.
+        crop_hw: size of the result in pixels, always.
+        padding_rgb: mean colour in grey levels 0..255, in the order of `padding_order`.
+        padding_order: "rgb", or "bgr" for a network that is fed blue first.
+        padding_thermal: mean of every channel that the network takes thermal for, likewise.
+        test_short_edge: short edge of evaluated images in pixels; None keeps their size.
+        track_position: whether examples carry the map of source positions.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        *,
+        flip_probability: float,
+        factors: tuple[float, ...],
+        crop_hw: tuple[int, int],
+        padding_rgb: tuple[float, float, float],
+        padding_order: Literal["rgb", "bgr"],
+        padding_thermal: tuple[float, ...],
+        test_short_edge: int | None,
+        track_position: bool,
+    ) -> None:
+        check_range("transform.flip_probability", flip_probability, 0, 1)
+        check_choice("transform.padding_order", padding_order, ("rgb", "bgr"))
+        check_lengths(crop_hw=crop_hw, test_short_edge=(test_short_edge,))
+        if not factors or min(factors) <= 0:
+            raise InputError(f"transform.factors must be positive numbers, got {list(factors)}.")
+        if not padding_thermal:
+            raise InputError("transform.padding_thermal must hold the mean of a channel, got [].")
+        for key, means in {"rgb": padding_rgb, "thermal": padding_thermal}.items():
+            for mean in means:
+                check_range(f"transform.padding_{key}", mean, 0, 255)
+        self.flip_probability = flip_probability
+        self.factors = factors
+        self.crop_hw = crop_hw
+        step = 1 if padding_order == "rgb" else -1
+        self.padding_rgb = np.rint(padding_rgb[::step]).astype(np.uint8)
+        self.padding_thermal = np.rint(np.mean(padding_thermal)).astype(np.uint8)
+        self.test_short_edge = test_short_edge
+        self.track_position = track_position
+
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example of `crop_hw`; what is padding is 255 in its label.
+
+        Args:
+            sample: as it lies on disk; without a label, all pixels are ignored.
+            rng: every draw comes from here.
+        """
+        source_hw = image_hw(sample)
+        flipped = bool(rng.random() < self.flip_probability)
+        factor = float(rng.choice(self.factors))
+        resized_hw = max(1, int(source_hw[0] * factor)), max(1, int(source_hw[1] * factor))
+        top, height = draw_span(resized_hw[0], self.crop_hw[0], rng)
+        left, width = draw_span(resized_hw[1], self.crop_hw[1], rng)
+        # The release cuts the mirrored image; a view cuts first, so its window is mirrored.
+        corner_yx = (top, resized_hw[1] - left - width if flipped else left)
+        view = View(source_hw, resized_hw, corner_yx, (height, width), flipped)
+        example = viewed(sample, view, np.uint8, track_position=self.track_position)
+        return padded(example, self.crop_hw, self.padding_rgb, self.padding_thermal)
+
+    def test(self, sample: Sample) -> Example:
+        """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
+        return evaluated(
+            sample, self.test_short_edge, None, np.uint8, track_position=self.track_position
+        )
+
+
+def draw_span(length: int, crop: int, rng: np.random.Generator) -> tuple[int, int]:
+    """First pixel and number of pixels of a crop along one axis.
+
+    All of an axis that is not longer than the crop. Of a longer one, every first pixel from 0 to
+    length - crop + 1 is as likely: the last lies one too far, and the crop lacks a pixel.
+
+    Source: CMX release.
+
+    Args:
+        length: of the axis in pixels.
+        crop: wanted length in pixels.
+        rng: the draw comes from here.
+    """
+    if length <= crop:
+        return 0, length
+    first = int(rng.integers(length - crop + 2))
+    return first, min(crop, length - first)
+
+
+def padded(example: Example, hw: tuple[int, int], rgb: ArrayLike, thermal: ArrayLike) -> Example:
+    """An example in the middle of padding; of odd padding the larger half is below and right.
+
+    Args:
+        example: images and label of one size, not above `hw` on either side.
+        hw: size of the result in pixels.
+        rgb: (3,) colour of the padding, grey levels.
+        thermal: () grey level of the padding.
+
+    Returns:
+        images of `hw` and dtypes of `example`; padding is 255 in the label, and where positions are
+        tracked it has that of the nearest pixel of the image.
+    """
+    height, width = example.label.shape
+    top, left = (hw[0] - height) // 2, (hw[1] - width) // 2
+    margins = (top, hw[0] - height - top), (left, hw[1] - width - left)
+
+    def framed(values: NDArray[Any], padding: ArrayLike) -> NDArray[Any]:
+        canvas = np.empty((*hw, *values.shape[2:]), values.dtype)
+        canvas[:] = padding
+        canvas[top : top + height, left : left + width] = values
+        return canvas
+
+    position = example.position
+    return replace(
+        example,
+        rgb=framed(example.rgb, rgb),
+        thermal=framed(example.thermal, thermal),
+        label=framed(example.label, IGNORE),
+        centre_yx=(example.centre_yx[0] + top, example.centre_yx[1] + left),
+        position=None if position is None else np.pad(position, ((0, 0), *margins), mode="edge"),
+    )

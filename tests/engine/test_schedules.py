@@ -1,0 +1,121 @@
+"""The schedule of the CMX and temporal releases, against a loop that counts as they do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.engine.schedules import LatePoly
+from tests.models.golden import compose
+
+LR = 6e-5
+STEPS = 200 * 1568  # temporal release
+
+
+def temporal(**changes: Any) -> LatePoly:
+    values = {"power": 0.9, "warmup_steps": 10 * 1568, "epochs": 200}
+    return LatePoly(**{**values, "epoch_steps": 1568, "counted_steps": 1874, **changes})
+
+
+def rates_in_effect(epochs: int, real: int, counted: int, warmup_epochs: int) -> list[float]:
+    """Rate of every step where it is set after the step from epoch * counted + iteration."""
+    rates, rate = [], LR
+    for epoch in range(epochs):
+        for iteration in range(real):
+            rates.append(rate)
+            t = epoch * counted + iteration
+            rate = LR * t / (warmup_epochs * counted)
+            if t >= warmup_epochs * counted:
+                rate = LR * (1 - t / (epochs * counted)) ** 0.9
+    return [*rates, rate]  # the last one is written and never used
+
+
+def test_every_rate_is_that_of_a_loop_that_writes_it_after_the_step() -> None:
+    expected = rates_in_effect(200, 1568, 1874, 10)
+    schedule = temporal()
+    found = [LR * schedule(step, STEPS, 784) for step in range(STEPS + 1)]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_published_values_where_an_epoch_is_counted_as_long_as_it_is() -> None:
+    """Index t is in effect at step t + 1."""
+    schedule = temporal(warmup_steps=18740, epoch_steps=1874)
+    at = {t: LR * schedule(t + 1, 200 * 1874, 1) for t in (0, 1, 18739, 18740)}
+    assert at[0] == 0
+    assert at[1] == pytest.approx(3.2017e-9, rel=1e-5)
+    assert at[18739] == pytest.approx(5.99968e-5, rel=1e-6)
+    assert at[18740] == pytest.approx(5.72931e-5, rel=1e-6)
+
+
+def test_published_values_of_the_run_whose_count_jumps() -> None:
+    schedule = temporal()
+    rate = [LR * schedule(step, STEPS, 784) for step in range(1570)]
+    assert rate[:2] == [LR, 0.0]
+    assert rate[2] == pytest.approx(3.2017e-9, rel=1e-5)
+    assert rate[1568] == pytest.approx(5.02e-6, rel=1e-3)  # t = 1567, last of epoch 0
+    assert rate[1569] == pytest.approx(6.0e-6, rel=1e-12)  # t = 1874, first of epoch 1
+    # The warm-up never ends: t jumps from 18433 (epoch 9, step 1567) to 18740.
+    assert LR * schedule(15680, STEPS, 784) == pytest.approx(LR * 18433 / 18740, rel=1e-12)
+    assert LR * schedule(15681, STEPS, 784) == pytest.approx(5.72931e-5, rel=1e-6)
+    assert LR * schedule(STEPS, STEPS, 784) == pytest.approx(1.0004e-7, rel=1e-4)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 240, 1000])
+def test_a_run_of_any_length_starts_full_and_falls_towards_zero(steps: int) -> None:
+    schedule = temporal(warmup_steps=0)
+    rates = [schedule(step, steps, 150) for step in range(steps)]
+    assert rates[:2] == [1.0, 1.0][:steps]
+    assert rates == sorted(rates, reverse=True)
+    assert min(rates) > 0
+
+
+def test_a_tenth_of_the_steps_keeps_the_shape() -> None:
+    """Same share of the run, same factor, up to the length of a step."""
+    whole, tenth = temporal(), temporal(warmup_steps=1568)
+    for step in range(1, STEPS // 10, 997):
+        found = tenth(step + 1, STEPS // 10, 150)
+        assert found == pytest.approx(whole(10 * step + 1, STEPS, 784), rel=1e-9)
+
+
+def test_without_a_jump_it_is_poly_one_step_late() -> None:
+    schedule = temporal(warmup_steps=0, epochs=500, epoch_steps=99, counted_steps=99)
+    for step in (1, 2, 990, 49499):
+        assert schedule(step, 49500, 98) == pytest.approx((1 - (step - 1) / 49500) ** 0.9)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"power": -1.0},
+        {"warmup_steps": -1},
+        {"epochs": 0},
+        {"epoch_steps": 0},
+        {"counted_steps": 1567},
+    ],
+)
+def test_values_out_of_range_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"schedule.{next(iter(change))} must lie in"):
+        temporal(**change)
+
+
+def test_configurations_hold_the_released_numbers() -> None:
+    node = compose("schedule=poly_temporal_released").schedule
+    assert (node.power, node.epochs, node.epoch_steps) == (0.9, 200, 2 * 784)
+    assert node.counted_steps == 1873 // 1 + 1
+    node = compose("schedule=poly_cmx_released").schedule
+    assert (node.power, node.epochs) == (0.9, 500)
+    assert node.epoch_steps == node.counted_steps == 784 // 8 + 1
+
+
+def test_the_recipe_of_cmx_as_released() -> None:
+    config = compose("+experiment=cmx_released", "scale=paper", "dataset.root=unused")
+    adamw = config.optimizer
+    assert (adamw.lr, adamw.weight_decay, adamw.decay_biases) == (6e-5, 0.01, False)
+    assert (adamw.backbone_multiplier, config.trainer.clip_norm) == (1.0, None)
+    assert (config.data.batch_size, config.trainer.max_steps) == (8, 500 * 99)
+    assert config.schedule.warmup_steps == 10 * 99
+    assert (config.model.decoder_norm_eps, config.model.decoder_norm_eps_eval) == (1e-3, 1e-5)
+    assert config.model.inputs.rgb_order == "bgr"
