@@ -29,7 +29,7 @@ TOP_LEVEL: dict[str, Any] = {"seed": int, "name": str, "runs_dir": str, "out": s
 
 NODES = (
     *("scale", "recipe", "dataset", "data", "transform", "masker", "model", "loss", "scheme"),
-    *("optimizer", "schedule", "trainer", "metric", "tracking"),
+    *("optimizer", "schedule", "trainer", "metric", "consistency", "tracking"),
 )
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
@@ -38,13 +38,13 @@ OF_THE_RUN: dict[str, dict[str, Any]] = {
 """Keys of a node that the run reads itself and the constructor does not take, by node."""
 
 NOT_IN_KEY = (
-    *("name", "runs_dir", "out", "scale", "recipe", "tracking"),
+    *("name", "runs_dir", "out", "scale", "recipe", "tracking", "consistency"),
     *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
     *("trainer.accelerator", "trainer.threads", "trainer.log_every", "trainer.checkpoint_every"),
 )
-"""What may differ between two runs that are the same run: labels, paths, hardware, tracking, and
-the sizes of `scale` and `recipe`, which count where other nodes take them up."""
+"""What may differ between two runs that are the same run: labels, paths, hardware, tracking, what
+is measured beside, and the sizes of `scale` and `recipe`, which count where others take them up."""
 
 
 def conf_dir() -> Path:

@@ -27,10 +27,14 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.pretrained import start
 from rgbt.randomness import derive
-from rgbt.tracking.pictures import Example
+from rgbt.tracking.pictures import Example, Legend
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import VIEWS, View
 from rgbt.weights.report import Report
+
+NUM_PANELS = 6
+"""Images of the qualitative panel: as many by day as by night where the split holds both."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Session:
         transform: makes examples of them.
         loading: batch sizes, workers, what to do about unreadable files.
         regions: partition of the image and the rule for absent classes.
+        consistency: virtual views that TC and CA are measured on, if any.
         trainer: durations, precision, device.
         fabric: device and precision.
         model: the network, on the device, not wrapped.
@@ -54,6 +59,7 @@ class Session:
     transform: Any
     loading: LoaderSettings
     regions: Regions
+    consistency: ViewSets
     trainer: TrainerSettings
     fabric: Fabric
     model: nn.Module
@@ -90,6 +96,7 @@ def open_session(config: DictConfig) -> Session:
         transform=build(config.transform),
         loading=build(config.data),
         regions=build(config.metric),
+        consistency=build(config.consistency),
         trainer=trainer,
         fabric=fabric,
         model=model.to(fabric.device),
@@ -221,3 +228,18 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             subset_mious={part: float(value) for part, value in parts.items()},
         ),
     )
+
+
+def legend_of(dataset: MFNet) -> Legend:
+    """Classes of a data set and their colours."""
+    return Legend(dataset.classes, np.array(dataset.palette, np.uint8))
+
+
+def panel_names(dataset: MFNet, split: str) -> tuple[str, ...]:
+    """The first images of a split, half by day and half by night where it holds both."""
+    names = dataset.names(split)
+    at_night = dataset.nights(names) or (False,) * len(names)
+    night = [name for name, dark in zip(names, at_night, strict=True) if dark]
+    day = [name for name, dark in zip(names, at_night, strict=True) if not dark]
+    num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
+    return tuple(day[:num_day] + night[: NUM_PANELS - num_day])

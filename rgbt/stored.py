@@ -16,9 +16,9 @@ from rgbt.session import Session, open_session
 from rgbt.tracking.folder import find_run
 
 CHECKPOINTS = ("best", "last")
-GROUPS = ("dataset", "metric")
+GROUPS = ("dataset", "metric", "consistency")
 CHANGEABLE = (
-    *("dataset", "data", "metric", "transform.test_short_edge"),
+    *("dataset", "data", "metric", "consistency", "transform.test_short_edge"),
     *("trainer.accelerator", "trainer.threads", "trainer.precision"),
 )
 """What may be changed of a stored run: where images come from and how they are counted."""
@@ -94,6 +94,8 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
     register_resolvers()
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"
+    if "consistency" not in config:  # a run of before there was any
+        config.consistency = OmegaConf.to_container(compose([]).consistency, resolve=True)
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
     check(config)
@@ -116,24 +118,30 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values."""
     for key, _ in pairs:
-        if not any(key == each or key.startswith(f"{each}.") for each in CHANGEABLE):
+        place = _place(key)
+        if not any(place == each or place.startswith(f"{each}.") for each in CHANGEABLE):
             raise InputError(
                 f"'{key}' cannot be changed of a stored run; {nearest(key, CHANGEABLE)}."
             )
     groups = [key for key, _ in pairs if key in GROUPS]
     for group in groups:
-        own = [f"{key}={value}" for key, value in pairs if key.split(".")[0] == group]
+        own = [f"{key}={value}" for key, value in pairs if _place(key).split(".")[0] == group]
         composed = compose(own)[group]
         for name in OmegaConf.missing_keys(composed):
             raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)
     known = flatten(config)
     for key, value in pairs:
-        if key.split(".")[0] in groups:
+        if _place(key).split(".")[0] in groups:
             continue
         if key not in known:
             raise InputError(f"'{key}' is not a key of this run; {nearest(key, known)}.")
         OmegaConf.update(config, key, _parsed(key, value))
+
+
+def _place(key: str) -> str:
+    """Where in the configuration an override works: camera@consistency.view.camera goes there."""
+    return key.rpartition("@")[2]
 
 
 def _pair(item: str) -> tuple[str, str]:

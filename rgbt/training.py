@@ -6,8 +6,8 @@ import hashlib
 import json
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,29 +18,36 @@ from torch import nn
 from rgbt.checks import InputError
 from rgbt.config import build, run_key
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
-from rgbt.data.mfnet import MFNet
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme, Trainer
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.metrics import names, scores
+from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe
-from rgbt.randomness import torch_generator
-from rgbt.session import Session, evaluate, open_session, result_tables
+from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.session import (
+    Session,
+    evaluate,
+    legend_of,
+    open_session,
+    panel_names,
+    result_tables,
+)
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
-from rgbt.tracking.pictures import Example, Legend, RegionHeat, draw_panel, draw_region_heat
+from rgbt.tracking.pair_pictures import draw_pairs
+from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
-from rgbt.tracking.tables import ResultTables, without_nan
+from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
-from rgbt.types import Batch, Masker
+from rgbt.transforms.view_sets import ViewSets
+from rgbt.two_frames import consistency_table, consistency_values, count_pairs
+from rgbt.types import Batch, Masker, Sample
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
-
-NUM_PANELS = 6
-"""Images of the qualitative panel: as many by day as by night where the split holds both."""
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -62,6 +69,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     if (path / "result.json").exists():
         folder = RunFolder(path)
         _show_again(folder, tracking, asked)
+        _tell_unmeasured(folder, build(config.consistency))
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         prepared = prepare(config)
@@ -81,6 +89,16 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     shown = asked if len(asked.name) > len(known.name) else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish("FINISHED")
+
+
+def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
+    """A finished run measures nothing more: say how its consistency can still be had."""
+    places = [folder.path / file_name("aligned", split, asked.mark) for split in asked.splits]
+    if asked.sets and not all(place.is_file() for place in places):
+        tell(
+            "its consistency on these views has not been measured: python -m rgbt.consistency "
+            f"run={folder.path}, with the same consistency.* settings, does so."
+        )
 
 
 @dataclass(frozen=True)
@@ -124,6 +142,7 @@ def prepare(config: DictConfig) -> Prepared:
     builder = build(config.optimizer)
     model, optimizer = session.fabric.setup(session.model, builder(session.model))
     scheme: Scheme = build(config.scheme, model=model, loss=loss, masker=masker, sdc=sdc, sdn=sdn)
+    _check_views(scheme, loss, session)
     return Prepared(session, model, optimizer, scheme, build(config.schedule))
 
 
@@ -132,11 +151,46 @@ def _check_loss(loss: object, model: nn.Module) -> None:
     reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
     if None in (reads, predicts) or reads == predicts:
         return
-    advice = {"scores": "loss=cross_entropy", "masks": "loss=set_criterion"}
+    key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
+    advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
     raise InputError(
         f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts {predicts}; "
         f"choose {advice[str(predicts)]}, or another network."
     )
+
+
+def _check_views(scheme: object, loss: object, session: Session) -> None:
+    """Refuse a loss of two frames without a second one, and cameras of other images."""
+    views = getattr(scheme, "view", None)
+    if views is None and hasattr(loss, "reads_warped"):
+        raise InputError(
+            f"{type(loss).__name__} is a loss of two frames, but {type(scheme).__name__} shows the "
+            "network one; choose scheme=temporal_paper or temporal_released, or "
+            "loss=cross_entropy."
+        )
+    if views is not None:
+        # One example for nothing: a camera of other images is told before the run is begun.
+        sample = _first_readable(session, "train")
+        example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
+        views.camera.matrix(example.rgb.shape[:2])
+    if session.consistency.sets:
+        shown = session.transform.test(_first_readable(session, "test"))
+        for image in (shown.rgb, shown.label):
+            session.consistency.view.camera.matrix(image.shape[:2])
+
+
+def _first_readable(session: Session, split: str) -> Sample:
+    """The first sample of a split; unreadable ones are passed over where the run does so too."""
+    refused: InputError | None = None
+    for name in session.dataset.names(split):
+        try:
+            return session.dataset.read(name)
+        except InputError as error:
+            if session.loading.on_error == "raise":
+                raise
+            refused = refused or error
+    assert refused is not None, "a split holds a name"
+    raise refused
 
 
 @dataclass(frozen=True)
@@ -158,8 +212,10 @@ class Run:
         self.tracking.start(self.folder, shown.name, tags, shown.params)
         try:
             state = self._train(session)
-            self._test(session, state)
-            self._finish(session, state, time.time() - started)
+            self._restore_best(session)
+            pairs = self._consistency(session)
+            self._test(session, state, pairs.get("test"))
+            self._finish(session, state, time.time() - started, pairs)
         except KeyboardInterrupt:
             self.tracking.finish("KILLED")
             raise
@@ -169,7 +225,9 @@ class Run:
             raise
         self.tracking.finish("FINISHED")
 
-    def _finish(self, session: Session, state: State, seconds: float) -> None:
+    def _finish(
+        self, session: Session, state: State, seconds: float, pairs: Mapping[str, ConsistencyTable]
+    ) -> None:
         self.folder.finish(
             {
                 "name": self.description.name,
@@ -180,14 +238,20 @@ class Run:
                 "best_score": state.best_score,
                 "seconds_of_last_process": round(seconds, 1),
                 "skipped": state.skipped,
-                **self._scores(state),
+                **self._scores(state, pairs),
             }
         )
 
-    def _scores(self, state: State) -> dict[str, dict[str, float | None]]:
+    def _scores(
+        self, state: State, pairs: Mapping[str, ConsistencyTable]
+    ) -> dict[str, dict[str, float | None]]:
         """What the best checkpoint reached on the selection split and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
         found = {"val": lines["val", state.best_step], "test": lines["test", state.step]}
+        found = {
+            kind: {**values, **(consistency_values(pairs[kind]) if kind in pairs else {})}
+            for kind, values in found.items()
+        }
         return {kind: without_nan(values) for kind, values in found.items()}
 
     def _claim(self, session: Session) -> None:
@@ -252,17 +316,37 @@ class Run:
             validate=validate,
         )
 
-    def _test(self, session: Session, state: State) -> None:
-        """Counts, tables and figures of the best checkpoint on the test split."""
+    def _restore_best(self, session: Session) -> None:
         best = self.folder.path / "best.pt"
         restore_weights(session.model, load_checkpoint(best)["model"], best)
-        found = evaluate(session, session.model, "test", keep=panel_names(session.dataset))
+
+    def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
+        """TC and CA of the best checkpoint under "val" and "test", as far as asked for."""
+        tables: dict[str, ConsistencyTable] = {}
+        for kind in session.consistency.splits if session.consistency.sets else ():
+            split = session.trainer.selection_split if kind == "val" else kind
+            keep = panel_names(session.dataset, split) if kind == "test" else ()
+            found = count_pairs(session, session.model, split, "virtual", keep=keep)
+            for protocol, counts in found.counts.items():
+                path = self.folder.path / file_name(protocol, split, session.consistency.mark)
+                path.parent.mkdir(exist_ok=True)
+                counts.save(path)
+            tables[kind] = consistency_table(found.counts, session.regions.absent)
+            if found.kept:
+                draw_pairs(found.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
+        return tables
+
+    def _test(self, session: Session, state: State, pairs: ConsistencyTable | None) -> None:
+        """Counts, tables and figures of the best checkpoint on the test split."""
+        found = evaluate(session, session.model, "test", keep=panel_names(session.dataset, "test"))
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
+        values |= {} if pairs is None else consistency_values(pairs)
         self.folder.append(state.step, "test", values)
         label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
         tables = result_tables(found.counts, session.regions, label, state.best_step)
+        tables = replace(tables, consistency=pairs)
         self.folder.write_tables(tables.to_json())
         if found.kept:
             self._draw(session, tables, found.kept)
@@ -270,9 +354,7 @@ class Run:
             tell("none of the images of the panel could be read; no pictures were drawn.")
 
     def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
-        palette = np.array(session.dataset.palette, np.uint8)
-        legend = Legend(session.dataset.classes, palette)
-        draw_panel(kept, legend, self.folder.figure_path("panel"))
+        draw_panel(kept, legend_of(session.dataset), self.folder.figure_path("panel"))
         heat = RegionHeat(
             title=f"{self.description.name}: IoU by region, {session.dataset.name} {tables.split}",
             region_map=session.regions.map(kept[0].label.shape).astype(np.int64),
@@ -286,13 +368,3 @@ def _noting_skipped(batches: Batches, state: State) -> Iterator[Batch]:
     for batch in batches:
         state.skip(batches.skipped)
         yield batch
-
-
-def panel_names(dataset: MFNet) -> tuple[str, ...]:
-    """The first images of the test split, half by day and half by night where it holds both."""
-    test = dataset.names("test")
-    at_night = dataset.nights(test) or (False,) * len(test)
-    night = [name for name, dark in zip(test, at_night, strict=True) if dark]
-    day = [name for name, dark in zip(test, at_night, strict=True) if not dark]
-    num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
-    return tuple(day[:num_day] + night[: NUM_PANELS - num_day])

@@ -106,6 +106,11 @@ def place_of(arguments: Arguments, overrides: Sequence[str]) -> tuple[Place, tup
         if key in ("seed", "experiment"):
             other = "seeds=3" if key == "seed" else "another table"
             raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
+        if key.rpartition("@")[2].partition(".")[0] == "consistency":
+            raise InputError(
+                f"'{word}': the columns of the table say what is counted, on the published sets of "
+                "views; measure others with python -m rgbt.consistency run=..."
+            )
         if key == "metric" or key.startswith("metric."):
             raise InputError(
                 f"'{word}': the columns of the table say what is counted; set its `regions` in a "

@@ -5,24 +5,47 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from rgbt.metrics.pairs import Protocol, file_name
+
 Value = str | int | float | bool | None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A further evaluation of a finished run, made by `python -m rgbt.evaluate`.
+    """A further evaluation of a finished run.
 
     Attributes:
         modality: "rgbt", "rgb" or "thermal"; "default": what the network is made for.
         regions: a file of ``conf/metric``, or "as trained".
+        frames: protocol of pairs of frames, see `rgbt.metrics.pairs`; None: single frames.
     """
 
     modality: str = "default"
     regions: str = "as trained"
+    frames: Protocol | None = None
+
+    @property
+    def label(self) -> str:
+        """For people: "thermal, ring9" or "consistency, aligned"."""
+        if self.frames is None:
+            return f"{self.modality}, {self.regions}"
+        return f"consistency, {self.frames}"
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """Module that makes it and what it is asked, beside the run.
+
+        One call makes both protocols of virtual views, aligned and released.
+        """
+        if self.frames is None:
+            return ("rgbt.evaluate", f"modality={self.modality}", f"regions={self.regions}")
+        return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
 
     @property
     def path(self) -> str:
         """Path of its counts inside the run folder, and among the run's files in MLflow."""
+        if self.frames is not None:
+            return file_name(self.frames, "test")
         return f"evaluations/table_{self.modality}_{self.regions.replace(' ', '-')}.npz"
 
 

@@ -69,6 +69,7 @@ def search(wanted: Search, settings: Settings) -> None:
         _preview(wanted, settings)
         return
     probe = _probe(wanted)
+    _check_consistency(probe, settings)
     storage = open_storage(settings.storage, wanted.runs.runs_dir)
     wanted.runs.touch()
     attributes = {
@@ -108,6 +109,23 @@ def _probe(wanted: Search) -> Plan:
     return Planner().plan(Point(label="probe", overrides=(*wanted.fixed, *chosen)))
 
 
+def _check_consistency(probe: Plan, settings: Settings) -> None:
+    """Refuse an objective of two frames that the runs would not measure.
+
+    Raises:
+        InputError: the split is not among those of ``conf/consistency``.
+    """
+    for objective in filter(lambda each: each.is_consistency, settings.objectives):
+        node = Planner().config(probe.runs[0].overrides).consistency
+        split = objective.metric.partition("/")[0]
+        if not node.sets or split not in node.splits:
+            splits = ",".join(dict.fromkeys((split, "test")))
+            raise InputError(
+                f"objective '{objective.metric}': the runs do not measure it; add "
+                f"consistency=views 'consistency.splits=[{splits}]'."
+            )
+
+
 def _drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
     def done() -> int:
         return sum(trial.state.is_finished() for trial in ledger.trials())
@@ -136,7 +154,7 @@ def _sampler_and_pruner(settings: Settings) -> tuple[Any, Any]:
     if settings.pruner is None:
         return sampler, build_pruner("none", {}, count)
     kind, _, options = _chosen(settings.pruner, "pruner")
-    if not settings.objectives[0].metric.startswith("val/"):
+    if not settings.objectives[0].is_followed:
         raise InputError(
             f"pruner: trials are compared while they train, but {settings.objectives[0].metric} is "
             "known at the end alone; follow val/mIoU or take hydra.sweeper.pruner=null."

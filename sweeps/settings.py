@@ -17,6 +17,13 @@ SCORES = (
 )
 """Scores of a run, with one region and one class as examples."""
 
+AT_THE_END = tuple(
+    scores.consistency(score, protocol)
+    for score in (scores.TC, scores.CA)
+    for protocol in ("aligned", "released")
+)
+"""Scores that a run measures once, of its best checkpoint."""
+
 
 @dataclass(frozen=True)
 class Objective:
@@ -24,7 +31,7 @@ class Objective:
 
     Attributes:
         metric: "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
-            being those of `rgbt.metrics.names`.
+            being those of `rgbt.metrics.names`; of two frames "val/TC/aligned" etc.
         direction: which way is better.
     """
 
@@ -42,8 +49,19 @@ class Objective:
         score = self.metric.partition("/")[2]
         part, _, inner = score.partition("/")
         whole = inner if part in (scores.DAY, scores.NIGHT) else score
-        if whole not in SCORES and part not in ("region", "class"):
-            raise InputError(f"objective '{self.metric}': {nearest(score, SCORES)}.")
+        if whole not in SCORES and score not in AT_THE_END and part not in ("region", "class"):
+            known = nearest(score, (*SCORES, *AT_THE_END))
+            raise InputError(f"objective '{self.metric}': {known}.")
+
+    @property
+    def is_consistency(self) -> bool:
+        """Whether it is a score of two frames, which only some runs measure."""
+        return self.metric.partition("/")[2] in AT_THE_END
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether a run tells it while it trains."""
+        return self.metric.startswith("val/") and not self.is_consistency
 
 
 @dataclass(frozen=True, kw_only=True)

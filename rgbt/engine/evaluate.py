@@ -38,14 +38,24 @@ def predictions(
         view: what is predicted from; None leaves it to the network.
     """
     model.eval()
-    asked = {} if view is None else {"views": (view,)}
     for batch in batches:
-        moved = batch.to(fabric.device)
-        with torch.inference_mode(), fabric.autocast():
-            output = model(moved.rgb, moved.thermal, **asked)
-            scores = output.logits.float()
-            label_hw = batch.label.shape[-2:]
-            if scores.shape[-2:] != label_hw:
-                scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
-            classes = scores.argmax(1).to(torch.uint8).cpu()
-        yield Prediction(batch, classes)
+        yield Prediction(batch, class_maps(model, batch.to(fabric.device), fabric, view).cpu())
+
+
+def class_maps(model: nn.Module, batch: Batch, fabric: Fabric, view: View | None = None) -> Tensor:
+    """(B, H', W') uint8: class index of every pixel of the labels of one batch.
+
+    Args:
+        model: a network in evaluation mode.
+        batch: on the device, images in [0, 1].
+        fabric: precision.
+        view: what is predicted from; None leaves it to the network.
+    """
+    asked = {} if view is None else {"views": (view,)}
+    with torch.inference_mode(), fabric.autocast():
+        scores = model(batch.rgb, batch.thermal, **asked).logits.float()
+        label_hw = batch.label.shape[-2:]
+        if scores.shape[-2:] != label_hw:
+            scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
+        classes: Tensor = scores.argmax(1).to(torch.uint8)
+    return classes

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.geometry import pad_to
+from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import Points, class_shares, sample
 from rgbt.losses.spatial import PointWeights, SpatialMap
 from rgbt.types import IGNORE

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, check_shape
-from rgbt.geometry import pad_to
+from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import sample
 from rgbt.types import Batch
 

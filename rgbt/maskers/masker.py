@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, check_range, check_shape
-from rgbt.geometry import STRIDE, padded_hw
+from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.maskers import pairing as pairings
 from rgbt.maskers import pattern
 from rgbt.types import MaskPair

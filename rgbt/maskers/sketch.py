@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from rgbt.checks import InputError
 from rgbt.command import command
 from rgbt.config import build
-from rgbt.geometry import padded_hw
+from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.masker import Masker
 from rgbt.randomness import numpy_generator, torch_generator
 

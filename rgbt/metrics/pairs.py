@@ -39,20 +39,30 @@ HEADLINES: dict[Protocol, tuple[str, str]] = {
 Map: TypeAlias = "NDArray[np.integer] | Tensor"
 
 
-def partition_name(protocol: Protocol, sets: int) -> str:
-    """What counts of pairs carry as their partition: "aligned3"."""
-    return f"{protocol}{sets}"
+def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
+    """What counts of pairs carry as their partition: "aligned3".
+
+    Args:
+        protocol: see the module docstring.
+        sets: S.
+        views: which virtual views; "" are the published ones: "aligned3-1c0ffe" are others.
+    """
+    return f"{protocol}{sets}{_dashed(views)}"
 
 
 def protocol_of(partition: str) -> Protocol | None:
     """The protocol of a partition; None: the counts are of single frames."""
-    found = re.fullmatch(r"([a-z]+)\d+", partition)
+    found = re.fullmatch(r"([a-z]+)\d+(-[0-9a-f]+)?", partition)
     return next((each for each in PROTOCOLS if found and found[1] == each), None)
 
 
-def file_name(protocol: Protocol, split: str) -> str:
-    """Where counts of pairs lie inside a run folder."""
-    return f"evaluations/consistency_{protocol}_{split}.npz"
+def file_name(protocol: Protocol, split: str, views: str = "") -> str:
+    """Where counts of pairs lie inside a run folder; `views` as for `partition_name`."""
+    return f"evaluations/consistency_{protocol}{_dashed(views)}_{split}.npz"
+
+
+def _dashed(views: str) -> str:
+    return f"-{views}" if views else ""
 
 
 def pair_counts(

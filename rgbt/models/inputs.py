@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, check_shape
-from rgbt.geometry import pad_to, padded_hw
+from rgbt.geometry.padding import pad_to, padded_hw
 from rgbt.types import MaskPair, View
 
 

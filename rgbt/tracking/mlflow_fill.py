@@ -183,7 +183,7 @@ def shown(name: str, value: float) -> float:
     exact value.
     """
     first, last = name.split("/")[0], name.split("/")[-1]
-    if last in FRACTIONS or first in ("region", "class"):
+    if last in FRACTIONS or first in ("region", "class", names.TC, names.CA):
         return round(100 * value, 2)
     return round(value, 2) if last == names.VAR else value
 

@@ -6,7 +6,7 @@ something is drawn and never opens a window.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -113,24 +113,44 @@ def draw_panel(examples: Sequence[Example], legend: Legend, path: Path) -> None:
     Raises:
         ValueError: no examples.
     """
-    if not examples:
-        raise ValueError("a qualitative panel needs at least one example, got none.")
-    height, width = examples[0].rgb.shape[:2]
-    cell_w = 3.0
-    cell_h = cell_w * height / width
-    figure = _figure(4 * cell_w + 0.4, len(examples) * (cell_h + 0.08) + 0.75)
-    axes = figure.subplots(len(examples), 4, squeeze=False)
-    for row, example in zip(axes, examples, strict=True):
-        pictures = (
+    rows = {
+        example.name: (
             example.rgb,
             np.repeat(example.thermal[..., None], 3, axis=2),
             colours(example.label, legend.palette),
             colours(example.prediction, legend.palette),
         )
+        for example in examples
+    }
+    draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), legend, path)
+
+
+def draw_columns(
+    rows: Mapping[str, Sequence[Image]], titles: Sequence[str], legend: Legend, path: Path
+) -> None:
+    """Write a PNG of pictures in rows and columns, with the classes below.
+
+    Args:
+        rows: name -> one (H, W, 3) picture per column.
+        titles: of the columns.
+        legend: classes and their colours.
+        path: of the PNG.
+
+    Raises:
+        ValueError: no rows.
+    """
+    if not rows:
+        raise ValueError("a qualitative panel needs at least one example, got none.")
+    height, width = next(iter(rows.values()))[0].shape[:2]
+    cell_w = 3.0
+    cell_h = cell_w * height / width
+    figure = _figure(len(titles) * cell_w + 0.4, len(rows) * (cell_h + 0.08) + 0.75)
+    axes = figure.subplots(len(rows), len(titles), squeeze=False)
+    for row, (name, pictures) in zip(axes, rows.items(), strict=True):
         for axis, picture in zip(row, pictures, strict=True):
             _image(axis, picture)
-        row[0].set_ylabel(example.name, fontsize=8)
-    for axis, title in zip(axes[0], ("RGB", "thermal", "ground truth", "prediction"), strict=True):
+        row[0].set_ylabel(name, fontsize=8)
+    for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=10)
     _class_legend(figure, legend)
     figure.savefig(path)

@@ -51,6 +51,36 @@ class ClassTable:
 
 
 @dataclass(frozen=True)
+class ConsistencyTable:
+    """How predictions of two frames of a scene agree, by class; fractions, NaN without pixels.
+
+    Attributes:
+        names: K class names.
+        tc: protocol ("aligned", "released", "next") -> K values of temporal consistency.
+        ca: the same of consistent accuracy.
+        mean_tc: protocol -> mean over classes.
+        mean_ca: protocol -> mean over classes.
+    """
+
+    names: tuple[str, ...]
+    tc: Mapping[str, tuple[float, ...]]
+    ca: Mapping[str, tuple[float, ...]]
+    mean_tc: Mapping[str, float]
+    mean_ca: Mapping[str, float]
+
+    @classmethod
+    def from_json(cls, plain: Mapping[str, Any]) -> ConsistencyTable:
+        """The inverse of `dataclasses.asdict` with None for NaN."""
+        return cls(
+            names=tuple(plain["names"]),
+            tc={protocol: _numbers(values) for protocol, values in plain["tc"].items()},
+            ca={protocol: _numbers(values) for protocol, values in plain["ca"].items()},
+            mean_tc={protocol: _number(value) for protocol, value in plain["mean_tc"].items()},
+            mean_ca={protocol: _number(value) for protocol, value in plain["mean_ca"].items()},
+        )
+
+
+@dataclass(frozen=True)
 class ResultTables:
     """Everything that is shown of one evaluation.
 
@@ -60,6 +90,7 @@ class ResultTables:
         region_names: R names, e.g. "ring_1", the innermost ring.
         regions: the per-region row.
         classes: the per-class table.
+        consistency: of two frames, where the run measured it.
     """
 
     split: str
@@ -67,6 +98,7 @@ class ResultTables:
     region_names: tuple[str, ...]
     regions: RegionTable
     classes: ClassTable
+    consistency: ConsistencyTable | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for `RunFolder.write_tables`; NaN becomes None."""
@@ -76,6 +108,7 @@ class ResultTables:
     def from_json(cls, plain: Mapping[str, Any]) -> ResultTables:
         """The inverse of `to_json`."""
         regions, classes = plain["regions"], plain["classes"]
+        consistency = plain.get("consistency")
         return cls(
             split=plain["split"],
             step=plain["step"],
@@ -93,6 +126,7 @@ class ResultTables:
                 region_ious=tuple(_numbers(row) for row in classes["region_ious"]),
                 subset_mious={k: _number(v) for k, v in classes["subset_mious"].items()},
             ),
+            consistency=None if consistency is None else ConsistencyTable.from_json(consistency),
         )
 
 
@@ -157,14 +191,28 @@ def subset_grid(tables: ResultTables) -> Grid:
     return Grid("mIoU by subset", ("images", "mIoU"), rows)
 
 
+def consistency_grid(table: ConsistencyTable, title: str) -> Grid:
+    """TC and CA by class, one pair of columns per protocol; percent."""
+    header = ("class", *(f"{score} {protocol}" for protocol in table.tc for score in ("TC", "CA")))
+    columns = [
+        values for protocol in table.tc for values in (table.tc[protocol], table.ca[protocol])
+    ]
+    means = [value for p in table.tc for value in (table.mean_tc[p], table.mean_ca[p])]
+    rows = [(name, *map(percent, row)) for name, *row in zip(table.names, *columns, strict=True)]
+    return Grid(title, header, (*rows, ("mean", *map(percent, means))))
+
+
 def result_grids(tables: ResultTables) -> tuple[Grid, ...]:
     """The tables that stand at the end of a run."""
     where = f"{tables.split}, step {tables.step}"
-    return (
+    grids = (
         region_grid([tables.regions], f"IoU by region ({where})"),
         class_grid(tables),
         subset_grid(tables),
     )
+    if tables.consistency is None:
+        return grids
+    return (*grids, consistency_grid(tables.consistency, "Consistency of two frames"))
 
 
 def percent(fraction: float) -> str:

@@ -24,7 +24,7 @@ PRELOADED = (
     *("sweeps.running.executors", "torch", "hydra"),
     *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
 )
-COMMANDS = ("rgbt.run", "rgbt.evaluate")
+COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
 """Run as programs, and a few lines each: not imported before."""
 
 GRACE_S = 20.0

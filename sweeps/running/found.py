@@ -21,6 +21,9 @@ from rgbt.tracking.terminal import tell
 from sweeps.points import Evaluation
 
 FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
+CHECKPOINT = "best.pt"
+"""What evaluations are made of; other machines do not get it."""
+
 FETCHED = ".fetched"
 """Folder inside the folder of runs: what was taken from MLflow of runs made elsewhere."""
 
@@ -81,9 +84,12 @@ class Found:
         return Counts.load(self.counts_file(evaluation))
 
     def has(self, evaluation: Evaluation) -> bool:
-        """Whether the evaluation is there, of this result and not of an earlier training."""
-        path, result = self.counts_file(evaluation), self.folder / "result.json"
-        if not path.exists() or path.stat().st_mtime < result.stat().st_mtime:
+        """Whether the evaluation is there, of this training and not of an earlier one."""
+        # The checkpoint tells, not the result: a run may have made it itself before that.
+        path, best = self.counts_file(evaluation), self.folder / CHECKPOINT
+        if not path.exists():
+            return False
+        if best.exists() and path.stat().st_mtime < best.stat().st_mtime:
             return False
         try:
             counts = Counts.load(path)

@@ -19,12 +19,16 @@ from sweeps.running.ledger import Ledger, by_key, counted
 from sweeps.running.live import View
 from sweeps.running.owner import Owner
 from sweeps.running.plan import Plan, Planner
-from sweeps.running.sources import ListSource, Standing, State, known, reason_of
+from sweeps.running.sources import ListSource, Standing, State, is_evaluated, reason_of, trained
 from sweeps.running.storage import begin_study, existing_study, open_storage
 from sweeps.settings import Settings
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
+
+
+UNFINISHED: tuple[State, ...] = ("waiting", "failed")
+"""States of points that a command would take up."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class Outcome:
         point: the point.
         state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
         reason: why it failed, or "".
-        found: its finished runs.
+        found: its finished runs; where it waits, those that lack further evaluations alone.
         keys: of its runs; () where its configuration is wrong.
     """
 
@@ -44,6 +48,11 @@ class Outcome:
     reason: str = ""
     found: tuple[Found, ...] = ()
     keys: tuple[str, ...] = ()
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether it is not finished, but lacks nothing but further evaluations of its runs."""
+        return self.state in UNFINISHED and bool(self.found)
 
     @property
     def seconds(self) -> float | None:
@@ -84,15 +93,15 @@ def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
 
 
 def _seen(plan: Plan, trials: Sequence[FrozenTrial], runs: Runs) -> Standing:
-    found = known(plan, runs)
-    if found is not None:
+    found = trained(plan, runs) or ()
+    if found and is_evaluated(plan, found):
         return Standing("finished", found=found)
     states = [trial.state.name for trial in trials]
     if "RUNNING" in states:
         return Standing("running")
     if states and states[-1] == "FAIL":
-        return Standing("failed", reason_of(trials[-1]))
-    return Standing("waiting")
+        return Standing("failed", reason_of(trials[-1]), found)
+    return Standing("waiting", found=found)
 
 
 def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
@@ -188,7 +197,7 @@ def make_executor(settings: Settings, runs_dir: Path) -> Executor:
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:
-    """How long the points that are not finished will take; None where no run tells."""
+    """How long the trainings that are missing will take; None where no run tells."""
     known_ones = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
-    missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
+    missing = sum(outcome.state in UNFINISHED and not outcome.is_trained for outcome in outcomes)
     return missing * median(known_ones) / workers if known_ones else None

@@ -68,7 +68,12 @@ class Planner:
         runs = tuple(self._run(overrides) for overrides in point.runs())
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            parts = [[run.key for run in runs], [vars(each) for each in point.evaluations]]
+            # What is None is left out: an attribute that is new keeps the keys of older studies.
+            asked = [
+                {name: value for name, value in vars(each).items() if value is not None}
+                for each in point.evaluations
+            ]
+            parts = [[run.key for run in runs], asked]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
         return Plan(point, key, runs)
 

@@ -173,16 +173,27 @@ class ListSource:
 
 def known(plan: Plan, runs: Runs) -> tuple[Found, ...] | None:
     """The runs of a point if all are finished, with their further evaluations; None otherwise."""
+    found = trained(plan, runs)
+    return found if found is not None and is_evaluated(plan, found) else None
+
+
+def trained(plan: Plan, runs: Runs) -> tuple[Found, ...] | None:
+    """The runs of a point if all are finished, whatever is evaluated of them; None otherwise."""
     found = []
     for run in plan.runs:
         try:
             one = runs.find(run.key, run.dataset)
         except RunError:  # told when the point is worked on
             return None
-        if one is None or not all(map(one.has, plan.point.evaluations)):
+        if one is None:
             return None
         found.append(one)
     return tuple(found)
+
+
+def is_evaluated(plan: Plan, found: Sequence[Found]) -> bool:
+    """Whether the further evaluations of a point's runs are all there."""
+    return all(one.has(evaluation) for one in found for evaluation in plan.point.evaluations)
 
 
 def reason_of(trial: FrozenTrial) -> str:

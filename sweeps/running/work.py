@@ -189,16 +189,17 @@ class Work:
         if found.run_id:
             raise PointError(
                 f"run {found.key} was made on another machine: its further evaluations "
-                f"({evaluation.modality}, {evaluation.regions}) can only be made there; to train "
-                f"it here, delete MLflow run {found.run_id} and {found.folder}"
+                f"({evaluation.label}) can only be made there; to train it here, delete MLflow "
+                f"run {found.run_id} and {found.folder}"
             )
         log = self._around.runs.runs_dir / LOGS / f"{found.key}.log"
         begin = log.stat().st_size if log.exists() else 0
-        self.status = f"evaluating {evaluation.modality} {evaluation.regions}"
+        self.status = f"evaluating {evaluation.label}"
+        module, *asked = evaluation.command
+        # The protocols of consistency have a file each, which lie where a run's evaluations lie.
+        place = f"out={out}" if evaluation.frames is None else f"runs_dir={found.folder.parent}"
         command = (
-            "rgbt.evaluate",
-            *(f"run={found.folder}", f"modality={evaluation.modality}"),
-            *(f"regions={evaluation.regions}", f"out={out}"),
+            *(module, f"run={found.folder}", *asked, place),
             # The run may have been made where the data lie elsewhere.
             *(word for word in run.overrides if word.startswith("dataset.root=")),
         )

@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_PANELS = 4
+"""Columns of a table without headlines up to which each has a panel."""
+
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
+"""What a figure is about where a table has it, over all images, those of the day or the night."""
+
+MAX_HEADLINES = 5
+"""Of a table; those after them are left out of its figure."""
+
 SHIFT = 0.13
 """How far published markers stand beside ours, in rows or columns."""
 
@@ -46,13 +54,17 @@ def draw_table(scored: Scored, path: Path) -> bool:
 
 
 def main_columns(scored: Scored) -> list[Column]:
-    """What the figure shows: mIoU and Var where the table has them, else all of a few columns."""
+    """What the figure shows: the headlines that the table has, else all of a few columns."""
     columns = [column for column in scored.table.columns if _has_values(scored, column)]
-    headlines = (names.MIOU, names.VAR)
-    chosen = [c for c in columns if (c.metric or "").rpartition("/")[2] in headlines]
+    chosen = [column for column in columns if _is_headline(column)]
     if chosen:
-        return chosen[:MAX_PANELS]
+        return chosen[:MAX_HEADLINES]
     return columns if len(columns) <= MAX_PANELS else []
+
+
+def _is_headline(column: Column) -> bool:
+    *part, score = (column.metric or "").split("/")
+    return score in HEADLINES and part in ([], [names.DAY], [names.NIGHT])
 
 
 def figure_of(scored: Scored) -> Figure | None:

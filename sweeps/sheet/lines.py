@@ -57,7 +57,9 @@ class Builder:
         if not self.beside:
             return (Text(), Text("seeds"), *columns)
         words = (Text("published"), Text("difference"))
-        return (Text("seeds"), *(text for column in columns for text in (column, *words)))
+        named = zip(self.columns, columns, strict=True)
+        beside = [(text, *(words if column.printed else ())) for column, text in named]
+        return (Text("seeds"), *(text for texts in beside for text in texts))
 
     def row(self, row: Row) -> list[Line]:
         """The lines of one row: all in one where they fit beside each other."""
@@ -91,8 +93,7 @@ class Builder:
         rhos = [Text(_signed(order.rho)) for order in orders]
         rows = [Text(str(order.rows)) for order in orders]
         if self.beside:
-            empty = Text(), Text()
-            apart = [[each for text in texts for each in (text, *empty)] for texts in (rhos, rows)]
+            apart = [self._apart(texts) for texts in (rhos, rows)]
             labels = Text("order of rows: rho"), Text("n")
             pairs = zip(labels, apart, strict=True)
             return [Line("order", label, (Text(), *texts)) for label, texts in pairs]
@@ -101,9 +102,18 @@ class Builder:
             Line("order", Text(), (Text("n"), Text(), *rows)),
         ]
 
+    def _apart(self, texts: Sequence[Text]) -> list[Text]:
+        """A text per column, with room for what is published of it."""
+        pairs = zip(self.columns, texts, strict=True)
+        apart = [(text, Text(), Text()) if column.printed else (text,) for column, text in pairs]
+        return [text for each in apart for text in each]
+
     def _triples(self, row: Row) -> list[Text]:
-        kinds = (self._ours, self._published, self._difference)
-        return [kind(row, column) for column in self.columns for kind in kinds]
+        """Ours, published and difference of every column; ours alone where it is not printed."""
+        beside = (self._published, self._difference)
+        kinds = [(self._ours, *(beside if column.printed else ())) for column in self.columns]
+        pairs = zip(self.columns, kinds, strict=True)
+        return [kind(row, column) for column, each in pairs for kind in each]
 
     def _label_notes(self, row: Row) -> list[str]:
         needs = [] if row.needs is None else [f"Cannot be run yet: {row.needs}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 
@@ -12,6 +13,7 @@ from sweeps.running.sources import State
 from sweeps.table.cell_points import Wanted
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
+TRAINED = "trained, not evaluated for all columns"
 
 
 def cells_grid(wanted: Wanted, outcomes: Sequence[Outcome]) -> Grid:
@@ -22,7 +24,7 @@ def cells_grid(wanted: Wanted, outcomes: Sequence[Outcome]) -> Grid:
             outcome.state,
             ABSENT if outcome.seconds is None else f"{outcome.seconds:.0f}",
             " ".join(outcome.keys) or ABSENT,
-            outcome.reason,
+            outcome.reason or (TRAINED if outcome.is_trained else ""),
         )
         for outcome in outcomes
     ]
@@ -55,6 +57,7 @@ def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[s
         seconds = estimated_seconds(outcomes, workers)
         known = duration(seconds) if seconds is not None else "known once a run is finished"
         lines.append(f"Time left with workers={workers}: {known}.")
+    lines += _evaluations(wanted, outcomes)
     if wanted.table.needs is not None:
         lines.append(f"The table cannot be run yet; it needs {wanted.table.needs}.")
     for row in wanted.table.rows:
@@ -63,4 +66,17 @@ def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[s
     for column in wanted.table.columns:
         if column.needs is not None:
             lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
+    return lines
+
+
+def _evaluations(wanted: Wanted, outcomes: Sequence[Outcome]) -> list[str]:
+    """What is made of every run beside its own evaluation, and which runs lack nothing else."""
+    asked = [shlex.join(evaluation.command) for evaluation in wanted.evaluations()]
+    if not outcomes or not asked:
+        return []
+    commands = "; ".join(f"python -m {command}" for command in dict.fromkeys(asked))
+    lines = [f"Made of every run that lacks it: {commands}."]
+    trained = sum(outcome.is_trained for outcome in outcomes)
+    if trained:
+        lines.append(f"Trained already: {trained}; the time of evaluations is not counted.")
     return lines

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from sweeps.sheet.lines import Builder
 from sweeps.sheet.texts import Footnotes, Line, Text
 from sweeps.table.scoring import Scored
+from sweeps.table.table import Column
 
 DEMO = (
     "scale=demo: data and network are small; compare the order of the rows with the paper, not the "
@@ -18,6 +19,7 @@ ORDER = (
     "rho: Spearman's rank correlation between our means and the published values over n rows; "
     "+1: the same order."
 )
+NOT_PRINTED = "Not in the paper."
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,7 @@ def sheet_of(scored: Scored, extra: Sequence[str] = ()) -> Sheet:
     builder = Builder(scored, notes)
     title = Text(f"{table.paper}, {table.number}: {table.caption}")
     title_notes = notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
-    columns = [
-        Text(column.name, notes=notes(column.needs and f"Not computed: {column.needs}"))
-        for column in table.columns
-    ]
+    columns = [Text(column.name, notes=notes(*_column_notes(column))) for column in table.columns]
     lines = [line for row in table.rows for line in builder.row(row)] + builder.order()
     return Sheet(
         title=Text(title.text, notes=title_notes),
@@ -67,6 +66,12 @@ def sheet_of(scored: Scored, extra: Sequence[str] = ()) -> Sheet:
         notes=tuple(notes.sentences),
         remarks=tuple(_remarks(scored, extra)),
     )
+
+
+def _column_notes(column: Column) -> list[str]:
+    """Footnotes of a column: that the paper does not have it, that it cannot be computed."""
+    ours = [] if column.printed else [NOT_PRINTED]
+    return ours + ([f"Not computed: {column.needs}"] if column.needs else [])
 
 
 def _remarks(scored: Scored, extra: Sequence[str]) -> list[str]:

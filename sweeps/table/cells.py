@@ -91,6 +91,8 @@ def metric_of(column: Column, row: Row) -> str:
 
 def evaluation_of(column: Column, table: Table) -> Evaluation | None:
     """What the column is counted from; None: the evaluation that every run makes itself."""
+    if column.frames is not None:
+        return Evaluation(frames=column.frames)
     asked = Evaluation(column.modality, table.regions)
     return None if asked == Evaluation() else asked
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import conf_dir
+from rgbt.metrics.named import OF_PAIRS
 
 if TYPE_CHECKING:
     from sweeps.table.table import Column, Factor, Row, Table
@@ -58,6 +59,26 @@ def _check_column(column: Column, names: list[str], place: str) -> None:
         raise InputError(f"{place}: expected one of metric, minus and needs, got {got}.")
     for other in column.minus or ():
         check_choice(f"{place}, minus", other, names)
+    _check_frames(column, place)
+
+
+def _check_frames(column: Column, place: str) -> None:
+    """Refuse a consistency metric without frames, and frames of anything else."""
+    is_consistency = (column.metric or "").rpartition("/")[2] in OF_PAIRS
+    if is_consistency and column.frames is None:
+        raise InputError(
+            f"{place}: {column.metric} compares two frames; add frames: aligned, released or next."
+        )
+    if column.frames is not None and not is_consistency:
+        raise InputError(
+            f"{place}: 'frames' is for {', '.join(OF_PAIRS)} alone; remove it, or choose one of "
+            "these."
+        )
+    if column.frames is not None and column.modality != "default":
+        raise InputError(
+            f"{place}: consistency is counted from what the network is made for; remove "
+            f"modality: {column.modality}."
+        )
 
 
 def _check_row(row: Row, table: Table, place: str) -> None:
@@ -67,6 +88,10 @@ def _check_row(row: Row, table: Table, place: str) -> None:
     _check_scales(row.at, place)
     for name in (*row.values, *row.doubtful):
         check_choice(f"{place}, column", name, names)
+        if not table.columns[names.index(name)].printed:
+            raise InputError(
+                f"{place}: column '{name}' is not printed (printed: false); remove its value."
+            )
     for column in table.columns:
         for key in re.findall(r"{(\w+)}", column.metric or ""):
             check_choice(f"{place}, '{key}' of metric {column.metric}", key, row.settings)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError, nearest
+from rgbt.metrics.pairs import Protocol
 from sweeps.table.checks import check_table
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
@@ -40,6 +41,9 @@ class Column:
         minus: (a, b): column a minus column b.
         needs: the part that must exist before the column can be computed.
         modality: what is predicted from; "default": what the network is made for.
+        frames: of a consistency metric: which two predictions it compares, see
+            `rgbt.metrics.pairs`.
+        printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
     """
 
@@ -50,6 +54,8 @@ class Column:
     minus: tuple[str, str] | None = None
     needs: str | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
+    frames: Protocol | None = None
+    printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"
 
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from rgbt.config import build, conf_dir, register_resolvers
 from rgbt.engine.allocator import keep_memory
-from rgbt.geometry import STRIDE, padded_hw
+from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.models.inputs import expand_cells

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.geometry import pad_to
+from rgbt.geometry.padding import pad_to
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.losses.spatial import PLAIN, SpatialWeight, weight_map
 from rgbt.types import IGNORE, Batch, Output

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.points import Evaluation, Point
 from sweeps.running.lists import Outcome
 from sweeps.table.scoring import Scored, score
@@ -36,6 +37,15 @@ def counts_of(*images: Any, night: tuple[bool, ...] | None = (False, True)) -> C
 def right(share: int) -> Counts:
     """One region and image whose pixel accuracy is `share` percent."""
     return counts_of([[[share, 100 - share], [0, 0]]], night=None)
+
+
+def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
+    """One pair of frames: `same` pixels are road in both, of `other` the second says car.
+
+    All are labelled road: TC of road is same / (same + other), that of car 0.
+    """
+    pairs = [[[same, other], [0, 0]], [[0, 0], [0, 0]], [[0, 0], [0, 0]]]
+    return replace(counts_of(pairs, night=None), partition=partition_name(protocol, 1))
 
 
 @dataclass(frozen=True)

@@ -196,6 +196,8 @@ def test_all_tables_are_listed_and_only_listed(
         (("table=my/small", "tracking=mlfow"), "did you mean 'mlflow'"),
         (("table=my/small", "metric=ring9"), "the columns of the table say what is counted"),
         (("table=my/small", "metric.regions=9"), "the columns of the table say what is counted"),
+        (("table=my/small", "consistency=none"), "on the published sets of views"),
+        (("table=my/small", "camera@consistency.view.camera=synth"), "python -m rgbt.consistency"),
         (("table=my/small", "workes=2"), "did you mean 'workers'"),
         (("table=my/small", "dryrun=true"), "did you mean 'dry_run'"),
         ((), "'table' has no value"),

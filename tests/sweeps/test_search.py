@@ -112,6 +112,17 @@ def test_another_search_under_the_same_name_is_refused(
             {"objectives": (Objective("test/mIoU", "maximize"),), "pruner": {"kind": "median"}},
             "known at the end alone",
         ),
+        (
+            {
+                "objectives": (Objective("val/TC/aligned", "maximize"),),
+                "pruner": {"kind": "median"},
+            },
+            "val/TC/aligned is known at the end alone",
+        ),
+        (
+            {"objectives": (Objective("val/TC/aligned", "maximize"),)},
+            r"do not measure it; add consistency=views 'consistency.splits=\[val,test\]'",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_before_a_study_is_made(
@@ -120,6 +131,18 @@ def test_what_cannot_be_is_refused_before_a_study_is_made(
     with pytest.raises(InputError, match=said):
         search(wanted, settings(**changes))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_consistency_is_followed_where_the_runs_measure_it(
+    wanted: Search, ends: list[str], tmp_path: Path
+) -> None:
+    fixed = (*wanted.fixed, "consistency=views", "consistency.splits=[val,test]")
+    objectives = tuple(Objective(f"val/{score}/aligned", "maximize") for score in ("TC", "CA"))
+    search(replace(wanted, fixed=fixed), settings(objectives=objectives[:1]))
+    assert len(load_study("s", open_storage(None, tmp_path)).trials) == 1
+    only_test = replace(wanted, fixed=(*wanted.fixed, "consistency=views"))
+    with pytest.raises(InputError, match="objective 'val/CA/aligned'"):
+        search(only_test, settings(objectives=objectives[1:]))
 
 
 def test_what_is_wrong_with_every_trial_is_told_before_the_first(

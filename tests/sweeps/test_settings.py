@@ -96,6 +96,10 @@ def test_interpolations_of_spaces_grids_and_points_are_left_to_the_runs(
         ({"objectives": [{"metric": "mIoU", "direction": "maximize"}]}, "objective 'mIoU'"),
         ({"objectives": [{"metric": "val/mIoU", "direction": "up"}]}, "hydra.sweeper.objectives"),
         (
+            {"objectives": [{"metric": "val/TC/align", "direction": "maximize"}]},
+            "did you mean 'TC/aligned'",
+        ),
+        (
             {"objectives": [{"metric": "val/mIoU", "direction": "maximize", "weight": 1}]},
             "hydra.sweeper.objectives",
         ),
@@ -110,6 +114,20 @@ def test_a_wrong_setting_is_told_in_one_sentence(
     with pytest.raises(InputError, match=said) as error:
         read_settings(changed(composed, **values))
     assert "\n" not in str(error.value)
+
+
+def test_objectives_that_are_told_while_a_run_trains() -> None:
+    followed = {
+        metric: Objective(metric, "maximize").is_followed
+        for metric in (
+            "val/mIoU",
+            "val/night/mIoU",
+            "val/TC/aligned",
+            "test/CA/released",
+            "test/Var",
+        )
+    }
+    assert list(followed.values()) == [True, True, False, False, False]
 
 
 @pytest.mark.parametrize("key", ["workers", "points"])

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice, check_range
-from rgbt.geometry import padded_hw
+from rgbt.geometry.padding import padded_hw
 from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
 from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid
 from rgbt.models.inputs import Inputs, only_view

@@ -9,13 +9,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice, check_range
-from rgbt.geometry import STRIDE, padded_hw
+from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
 from rgbt.models.mask2former.decoder import Predictions, Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
 from rgbt.types import VIEWS, MaskPair, Output, Predicts, View
+
+FAINTEST = 1e-6
+"""Smallest semantic score whose logarithm is taken."""
 
 
 class Head(nn.Module):
@@ -61,6 +64,9 @@ class Mask2Former(nn.Module):
 
     views: tuple[View, ...] = VIEWS
     predicts: Predicts = "masks"
+    stacks_passes = True
+    """`forward` takes several passes of a batch at once and treats each as a call of its own."""
+
     pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
@@ -172,6 +178,25 @@ class Mask2Former(nn.Module):
             "mask_logits": mask_logits.unflatten(1, stacked),
         }
         return Output(logits, aux)
+
+    def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
+        """Class scores of every pixel in training, for losses that compare dense predictions.
+
+        Args:
+            output: of one pass and view, see `forward`.
+            image_hw: size of the images.
+
+        Returns:
+            (B, K, H, W) float32: logarithm of the semantic scores, so that their softmax is the
+            share of a class in the sum over classes.
+        """
+        scores = semantic_logits(
+            output.aux["class_logits"][-1, 0],
+            output.aux["mask_logits"][-1, 0],
+            image_hw,
+            padded_hw(image_hw),
+        )
+        return scores.clamp(min=FAINTEST).log()
 
 
 def semantic_logits(

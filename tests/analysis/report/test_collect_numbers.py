@@ -20,6 +20,7 @@ from analysis.report.tables_scored import Draft, asked_of, score_again, values_o
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from rgbt.randomness import numpy_generator
 from sweeps.table.table import load_table
 from tests.analysis.report.stores import TABLE, counts_of, files_of
 from tests.analysis.report.test_collect_parts import run_of, stored
@@ -78,10 +79,10 @@ def test_differences_score_absent_classes_as_the_runs_do() -> None:
     assert "not corrected" in effect
 
 
-def draft(tmp_path: Path, seeds: int, runs: dict[str, Any]) -> Draft:
+def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -> Draft:
     """Row A with one run per seed, recorded with `seeds` of them."""
     path = tmp_path / "t.yaml"
-    path.write_text(TABLE)
+    path.write_text(text)
     line = Line(1.0, None, seeds, None, "", tuple(runs))
     recorded = Recorded(
         name="own/t",
@@ -104,6 +105,37 @@ def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
     )
     assert expected < 0
     assert values_of(found, table.rows[0], drop, {"k0": run}) == pytest.approx((expected,))
+
+
+def pairs_of(seed: int) -> Counts:
+    """Twelve pairs of frames of one set: 200 pixels of each of two classes, 200 of none."""
+    single = counts_of(seed)
+    size = (len(single.names), 3)
+    drawn = numpy_generator(seed, "pairs").multinomial(200, (0.4, 0.1, 0.1, 0.4), size)
+    return replace(single, counts=drawn.reshape(*size, 2, 2), partition="aligned1")
+
+
+def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path: Path) -> None:
+    runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
+    for seed, run in enumerate(runs.values()):
+        run._evaluations["evaluations/consistency_aligned_test.npz"] = pairs_of(seed)
+    ours = "{name: TC, metric: class/car/TC, frames: aligned, printed: false}"
+    text = TABLE.replace("{name: TC, needs: the consistency metrics}", ours)
+    found = draft(tmp_path, 2, runs, text)
+    row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
+    expected = [value("class/car/TC", pairs_of(seed), "released") for seed in range(2)]
+    assert values_of(found, row, column, runs) == ()  # recorded without the column
+    assert found.scored.cells["A", "TC"].mean == pytest.approx(sum(expected) / 2)
+    asked = asked_of(found, row, column)
+    source = Source(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), "released")
+    assert asked == (source, "class/car/TC")
+    intervals = Intervals(runs)
+    intervals.ask(*asked)
+    intervals.compute(200, quiet)
+    wanted = estimate(
+        [pairs_of(seed) for seed in range(2)], ["class/car/TC"], Resampling(resamples=200)
+    )
+    assert intervals.found[asked].interval == wanted["class/car/TC"].both
 
 
 def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from sweeps.points import Evaluation
 from sweeps.running import executors
 from sweeps.running.executors import Job, LocalExecutor
 from tests.sweeps.fakes import DEADLINE_S, until
@@ -302,3 +303,10 @@ def test_what_is_loaded_beforehand_can_be_loaded() -> None:
 
     assert all(importlib.util.find_spec(name) is not None for name in executors.PRELOADED)
     assert "forkserver" in multiprocessing.get_all_start_methods()
+
+
+def test_every_command_that_is_called_of_a_run_is_loaded_by_its_process_alone() -> None:
+    evaluations = (Evaluation(), Evaluation(frames="aligned"), Evaluation(frames="next"))
+    called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
+    assert called == set(executors.COMMANDS)
+    assert not called & set(executors.own_modules())

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.points import Point
+from sweeps.points import Evaluation, Point
 from sweeps.running import lists
 from sweeps.running.found import Found, Runs
 from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey
 from sweeps.running.plan import Plan
-from tests.sweeps.fakes import finish, plan_of, settings
+from tests.sweeps.fakes import counts, finish, plan_of, settings
 
 
 def made(folder: Path, seconds: float) -> Outcome:
@@ -30,6 +30,31 @@ def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
     assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
     assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
     assert estimated_seconds(left, 1) is None
+
+
+def test_the_time_of_what_is_trained_and_not_evaluated_is_not_counted(tmp_path: Path) -> None:
+    trained = replace(made(tmp_path / "a", 40), state="waiting")
+    failed = replace(made(tmp_path / "b", 20), state="failed")
+    waiting = Outcome(Point("q", ()), "waiting")
+    assert [each.is_trained for each in (trained, failed, waiting)] == [True, True, False]
+    assert not made(tmp_path / "c", 1).is_trained
+    assert estimated_seconds([trained, failed, waiting], 1) == 30.0
+    assert estimated_seconds([trained], 1) == 0.0
+
+
+def test_a_survey_tells_what_lacks_further_evaluations_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lists, "Planner", OneKey)
+    aligned = Evaluation(frames="aligned")
+    point = Point("a", ("x=1",), evaluations=(aligned,))
+    run = finish(tmp_path / plan_of(point).runs[0].key)
+    (outcome,) = survey(wanted(tmp_path, point), settings())
+    assert (outcome.state, outcome.is_trained, outcome.seconds) == ("waiting", True, 2.5)
+    (run.path / "evaluations").mkdir()
+    counts().save(run.path / aligned.path)
+    (outcome,) = survey(wanted(tmp_path, point), settings())
+    assert (outcome.state, outcome.is_trained) == ("finished", False)
 
 
 class OneKey:

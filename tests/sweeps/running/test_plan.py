@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
@@ -57,6 +59,19 @@ def test_seeds_make_a_run_each_and_evaluations_a_point_of_its_own(planner: Plann
     assert len({plan.key for plan in (*evaluated, both)}) == 5
     assert {plan.runs[0].key for plan in evaluated} == {single.key}
     assert all(len(plan.key) == 12 for plan in (*evaluated, both))
+
+
+def test_points_without_frames_keep_the_keys_of_studies_from_before_there_were_any(
+    planner: Planner,
+) -> None:
+    plan = planner.plan(Point("p", ("seed=1",), evaluations=(Evaluation("thermal", "ring9"),)))
+    parts = [[plan.runs[0].key], [{"modality": "thermal", "regions": "ring9"}]]
+    assert plan.key == hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+    framed = [
+        planner.plan(Point("p", ("seed=1",), evaluations=(Evaluation(frames=frames),)))
+        for frames in (None, "aligned", "released")
+    ]
+    assert len({plan.key for plan in framed}) == 3
 
 
 def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> None:

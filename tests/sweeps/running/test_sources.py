@@ -335,7 +335,9 @@ def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_p
     file.parent.mkdir()
     shutil.copyfile(found.folder / "counts_test.npz", file)
     assert found.has(ring)
-    os.utime(file, (0, 0))  # the run was trained again since
+    os.utime(file, (0, 0))
+    assert found.has(ring), "of a run made elsewhere there is no checkpoint"
+    (found.folder / "best.pt").touch()  # the run was trained again since
     assert not found.has(ring)
     assert known(plan, runs) is None
     replace(Counts.load(found.folder / "counts_test.npz"), dataset="other").save(file)

@@ -357,6 +357,69 @@ def test_further_evaluations_follow_the_run(tmp_path: Path) -> None:
     assert Bench(tmp_path, plan).work.advance() is not None, "all there: nothing is started"
 
 
+ALIGNED, RELEASED, NEXT = (
+    Evaluation(frames="aligned"),
+    Evaluation(frames="released"),
+    Evaluation(frames="next"),
+)
+OF_FRAMES = {"virtual": (ALIGNED, RELEASED), "next": (NEXT,)}
+
+
+def measuring(call: Call) -> Process:
+    """``rgbt.consistency``: both protocols of virtual views in one go."""
+    if call.module != "rgbt.consistency":
+        return (yield from succeed(call))
+    yield
+    for evaluation in OF_FRAMES[call.value("frames")]:
+        out = Path(call.value("run")) / evaluation.path
+        out.parent.mkdir(exist_ok=True)
+        counts(right=5).save(out)
+    return 0
+
+
+def test_both_protocols_of_virtual_views_are_one_call(tmp_path: Path) -> None:
+    plan = plan_of(Point("p", ("dataset.root=/x",), evaluations=(RELEASED, ALIGNED, NEXT)))
+    bench = Bench(tmp_path, plan, measuring)
+    (found,) = bench.run()
+    place = (f"run={found.folder}", f"runs_dir={tmp_path}")
+    assert [(call.module, call.words) for call in bench.executor.calls[1:]] == [
+        ("rgbt.consistency", (place[0], "frames=virtual", place[1], "dataset.root=/x")),
+        ("rgbt.consistency", (place[0], "frames=next", place[1], "dataset.root=/x")),
+    ]
+    for evaluation in (ALIGNED, RELEASED, NEXT):
+        assert found.counts(evaluation).counts[0, 0, 0, 0] == 5
+    assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
+
+
+def test_a_run_that_has_measured_its_consistency_itself_is_not_measured_again(
+    tmp_path: Path,
+) -> None:
+    def at_its_end(call: Call) -> Process:
+        """As `rgbt.training`: after the best checkpoint, before counts and result."""
+        RunFolder(call.folder)
+        (call.folder / "best.pt").touch()
+        for evaluation in (ALIGNED, RELEASED):
+            (call.folder / "evaluations").mkdir(exist_ok=True)
+            counts(right=6).save(call.folder / evaluation.path)
+        yield
+        finish(call.folder)
+        return 0
+
+    plan = plan_of(point(evaluations=(RELEASED, ALIGNED)))
+    bench = Bench(tmp_path, plan, at_its_end)
+    (found,) = bench.run()
+    assert [call.module for call in bench.executor.calls] == ["rgbt.run"]
+    assert found.counts(ALIGNED).counts[0, 0, 0, 0] == 6
+
+
+def test_a_consistency_that_cannot_be_measured_fails_the_point(tmp_path: Path) -> None:
+    plan = plan_of(point(evaluations=(ALIGNED,)))
+    finish(tmp_path / plan.runs[0].key)
+    refused = say("rgbt: 'fx' and 'width' are intrinsics of another image size.", 2)
+    with pytest.raises(PointError, match="of another image size"):
+        Bench(tmp_path, plan, refused).run()
+
+
 def test_an_evaluation_that_fails_or_writes_nothing_fails_the_point(tmp_path: Path) -> None:
     plan = plan_of(point(evaluations=(RING,)))
     finish(tmp_path / plan.runs[0].key)

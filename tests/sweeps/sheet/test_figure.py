@@ -5,11 +5,12 @@ from pathlib import Path
 import cv2
 import pytest
 
+from sweeps.points import Evaluation
 from sweeps.sheet.drawing import OURS, PUBLISHED, are_far_apart
 from sweeps.sheet.figure import draw_table, figure_of, main_columns
 from sweeps.table.scoring import score
 from sweeps.table.table import Column, Factor, Row
-from tests.sweeps.tabled import Made, counts_of, outcome, table
+from tests.sweeps.tabled import Made, counts_of, outcome, pairs_of, table
 
 MIOU = Column(name="mIoU", metric="mIoU")
 VAR = Column(name="Var", metric="Var", best="lowest")
@@ -73,6 +74,26 @@ def test_one_panel_per_row_for_tables_of_regions() -> None:
     many = tuple(Row(label=r.label, values={c.name: 1.0 for c in columns}) for r in rows)
     figure = figure_of(score("t", table(many, columns), {}, scale="demo"))
     assert [axes.get_title() for axes in figure.axes] == ["Car", "Bike"]
+
+
+def test_consistency_of_both_protocols_has_panels_beside_the_iou() -> None:
+    columns = (
+        Column(name="mAcc", metric="mAcc"),
+        MIOU,
+        Column(name="TC", metric="TC", frames="released"),
+        Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
+        Column(name="car", metric="class/car/TC", frames="aligned", printed=False),
+    )
+    made = {None: counts_of()} | {
+        Evaluation(frames=frames): pairs_of(6, 2, frames) for frames in ("released", "aligned")
+    }
+    rows = (Row(label="a", experiment="crm", values={"mIoU": 60.0, "TC": 34.0}),)
+    scored = score("t", table(rows, columns), {("a", 0): outcome("k", made)}, scale="demo")
+    assert main_columns(scored) == [columns[1], columns[2], columns[3]]
+    figure = figure_of(scored)
+    assert [axes.get_xlabel() for axes in figure.axes[:3]] == ["mIoU", "TC", "TC aligned"]
+    hollow = [line for line in figure.axes[2].lines if line.get_markerfacecolor() == "none"]
+    assert not hollow, "nothing is published of it"
 
 
 def test_png_holds_both_colours(tmp_path: Path) -> None:

@@ -46,6 +46,40 @@ def test_the_order_of_rows_and_the_remarks_stand_below() -> None:
     assert DEMO in shown
 
 
+def test_a_column_of_ours_alone_has_nothing_published_beside_it() -> None:
+    columns = (
+        Column(name="acc", metric="pixel_accuracy"),
+        Column(name="own", metric="pixel_accuracy", printed=False),
+    )
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"acc": printed})
+        for label, printed in (("a", 48.5), ("b", 47.5), ("c", 46.5))
+    )
+    runs = {(label, 0): outcome(label, right(share)) for label, share in zip("abc", (3, 2, 1))}
+    scored = score("t", table(rows, columns), runs, scale="demo")
+    shown = lines(scored)
+    assert shown[1].split() == ["seeds", "acc", "published", "difference", "own[1]"]
+    assert shown[3].split() == ["a", "1", "*3.00", "*48.5", "-45.50", "*3.00"]
+    assert shown[6].split() == ["order", "of", "rows:", "rho", "+1.00", "-"]
+    assert shown[7].split() == ["n", "3", "0"]
+    assert "[1] Not in the paper." in shown
+    text = latex(sheet_of(scored))
+    body = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert {line.count(" & ") for line in body} == {5}
+    assert "| own<sup>1</sup> |" in markdown(sheet_of(scored))
+    last = list(csv.DictReader(io.StringIO(tidy_csv(scored))))[-1]
+    assert (last["column"], last["mean"], last["published"]) == ("own", "1.0", "")
+    assert last["difference"] == ""
+
+
+def test_a_column_of_ours_alone_has_dashes_where_lines_are_below_each_other() -> None:
+    own = (*STACKED[:3], Column(name="own", metric="pixel_accuracy", printed=False))
+    shown = lines(wide(own))
+    assert shown[3].split() == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
+    assert shown[4].split() == ["published", "48.00", "49.25", "-", "-"]
+    assert "[1] Not in the paper." in shown
+
+
 def test_more_columns_have_a_line_each_for_ours_published_and_difference() -> None:
     shown = lines(wide(STACKED))
     assert shown[3].split() == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]

@@ -62,6 +62,22 @@ def test_regions_of_the_table_are_evaluated_for_every_modality() -> None:
     )
 
 
+def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
+    columns = (
+        Column(name="mIoU", metric="mIoU"),
+        Column(name="TC", metric="TC", frames="released"),
+        Column(name="CA", metric="CA_released", frames="released"),
+        Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
+    )
+    for regions, others in (("as trained", ()), ("ring9", (Evaluation(regions="ring9"),))):
+        asked = Wanted("own/t", table(ROWS, columns, regions=regions), "demo", (0,))
+        assert asked.points()[0].evaluations == (
+            *others,
+            Evaluation(frames="released"),
+            Evaluation(frames="aligned"),
+        )
+
+
 def test_outcomes_go_back_to_their_cells() -> None:
     asked = wanted()
     outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]

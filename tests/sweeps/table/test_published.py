@@ -77,7 +77,7 @@ def test_the_four_papers_together(published: dict[str, Any]) -> None:
 def test_columns_stand_in_the_printed_order(published: dict[str, Any]) -> None:
     for name, table in published.items():
         ours = OURS[name]
-        names = [column.name for column in ours.columns]
+        names = [column.name for column in ours.columns if column.printed]
         flat = [
             f"{key}_{part}" if part else key
             for key, cell in table["rows"][0]["values"].items()

@@ -8,7 +8,7 @@ from rgbt.checks import InputError
 from sweeps.points import Evaluation
 from sweeps.table.scoring import check_metrics, published, score
 from sweeps.table.table import Column, Row
-from tests.sweeps.tabled import Made, counts_of, failed, outcome, right, table
+from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
 
 ACC = Column(name="acc", metric="pixel_accuracy")
 RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
@@ -94,6 +94,51 @@ def test_regions_of_the_table_and_placeholders() -> None:
     scored = score("t", table(rows, (column,), regions="ring9"), runs, scale="demo")
     assert scored.cells["Road", "R2"].mean == pytest.approx(75.0)
     assert scored.cells["Car", "R2"].mean == pytest.approx(80.0)
+
+
+def test_protocols_have_their_counts_and_a_column_of_ours_no_order() -> None:
+    """TC of road 6/8 and 8/10, of car 0. CA of road alike; as released 6/10 and 8/12."""
+    columns = (
+        ACC,
+        Column(name="TC", metric="TC", frames="released"),
+        Column(name="CA", metric="CA_released", frames="released"),
+        Column(name="TC aligned", metric="class/road/TC", frames="aligned", printed=False),
+    )
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"TC": printed})
+        for label, printed in (("a", 30.0), ("b", 31.0), ("c", 32.0))
+    )
+    made = {
+        label: {
+            None: right(share),
+            Evaluation(frames="released"): pairs_of(same, 2, "released"),
+            Evaluation(frames="aligned"): pairs_of(same + 2, 0 if label == "c" else 2),
+        }
+        for label, share, same in (("a", 40, 6), ("b", 50, 8), ("c", 60, 2))
+    }
+    runs = {(label, 0): outcome(label, counts) for label, counts in made.items()}
+    scored = score("t", table(rows, columns), runs, scale="demo")
+    found = {place: cell.mean for place, cell in scored.cells.items()}
+    assert found["a", "TC"] == pytest.approx(100 * 6 / 8 / 2)
+    assert found["b", "TC"] == pytest.approx(100 * 8 / 10 / 2)
+    assert found["a", "CA"] == pytest.approx(100 * 6 / (6 + 8 + 8 - 2 * 6) / 2)
+    assert found["b", "CA"] == pytest.approx(100 * 8 / (8 + 10 + 10 - 2 * 8) / 2)
+    assert found["a", "TC aligned"] == pytest.approx(80.0)
+    assert found["c", "TC aligned"] == 100.0
+    assert scored.orders["TC"].rho == pytest.approx(-0.5)  # ours 2 3 1 for 1 2 3
+    assert scored.orders["TC aligned"].rows == 0
+    assert scored.ranks_ours["c", "TC aligned"] == 1
+    assert math.isnan(scored.difference(rows[0], columns[3]))
+
+
+def test_pairs_that_were_not_counted_say_so() -> None:
+    column = Column(name="TC", metric="TC", frames="aligned")
+    run = outcome("k", {Evaluation(frames="aligned"): right(40)})
+    (cell,) = score(
+        "t", table((Row(label="a"),), (column,)), {("a", 0): run}, scale="demo"
+    ).cells.values()
+    assert cell.mark == "no value"
+    assert "python -m rgbt.consistency run=..." in cell.reason
 
 
 def test_a_failed_seed_keeps_its_reason_and_leaves_the_others() -> None:

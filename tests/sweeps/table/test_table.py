@@ -128,6 +128,24 @@ def test_names_list_published_tables_and_ones_own(tmp_path: Path) -> None:
         (column(minus=["mIoU"]), "column 'b': 'minus[1]' has no value"),
         (column(minus=["mIoU", "IoU"]), "column 'b', minus: 'IoU' is not a choice"),
         ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
+        (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
+        (column(metric="class/car/CA"), "class/car/CA compares two frames"),
+        (column(metric="TC", frames="align"), "'frames': input should be 'aligned', 'released'"),
+        (column(metric="Var", frames="aligned"), "'frames' is for TC, CA, CA_released alone"),
+        (column(minus=["b", "mIoU"], frames="aligned"), "'frames' is for TC, CA, CA_released"),
+        (
+            column(metric="TC", frames="aligned", modality="thermal"),
+            "column 'b': consistency is counted from what the network is made for; remove modality",
+        ),
+        (
+            {**column(metric="Var", printed=False), **row(values={"b": 3})},
+            "row 'small': column 'b' is not printed (printed: false); remove its value",
+        ),
+        (
+            {**column(metric="Var", printed=False), **row(doubtful=["b"])},
+            "column 'b' is not printed",
+        ),
+        (column(metric="Var", printed="no"), "column 'b': 'printed': input should be a valid bool"),
     ],
 )
 def test_refuses(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None:
@@ -228,6 +246,14 @@ def test_published_row_composes_and_its_masks_fit(table: Table, row: Row, compos
             ("crm/table4", "CRM"),
         ],
         [("temporal/table1", "(A)"), ("temporal/table2", "(A)")],
+        [("temporal/table1", "(G)"), ("temporal/table4", "Ours-dice")],
+        [
+            ("temporal/table1", "(H)"),
+            ("temporal/table2", "(D)"),
+            ("temporal/table3", "(E)"),
+            ("temporal/table4", "Ours-con"),
+        ],
+        [("temporal/table1", "(I)"), ("temporal/table4", "Ours-con-acc")],
     ],
 )
 def test_rows_that_are_printed_twice_are_one_run(
@@ -247,7 +273,8 @@ def test_rows_that_are_printed_twice_are_one_run(
 @pytest.mark.parametrize(
     "name",
     ["crm/table3a", "crm/table3b", "crm/table4"]
-    + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)],
+    + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)]
+    + [f"temporal/table{number}" for number in (1, 2, 3)],
 )
 def test_rows_of_an_ablation_are_different_runs(name: str, compose: Compose) -> None:
     table = TABLES[name]
@@ -261,7 +288,8 @@ def test_settings_say_what_the_overrides_do(table: Table, row: Row, compose: Com
     printed = {key: value for key, value in row.settings.items() if value is not None}
     found = {
         "patch_size": 2 * (masker.patch_size or 0),  # pixels are halved at demo scale
-        "alpha": loss.get("spatial", {}).get("alpha"),
+        "alpha": loss.get("spatial", loss).get("alpha"),
+        "beta": loss.get("beta"),
         "focus": loss.get("spatial", {}).get("focus"),
         "masking_ratio": masker.ratio,
         "masking": {"indiv": "irm", "rand_comp": "crm"}.get(masker.pairing or ""),

@@ -1,0 +1,100 @@
+"""True second frames of a data set: the folder `next` beside its images.
+
+`synth` writes one (``dataset.ego_forward_m=...``); any data set in MFNet's layout may hold one:
+
+    next/                 the same layout and the same names, one moment later
+    next/flow/NAME.npy    (H, W, 2) float32: for every pixel of the second frame, how many (rows,
+                          columns) further the same point lies in the first; NaN where it is hidden
+                          there or outside
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+
+FOLDER = "next"
+
+
+class NextFrames:
+    """The second frames of a data set, and where their points were in the first.
+
+    Args:
+        first: the data set of the first frames.
+
+    Attributes:
+        dataset: reader of the second frames.
+
+    Raises:
+        InputError: the data set has no second frames.
+    """
+
+    def __init__(self, first: MFNet) -> None:
+        root = first.root / FOLDER
+        if not (root / "flow").is_dir():
+            raise InputError(
+                f"{first.name} ({first.root}) has no second frames: expected the folder {FOLDER}/ "
+                "with images, labels and flow; dataset=synth writes them with "
+                "dataset.ego_forward_m=0.5, and frames=virtual needs none."
+            )
+        self.dataset = MFNet(
+            str(root),
+            name=f"{first.name}/{FOLDER}",
+            num_classes=first.num_classes,
+            classes=first.classes,
+            palette=first.palette,
+            splits=first.splits,
+            layout=first.layout,
+        )
+
+    def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
+        """Where each pixel of the second frame was in the first.
+
+        Args:
+            name: of the frame.
+            image_hw: its size, which the flow must have.
+
+        Returns:
+            rows and columns (H, W) int64, nearest pixels; -1 where the point was not seen.
+
+        Raises:
+            InputError: no flow, one of another size, or one that leads out of the image.
+        """
+        flow = self._flow(name, image_hw)
+        rows, columns = np.indices(image_hw)
+        grid = np.stack([rows, columns], axis=-1)
+        seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
+        place = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
+        if (place < 0).any() or (place >= image_hw).any():
+            raise InputError(
+                f"{self._path(name)} leads out of the first frame of {image_hw[0]}x{image_hw[1]} "
+                "pixels; points that were not seen there must be NaN."
+            )
+        place[~seen] = -1
+        return place[..., 0], place[..., 1]
+
+    def _flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
+        path = self._path(name)
+        try:
+            flow = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path} cannot be read as an array ({error}).") from error
+        is_array = isinstance(flow, np.ndarray) and np.issubdtype(flow.dtype, np.floating)
+        if not is_array or flow.shape != (*image_hw, 2):
+            what = (
+                f"{' x '.join(map(str, flow.shape))} {flow.dtype}" if is_array else "something else"
+            )
+            raise InputError(
+                f"{path} must be an array of {image_hw[0]} x {image_hw[1]} x 2 real numbers (rows, "
+                f"columns) like its frame, got {what}."
+            )
+        return np.asarray(flow, np.float32)
+
+    def _path(self, name: str) -> Path:
+        return self.dataset.root / "flow" / f"{name}.npy"

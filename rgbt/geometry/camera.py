@@ -1,0 +1,73 @@
+"""The pinhole camera whose views are synthesised, and its matrix for images of a given size."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of a pinhole camera for images of `height` x `width` pixels.
+
+    Attributes:
+        fx: focal length along a row, pixels, above 0.
+        fy: focal length along a column, pixels, above 0.
+        cx: column of the principal point, pixels; centres of pixels lie at whole numbers.
+        cy: row of the principal point.
+        height: rows of the images that the four numbers hold for.
+        width: their columns.
+
+    Raises:
+        InputError: a size or a focal length that is not positive, or a principal point outside
+            the image: then these are the intrinsics of images of another size.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        positive = all(0 < focal < math.inf for focal in (self.fx, self.fy))
+        if not positive or min(self.height, self.width) < 1:
+            raise InputError(
+                f"camera: expected fx, fy, height and width above 0, got fx={self.fx:g}, "
+                f"fy={self.fy:g}, height={self.height}, width={self.width}."
+            )
+        inside = -0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5
+        if not inside:
+            raise InputError(
+                f"camera: the principal point (cx={self.cx:g}, cy={self.cy:g}) lies outside an "
+                f"image of {self.height}x{self.width}, so these are intrinsics of another image "
+                f"size; set height and width to the size they were calibrated for."
+            )
+
+    def matrix(self, image_hw: tuple[int, int]) -> Tensor:
+        """(3, 3) float64, the calibration matrix K for images of `image_hw` (height, width).
+
+        Images of the same aspect but another size are the same picture resized: focal lengths
+        scale by s, and the principal point as pixel centres do, c' = (c + 0.5) s - 0.5. An aspect
+        that differs by less than a pixel, as by rounding after resizing, is the same.
+
+        Raises:
+            InputError: `image_hw` has another aspect than the camera's images.
+        """
+        height, width = image_hw
+        sy, sx = height / self.height, width / self.width
+        if abs(sy * self.width - width) >= 1:
+            raise InputError(
+                f"camera: expected images of {self.height}x{self.width} or that aspect, got "
+                f"{height}x{width}: these are intrinsics of another image size; give those of "
+                f"your camera (fx, fy, cx, cy, height, width)."
+            )
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        rows = [[self.fx * sx, 0.0, cx], [0.0, self.fy * sy, cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)

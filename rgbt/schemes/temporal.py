@@ -1,0 +1,162 @@
+"""A frame and a virtual view of it through shared weights, with losses on both and between them.
+
+Source: Li, Chu, Sun, "Temporal Consistency for RGB-Thermal Data-based Semantic Scene
+Understanding", Fig. 2 and Eq. 4, and its release.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Literal, Protocol, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from rgbt.checks import InputError
+from rgbt.geometry.warp import Warp
+from rgbt.types import Batch, Frame, GeneratorOf, Masker, Output, Phase
+
+DenseLogits = Callable[[Output, tuple[int, int]], Tensor]
+"""(output, image_hw) -> (B, K, H, W) scores of a network that predicts masks of queries."""
+
+
+class VirtualViews(Protocol):
+    """What draws the second frame (see `rgbt.transforms.virtual_view.VirtualView`)."""
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, 3) angles."""
+        ...
+
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
+        """Where the pixels of the second frame come from."""
+        ...
+
+    def batch(self, batch: Batch, warp: Warp) -> Batch:
+        """The second frames with their labels."""
+        ...
+
+    def valid(self, warp: Warp) -> Tensor:
+        """(B, H, W) bool: pixels that losses count."""
+        ...
+
+
+class Temporal:
+    """Losses of a frame, of its virtual successor, and of how their predictions agree.
+
+    Both frames go through the same weights. Where the network normalises over the batch they go
+    one after the other, as released; else as one batch, which is the same function and faster.
+
+    Paper: the first prediction ("segmentation map") is brought into the second frame; nothing is
+        said of stopping its gradient.
+    Released: scores are brought there and normalised afterwards, and no gradient passes.
+
+    Args:
+        model: any network; one that returns masks of queries needs `dense_logits`.
+        loss: loss of two frames (see `rgbt.losses.temporal.TemporalLoss`).
+        masker: must hide nothing: virtual views and masks are not trained together.
+        view: draws virtual views and applies them.
+        warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
+        detach: whether the first prediction is a fixed teacher of the second.
+
+    Raises:
+        InputError: a loss of single frames, a masker that hides something, or a network that the
+            loss between frames cannot read.
+    """
+
+    def __init__(  # noqa: PLR0913 - four collaborators, two choices of the paper
+        self,
+        *,
+        model: nn.Module,
+        loss: Any,
+        masker: Masker,
+        view: VirtualViews,
+        warps: Literal["logits", "probabilities"],
+        detach: bool,
+    ) -> None:
+        if not hasattr(loss, "reads_warped"):
+            raise InputError(
+                f"scheme=temporal trains on pairs of frames, but {type(loss).__name__} is a loss "
+                "of single ones; choose loss=temporal_paper or loss=temporal_released."
+            )
+        if not masker.hides_nothing:
+            raise InputError(
+                "scheme=temporal shows both frames whole, but the masker hides cells; choose "
+                "masker=none."
+            )
+        if getattr(model, "predicts", "scores") == "masks" and not hasattr(model, "dense_logits"):
+            raise InputError(
+                f"scheme=temporal compares class scores of two frames, but {type(model).__name__} "
+                "predicts masks of queries and has no `dense_logits` that makes scores of them; "
+                "choose another network."
+            )
+        self.model = model
+        self.loss = loss
+        self.view = view
+        self.warps = warps
+        self.detach = detach
+        self.stacks = bool(getattr(model, "stacks_passes", False))
+        self.apart = any(isinstance(module, _BatchNorm) for module in model.modules())
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        """One phase with the parts of Eq. 4.
+
+        Args:
+            batch: see `rgbt.types.Batch`, images in [0, 1].
+            generator_of: purpose -> generator of this step.
+        """
+        image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
+        angles = self.view.draw(len(batch.name), generator_of("virtual view"))
+        warp = self.view.warp(angles, image_hw)
+        first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
+        warped = self._warped(first.logits, warp) if self.loss.reads_warped else None
+        parts = self.loss(first, second, warped, self.view.valid(warp), generator_of("loss"))
+        yield Phase("main", parts)
+
+    def _warped(self, logits: Tensor, warp: Warp) -> Tensor:
+        """(B, K, H, W) class probabilities of the first frame, as the second should see them."""
+        logits = logits.detach() if self.detach else logits
+        if self.warps == "probabilities":
+            return warp.bilinear(logits.float().softmax(1))
+        return warp.bilinear(logits.float()).softmax(1)
+
+    def _frames(
+        self, first: Batch, second: Batch, generator_of: GeneratorOf
+    ) -> tuple[Frame, Frame]:
+        generator = generator_of("stochastic depth")
+        batches = (first, second)
+        if self.apart and not self.stacks:
+            outputs = [self.model(each.rgb, each.thermal, generator=generator) for each in batches]
+            return self._frame(outputs[0], first), self._frame(outputs[1], second)
+        rgb = torch.cat([each.rgb for each in batches])
+        thermal = torch.cat([each.thermal for each in batches])
+        passes = {"passes": 2} if self.stacks else {}
+        output = self.model(rgb, thermal, generator=generator, **passes)
+        halves = _passes(output) if self.stacks else _halves(output, len(first.name))
+        return self._frame(halves[0], first), self._frame(halves[1], second)
+
+    def _frame(self, output: Output, batch: Batch) -> Frame:
+        logits = output.logits
+        if logits is None:
+            image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
+            logits = cast(DenseLogits, self.model.dense_logits)(output, image_hw)
+        return Frame(output, batch, logits)
+
+
+def _passes(output: Output) -> tuple[Output, Output]:
+    """Two stacked passes (L, P = 2, B, ...) as two outputs."""
+    first, second = (
+        Output(None, {name: values[:, number : number + 1] for name, values in output.aux.items()})
+        for number in range(2)
+    )
+    return first, second
+
+
+def _halves(output: Output, count: int) -> tuple[Output, Output]:
+    """A batch of both frames as two outputs; what networks return beside has the batch first."""
+    assert output.logits is not None, "a network that does not stack passes returns scores"
+    first, second = (
+        Output(output.logits[part], {name: values[part] for name, values in output.aux.items()})
+        for part in (slice(count), slice(count, None))
+    )
+    return first, second

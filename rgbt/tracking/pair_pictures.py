@@ -1,0 +1,76 @@
+"""Picture of pairs of frames: what a network says of each, and where it contradicts itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.tracking.pictures import (
+    IGNORED_COLOUR,
+    Image,
+    Legend,
+    colours,
+    draw_columns,
+    overlay,
+)
+
+AGREES = (235, 235, 235)
+DIFFERS = (200, 30, 30)
+
+
+@dataclass(frozen=True)
+class PairExample:
+    """Two frames of a scene and what was predicted of them.
+
+    Attributes:
+        name: shown beside the row.
+        first_rgb: (H, W, 3) uint8, the first frame.
+        first: (H, W) uint8, its predicted classes.
+        second_rgb: (H, W, 3) uint8, the second frame.
+        second: (H, W) uint8, its predicted classes.
+        followed: (H, W) uint8, the first prediction at the points that the second frame shows.
+        seen: (H, W) bool, whether the first frame shows that point too.
+    """
+
+    name: str
+    first_rgb: Image
+    first: Image
+    second_rgb: Image
+    second: Image
+    followed: Image
+    seen: NDArray[np.bool_]
+
+    def difference(self) -> Image:
+        """(H, W, 3) uint8: red where the two predictions differ, grey where nothing is compared."""
+        picture = np.empty((*self.seen.shape, 3), np.uint8)
+        picture[:] = AGREES
+        picture[self.followed != self.second] = DIFFERS
+        picture[~self.seen] = IGNORED_COLOUR
+        return picture
+
+
+COLUMNS = ("frame", "its prediction", "second frame", "its prediction", "first, brought there")
+
+
+def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> None:
+    """Write a PNG, one row per scene, as in Temporal, Figs. 1 and 6.
+
+    Raises:
+        ValueError: no examples.
+    """
+    rows = {
+        example.name: (
+            example.first_rgb,
+            overlay(example.first_rgb, example.first, legend.palette),
+            example.second_rgb,
+            overlay(example.second_rgb, example.second, legend.palette),
+            colours(np.where(example.seen, example.followed, 255), legend.palette),
+            example.difference(),
+        )
+        for example in examples
+    }
+    draw_columns(rows, (*COLUMNS, "differ"), legend, path)

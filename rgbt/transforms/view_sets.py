@@ -1,0 +1,119 @@
+"""Sets of angles for evaluation: a virtual view of every image of a split, always the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError, nearest
+from rgbt.transforms.virtual_view import VirtualView
+
+HEADER = "yaw,pitch,roll"
+PUBLISHED = Path(__file__).with_name("angles")
+"""The three sets of the Temporal release: 393 triples each, one per image of MFNet's test list."""
+
+PUBLISHED_VIEWS = "e93922"
+"""Digest of ``conf/consistency/views.yaml``, on which published TC and CA were measured."""
+
+Split = Literal["val", "test"]
+
+
+class ViewSets:
+    """Which virtual views consistency is measured on (TC and CA), and of which splits.
+
+    Source: Temporal, Table I: the mean over the same three sets of angles; the sets are those of
+    its release. The k-th triple belongs to the k-th image of the split's list; a split with more
+    images than triples begins again with the first triple.
+
+    Args:
+        view: how a triple becomes a view; its ranges of angles are not drawn from.
+        sets: names of published sets ("released_1" .. "released_3"), or CSV files with the columns
+            yaw,pitch,roll in degrees. None: a run measures no consistency.
+        splits: what a run measures at its end, with its best checkpoint.
+
+    Raises:
+        InputError: no such set, a line that is no triple, or a triple that leaves no rectangle.
+    """
+
+    def __init__(
+        self, *, view: VirtualView, sets: tuple[str, ...], splits: tuple[Split, ...]
+    ) -> None:
+        self.view = view
+        self.sets = sets
+        self.splits = splits
+        if sets and not splits:
+            raise InputError(
+                "consistency.splits is empty, so that nothing of consistency.sets would be "
+                "measured; name val or test, or choose consistency=none."
+            )
+        self._triples = [read_angles(name) for name in sets]
+        for name, triples in zip(sets, self._triples, strict=True):
+            try:
+                view.check(triples, (view.camera.height, view.camera.width))
+            except InputError as error:
+                raise InputError(f"consistency.sets: {name}: {error}") from error
+
+    @property
+    def mark(self) -> str:
+        """Empty for the published views; six hexadecimal digits of any others, for names of files.
+
+        Depends on the triples and on how they become views, not on names or places of files.
+        """
+        triples = [each.tolist() for each in self._triples]
+        text = json.dumps([self.view.settings(), triples], sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:6]
+        return "" if digest == PUBLISHED_VIEWS else digest
+
+    def angles(self, number: int, indices: list[int]) -> Tensor:
+        """(B, 3) float64 degrees: the triples of set `number` (0-based) for images of a split.
+
+        Args:
+            number: of the set.
+            indices: places of the images in the split's list.
+        """
+        triples = self._triples[number]
+        return triples[torch.tensor(indices) % len(triples)]
+
+
+def read_angles(name: str) -> Tensor:
+    """(N, 3) float64: the triples of a published set, or of a file.
+
+    Raises:
+        InputError: neither a published set nor a file, or a line that is no triple of numbers.
+    """
+    published = {path.stem: path for path in PUBLISHED.glob("*.csv")}
+    path = published.get(name, Path(name).expanduser())
+    if not path.is_file():
+        raise InputError(
+            f"consistency.sets: '{name}' is no published set of angles and no file; "
+            f"{nearest(name, published)}, or give a CSV file with the columns {HEADER}."
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"consistency.sets: {path} is no text in UTF-8; save it as a CSV file with the columns "
+            f"{HEADER}."
+        ) from error
+    header, *lines = [line.replace(" ", "") for line in text.splitlines() if line.strip()] or [""]
+    if header != HEADER or not lines:
+        raise InputError(
+            f"consistency.sets: {path} must begin with the line '{HEADER}', then one triple of "
+            f"degrees per line, got '{header}' and {len(lines)} lines."
+        )
+    return torch.tensor([_triple(path, line) for line in lines], dtype=torch.float64)
+
+
+def _triple(path: Path, line: str) -> list[float]:
+    try:
+        yaw, pitch, roll = map(float, line.split(","))
+    except ValueError as error:
+        raise InputError(
+            f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got '{line}'."
+        ) from error
+    return [yaw, pitch, roll]

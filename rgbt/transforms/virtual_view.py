@@ -1,0 +1,190 @@
+"""Virtual views: a labelled frame as it looks after a small turn of the camera (VVIG).
+
+A turn moves every pixel by a homography; cutting the result to the largest rectangle without empty
+pixels and enlarging it again stands for the way forward. Where pixels come from is arithmetic in
+`rgbt.geometry`; here it is drawn and applied to batches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from itertools import product
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.geometry.camera import Camera
+from rgbt.geometry.homography import Order, homography
+from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
+from rgbt.geometry.warp import Resampling, Warp
+from rgbt.types import IGNORE, Batch
+
+Degrees = tuple[float, float]
+STEEPEST = 60.0
+"""Degrees; a camera of ordinary width that turns further sees nothing of what it saw."""
+
+
+class VirtualView:
+    """Draws turns of the camera and brings images, labels and predictions into the new view.
+
+    Paper: Temporal, Sec. III-B and Eq. 1: ``M = K Rz(roll) Ry(yaw) Rx(pitch) K^-1``, angles from
+        closed intervals, cut to the largest inner rectangle, one interpolation.
+    Released: ``K Rz Rx Ry K^-1``, whole degrees without the upper end, second extremes of the
+        corners for the rectangle, interpolated twice (warp, then cut and resize), empty pixels
+        are background. Its intrinsics are those of another camera (see ``conf/camera``).
+
+    Args:
+        camera: intrinsics, scaled to the size of the images.
+        order: of the rotations: "zyx" as in the paper, "zxy" as released.
+        yaw: (low, high) degrees about the vertical axis; positive moves what is seen to the right.
+        pitch: likewise about the horizontal axis; positive moves it up.
+        roll: likewise about the viewing direction; positive turns it clockwise.
+        angles: "uniform" real numbers, or "integer": whole degrees without the upper end.
+        mode: "both"; "rotation" leaves out cutting and enlarging, "translation" does nothing else
+            (Temporal, Table II, whose definitions are not published).
+        rectangle: "largest" by area, or "corners" as released. "rotation" does not cut.
+        resampling: "once" or "twice".
+        outside: what pixels are that the first frame does not show: "ignore" leaves them out of
+            every loss, "background" gives them class 0 and trains on them, as released.
+
+    Raises:
+        InputError: angles out of range, or so large that no rectangle is left.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        *,
+        camera: Camera,
+        order: Order,
+        yaw: Degrees,
+        pitch: Degrees,
+        roll: Degrees,
+        angles: Literal["uniform", "integer"],
+        mode: Literal["both", "rotation", "translation"],
+        rectangle: Rule,
+        resampling: Resampling,
+        outside: Literal["ignore", "background"],
+    ) -> None:
+        check_choice("view.angles", angles, ("uniform", "integer"))
+        check_choice("view.mode", mode, ("both", "rotation", "translation"))
+        check_choice("view.outside", outside, ("ignore", "background"))
+        self.camera = camera
+        self.order: Order = order
+        self.angles = angles
+        self.mode = mode
+        self.rectangle: Rule = rectangle
+        self.resampling: Resampling = resampling
+        self.outside_label = IGNORE if outside == "ignore" else 0
+        self.ranges = {"yaw": yaw, "pitch": pitch, "roll": roll}
+        self._check_ranges()
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, 3) float64: yaw, pitch, roll in degrees, on the device of `generator`."""
+        device = generator.device
+        low, high = torch.tensor(
+            list(self.ranges.values()), dtype=torch.float64, device=device
+        ).unbind(1)
+        drawn = torch.rand(count, 3, dtype=torch.float64, generator=generator, device=device)
+        angles = low + (high - low) * drawn
+        return angles.floor() if self.angles == "integer" else angles
+
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
+        """Where the pixels of the view come from.
+
+        Args:
+            angles: (B, 3) degrees: yaw, pitch, roll.
+            image_hw: size of both frames in pixels.
+
+        Raises:
+            InputError: the camera is one of images of another shape.
+        """
+        turn = homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
+        frame = _whole(turn, image_hw)
+        rectangle = frame if self.mode == "rotation" else self._rectangle(turn, image_hw)
+        if self.mode == "translation":
+            turn = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
+        return Warp(turn, rectangle, image_hw, self.resampling)
+
+    def settings(self) -> dict[str, Any]:
+        """What decides how given angles become a view, as plain values."""
+        return {
+            "camera": asdict(self.camera),
+            "order": self.order,
+            "mode": self.mode,
+            "rectangle": self.rectangle,
+            "resampling": self.resampling,
+            "outside": self.outside_label,
+        }
+
+    def check(self, angles: Tensor, image_hw: tuple[int, int]) -> None:
+        """Raise InputError where an angle leaves no rectangle; waits for the device."""
+        turn = homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
+        check_rectangle(self._rectangle(turn, image_hw), angles)
+
+    def batch(self, batch: Batch, warp: Warp) -> Batch:
+        """The frames as seen from the view: images bilinear, labels and positions nearest.
+
+        Thermal keeps its scale: networks that divide it by its own maximum do so again (the
+        release divides once, before the view is made).
+
+        Args:
+            batch: images float in [0, 1], see `rgbt.types.Batch.to`. The label may have another
+                size than the images, as in evaluation.
+            warp: of the images' size.
+        """
+        images = warp.bilinear(torch.cat([batch.rgb, batch.thermal], 1))
+        label_hw = (batch.label.shape[1], batch.label.shape[2])
+        of_label = warp if label_hw == warp.image_hw else warp.resized(label_hw)
+        position = batch.position
+        return replace(
+            batch,
+            rgb=images[:, :3],
+            thermal=images[:, 3:],
+            label=of_label.nearest(batch.label, self.outside_label),
+            centre_yx=_moved(batch.centre_yx, warp),
+            position=None if position is None else warp.nearest(position, 0),
+        )
+
+    def valid(self, warp: Warp) -> Tensor:
+        """(B, H, W) bool: pixels that losses count."""
+        inside = warp.inside()
+        return inside if self.outside_label == IGNORE else torch.ones_like(inside)
+
+    def _rectangle(self, turn: Tensor, image_hw: tuple[int, int]) -> Tensor:
+        return inner_rectangle(turn, image_hw, self.rectangle)
+
+    def _check_ranges(self) -> None:
+        for name, (low, high) in self.ranges.items():
+            for end in (low, high):
+                check_range(f"view.{name}", end, -STEEPEST, STEEPEST)
+            whole = float(low).is_integer() and float(high).is_integer()
+            if low > high or (self.angles == "integer" and not (whole and low < high)):
+                wanted = "whole degrees, low < high" if self.angles == "integer" else "low <= high"
+                raise InputError(f"view.{name} must be (low, high) with {wanted}, got {low, high}.")
+        if self.mode != "rotation":
+            # The widest turns leave the least; looked at here, so that no step has to wait for it.
+            extremes = torch.tensor(list(product(*self.ranges.values())), dtype=torch.float64)
+            self.check(extremes, (self.camera.height, self.camera.width))
+
+
+def _moved(points_yx: Tensor, warp: Warp) -> Tensor:
+    """(B, 2) int64: pixels (row, column) of the first frame in the view, or the nearest there."""
+    row, column = points_yx.to(warp.homography.device, torch.float64).unbind(1)
+    points = torch.stack([column, row, torch.ones_like(row)], 1)
+    x, y, w = (warp.homography @ points[..., None])[..., 0].unbind(1)
+    left, top, right, bottom = warp.rectangle.unbind(1)
+    height, width = warp.image_hw
+    rows = (y / w - top) * height / (bottom - top) - 0.5
+    columns = (x / w - left) * width / (right - left) - 0.5
+    limit = torch.tensor([height - 1, width - 1], device=row.device)
+    nearest = torch.stack([rows, columns], 1).round().long()
+    return torch.minimum(nearest.clamp(min=0), limit)
+
+
+def _whole(turn: Tensor, image_hw: tuple[int, int]) -> Tensor:
+    """(B, 4): the edges of the whole frame."""
+    height, width = image_hw
+    edges = turn.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+    return edges.expand(len(turn), 4)

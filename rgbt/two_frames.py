@@ -1,0 +1,320 @@
+"""Predictions of two frames of every scene, counted together: what TC and CA are derived from.
+
+The second frame is a virtual view of the first (frames=virtual), or a true one (frames=next).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import zip_longest
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.data.loaders import eval_batches
+from rgbt.data.next_frames import NextFrames
+from rgbt.engine.evaluate import class_maps
+from rgbt.engine.progress import progress
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.names import CA, CA_RELEASED, TC, consistency
+from rgbt.metrics.pairs import (
+    HEADLINES,
+    Protocol,
+    ca,
+    ca_released,
+    pair_counts,
+    partition_name,
+    tc,
+)
+from rgbt.metrics.scores import class_mean
+from rgbt.session import Session
+from rgbt.tracking.pair_pictures import PairExample
+from rgbt.tracking.tables import ConsistencyTable
+from rgbt.types import IGNORE, Batch, View
+
+Frames = Literal["virtual", "next"]
+PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
+    "virtual": ("aligned", "released"),
+    "next": ("next",),
+}
+"""What is counted of which second frames."""
+
+
+class Compared(NamedTuple):
+    """Class maps (H', W') of one scene, as one protocol compares them.
+
+    Attributes:
+        first: prediction of the first frame.
+        second: prediction of the second frame.
+        label: label of the second frame.
+        valid: pixels that count; None: all.
+    """
+
+    first: Tensor
+    second: Tensor
+    label: Tensor
+    valid: Tensor | None
+
+
+@dataclass
+class Collected:
+    """Counts of one protocol, image by image: name -> one (K + 1, K, K) array per set of views."""
+
+    by_name: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
+
+    def add(self, names: Iterable[str], compared: Compared, num_classes: int) -> None:
+        """Count the scenes of a batch."""
+        for name, each in zip(names, _each(compared), strict=True):
+            counts = pair_counts(each.first, each.second, each.label, num_classes, each.valid)
+            self.by_name.setdefault(name, []).append(counts)
+
+
+class Scenes(NamedTuple):
+    """A batch of scenes with both predictions.
+
+    Attributes:
+        names: of the B scenes.
+        compared: class maps (B, H', W') by protocol.
+        images: (B, 3, H, W) float in [0, 1], RGB of both frames.
+        first: (B, H', W') prediction of the first frame, in its own pixels.
+    """
+
+    names: tuple[str, ...]
+    compared: dict[Protocol, Compared]
+    images: tuple[Tensor, Tensor]
+    first: Tensor
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What `count_pairs` found.
+
+    Attributes:
+        counts: by protocol, see `rgbt.metrics.pairs`.
+        kept: scenes for pictures.
+    """
+
+    counts: dict[Protocol, Counts]
+    kept: tuple[PairExample, ...]
+
+
+def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the second frames are
+    session: Session,
+    model: nn.Module,
+    split: str,
+    frames: Frames,
+    *,
+    view: View | None = None,
+    keep: Collection[str] = (),
+) -> Pairs:
+    """Predict both frames of every scene of a split and count, with a progress bar.
+
+    Source: Temporal, Fig. 4 (aligned: the first prediction is brought into the second frame) and
+    its release (released: it is not). On true frames points are followed by their exact flow.
+
+    Args:
+        session: see `rgbt.session.open_session`; its `consistency` says which virtual views.
+        model: the network to evaluate; left in evaluation mode.
+        split: name of the split.
+        frames: what the second frames are.
+        view: what is predicted from; None takes the network's first.
+        keep: names of scenes to return for pictures.
+
+    Raises:
+        InputError: no sets of views, no second frames, or no image that can be read.
+    """
+    model.eval()
+    found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
+    kept: dict[str, PairExample] = {}
+    scenes_of = _virtual if frames == "virtual" else _next
+    num_classes = len(session.dataset.classes)
+    with progress() as display:
+        total = len(session.dataset.names(split))
+        task = display.add_task(f"{split} pairs", total=total, note="images")
+        for scenes in scenes_of(session, model, split, view):
+            for protocol, maps in scenes.compared.items():
+                found[protocol].add(scenes.names, maps, num_classes)
+            wanted = [name for name in scenes.names if name in keep and name not in kept]
+            kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
+            display.update(task, completed=len(next(iter(found.values())).by_name))
+    counts = {protocol: _counts(session, split, protocol, each) for protocol, each in found.items()}
+    return Pairs(counts, tuple(kept.values()))
+
+
+def _virtual(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
+    """Every batch with each set of views in turn."""
+    sets = session.consistency
+    if not sets.sets:
+        raise InputError(
+            "consistency.sets is empty: no virtual views are named; give consistency=views."
+        )
+    place = {name: index for index, name in enumerate(session.dataset.names(split))}
+    for batch in eval_batches(session.dataset, split, session.transform, session.loading):
+        moved = batch.to(session.fabric.device)
+        first = class_maps(model, moved, session.fabric, view)
+        indices = [place[name] for name in batch.name]
+        for number in range(len(sets.sets)):
+            angles = sets.angles(number, indices).to(first.device)
+            yield _turned(session, model, moved, first, angles, view)
+
+
+def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the second one
+    session: Session,
+    model: nn.Module,
+    batch: Batch,
+    first: Tensor,
+    angles: Tensor,
+    view: View | None,
+) -> Scenes:
+    views = session.consistency.view
+    warp = views.warp(angles, (batch.rgb.shape[2], batch.rgb.shape[3]))
+    turned = views.batch(batch, warp)
+    second = class_maps(model, turned, session.fabric, view)
+    at_label = warp.resized((first.shape[1], first.shape[2]))
+    aligned = Compared(
+        at_label.nearest(first, 0),
+        second,
+        turned.label,
+        at_label.inside() & (turned.label != IGNORE),
+    )
+    # As released: the first prediction stays where it is, and every pixel counts.
+    released = Compared(first, second, turned.label, None)
+    compared: dict[Protocol, Compared] = {"aligned": aligned, "released": released}
+    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
+
+
+def _next(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
+    after = NextFrames(session.dataset)
+    settings, transform = session.loading, session.transform
+    pairs = zip_longest(
+        eval_batches(session.dataset, split, transform, settings),
+        eval_batches(after.dataset, split, transform, settings),
+    )
+    for batch, later in pairs:
+        names = [() if each is None else each.name for each in (batch, later)]
+        if names[0] != names[1]:
+            raise InputError(
+                f"both frames of a scene must be listed in {split} and readable: "
+                f"{session.dataset.root} gives {', '.join(names[0]) or 'nothing more'}, "
+                f"{after.dataset.root} {', '.join(names[1]) or 'nothing more'}."
+            )
+        if batch.label.shape != later.label.shape:
+            sizes = [" x ".join(map(str, each.label.shape[1:])) for each in (batch, later)]
+            raise InputError(
+                f"both frames of a scene must have one size, but '{names[0][0]}' has "
+                f"{sizes[0]} pixels in {session.dataset.root} and {sizes[1]} in "
+                f"{after.dataset.root}."
+            )
+        moved = [each.to(session.fabric.device) for each in (batch, later)]
+        first, second = (class_maps(model, each, session.fabric, view).cpu() for each in moved)
+        followed, seen = _followed(after, batch.name, first)
+        valid = seen & (later.label != IGNORE)
+        compared: dict[Protocol, Compared] = {
+            "next": Compared(followed, second, later.label, valid)
+        }
+        yield Scenes(batch.name, compared, (moved[0].rgb, moved[1].rgb), first)
+
+
+def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[Tensor, Tensor]:
+    """The first prediction at the pixels of the second frame, and where it was seen."""
+    height, width = first.shape[1:]
+    places = [np.stack(after.source(name, (height, width))) for name in names]
+    rows, columns = torch.from_numpy(np.stack(places, 1))
+    seen = rows >= 0
+    flat = (rows * width + columns).clamp(min=0).flatten(1)
+    return first.flatten(1).gather(1, flat).view_as(first), seen
+
+
+def _each(maps: Compared) -> Iterator[Compared]:
+    """The scenes of a batch, on the CPU."""
+    first, second, label = (each.cpu() for each in maps[:3])
+    valid = None if maps.valid is None else maps.valid.cpu()
+    for number in range(len(first)):
+        shown = None if valid is None else valid[number]
+        yield Compared(first[number], second[number], label[number], shown)
+
+
+def _example(scenes: Scenes, name: str, protocol: Protocol) -> PairExample:
+    maps, number = scenes.compared[protocol], scenes.names.index(name)
+    label_hw = (scenes.first.shape[1], scenes.first.shape[2])
+    first_rgb, second_rgb = (
+        F.interpolate(images[number : number + 1], label_hw, mode="bilinear", align_corners=False)
+        for images in scenes.images
+    )
+    assert maps.valid is not None, "the protocol that is drawn says what is seen"
+    return PairExample(
+        name=name,
+        first_rgb=_picture(first_rgb[0]),
+        first=scenes.first[number].cpu().numpy(),
+        second_rgb=_picture(second_rgb[0]),
+        second=maps.second[number].cpu().numpy(),
+        followed=maps.first[number].cpu().numpy(),
+        seen=maps.valid[number].cpu().numpy(),
+    )
+
+
+def _picture(image: Tensor) -> NDArray[np.uint8]:
+    """(H, W, 3) of an image (3, H, W) in [0, 1]."""
+    return (255 * image).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
+
+
+def _counts(session: Session, split: str, protocol: Protocol, collected: Collected) -> Counts:
+    dataset = session.dataset
+    if not collected.by_name:
+        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
+    names = tuple(collected.by_name)
+    arrays = [np.concatenate(arrays) for arrays in collected.by_name.values()]
+    sets = len(collected.by_name[names[0]])
+    return Counts(
+        counts=np.stack(arrays).astype(np.int32),
+        names=names,
+        night=dataset.nights(names),
+        classes=dataset.classes,
+        partition=partition_name(protocol, sets, views_of(session, protocol)),
+        dataset=dataset.fingerprint(),
+        split=split,
+    )
+
+
+def views_of(session: Session, protocol: Protocol) -> str:
+    """Which virtual views counts are of, for names; "" where they are published or true frames."""
+    return "" if protocol == "next" else session.consistency.mark
+
+
+def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
+    """TC and CA of every class and protocol.
+
+    Args:
+        found: counts by protocol, see `count_pairs`.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+    """
+    by_protocol = {protocol: counts.by_region() for protocol, counts in found.items()}
+    scores = {protocol: tc(pairs, absent) for protocol, pairs in by_protocol.items()}
+    right = {
+        protocol: (ca_released if CA_RELEASED in HEADLINES[protocol] else ca)(pairs, absent)
+        for protocol, pairs in by_protocol.items()
+    }
+    return ConsistencyTable(
+        names=next(iter(found.values())).classes,
+        tc={protocol: tuple(map(float, values)) for protocol, values in scores.items()},
+        ca={protocol: tuple(map(float, values)) for protocol, values in right.items()},
+        mean_tc={protocol: float(class_mean(values)) for protocol, values in scores.items()},
+        mean_ca={protocol: float(class_mean(values)) for protocol, values in right.items()},
+    )
+
+
+def consistency_values(table: ConsistencyTable) -> dict[str, float]:
+    """The means as metrics of a run, as fractions: "TC/aligned", "CA/aligned", ..."""
+    means = {TC: table.mean_tc, CA: table.mean_ca}
+    return {
+        consistency(score, protocol): by_protocol[protocol]
+        for protocol in table.tc
+        for score, by_protocol in means.items()
+    }

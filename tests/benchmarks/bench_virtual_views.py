@@ -1,0 +1,191 @@
+"""Virtual views of a batch with labels and logits: ours against a loop of OpenCV, in one run.
+
+One batch: 8 frames of 480x640, RGB and thermal bilinear, labels nearest, nine-class logits
+bilinear. Ours draws no angles but does all the rest: homographies, largest rectangles, one
+composed sampling, and the gradient of the logits. The loop does what the release does per sample,
+on NumPy copies and without a gradient: 8-bit image, float label and logits, each warped, cut and
+resized. On a GPU the loop includes the copies from and to it, as in the release.
+
+The memory of large tensors is kept as in every training here; "default" leaves the allocator as
+the release has it, which costs both about 10 ms a sample.
+
+Run: python -m tests.benchmarks.bench_virtual_views [default]
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+
+# Threads that wait must not count as work: CPU time is given beside the wall clock.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.engine.allocator import keep_memory
+from rgbt.geometry.camera import Camera
+from rgbt.geometry.homography import homography
+from rgbt.geometry.rectangle import Rule, inner_rectangle
+from rgbt.geometry.warp import Resampling, Warp
+
+HW = (480, 640)
+BATCH = 8
+CLASSES = 9
+AT_LEAST = {"cpu": 1.5, "cuda": 10.0}
+ROUNDS = 15
+THREADS = 2
+
+CAMERA = Camera(fx=702.6, fy=703.45, cx=320, cy=240, height=HW[0], width=HW[1])
+
+
+class Work:
+    """Eight frames, their angles, and what to do with them."""
+
+    def __init__(self, device: str) -> None:
+        generator = torch.Generator().manual_seed(0)
+        self.device = device
+        coarse = torch.rand(BATCH, 4, 60, 80, generator=generator)
+        self.image = F.interpolate(coarse, HW, mode="bilinear").to(device)
+        blocks = torch.randint(0, CLASSES, (BATCH, 30, 40), generator=generator)
+        self.label = blocks.repeat_interleave(16, 1).repeat_interleave(16, 2).to(device)
+        logits = torch.randn(BATCH, CLASSES, 60, 80, generator=generator)
+        self.logits = F.interpolate(logits, HW, mode="bilinear").to(device).requires_grad_()
+        self.upstream = torch.randn(BATCH, CLASSES, *HW, generator=generator).to(device)
+        limits = torch.tensor([10.0, 10.0, 5.0])
+        self.angles = ((2 * torch.rand(BATCH, 3, generator=generator) - 1) * limits).to(device)
+
+    def warp(self, rule: Rule, resampling: Resampling) -> Warp:
+        views = homography(self.angles, CAMERA.matrix(HW), "zxy")
+        return Warp(views, inner_rectangle(views, HW, rule), HW, resampling)
+
+    def ours(
+        self, rule: Rule = "largest", resampling: Resampling = "once", *, gradient: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        warp = self.warp(rule, resampling)
+        image, label = warp.bilinear(self.image), warp.nearest(self.label, 255)
+        with torch.set_grad_enabled(gradient):
+            logits = warp.bilinear(self.logits)
+        if gradient:
+            self.logits.grad = None
+            logits.backward(self.upstream)
+        return image, label, logits.detach()
+
+    def opencv(self) -> tuple[Tensor, Tensor, Tensor]:
+        warp = self.warp("corners", "twice")
+        matrices = warp.homography.cpu().numpy()
+        edges = (warp.rectangle + 0.5).int().tolist()
+        results = [self._one(b, matrices[b], edges[b]) for b in range(BATCH)]
+        image, label, logits = (torch.stack(parts) for parts in zip(*results, strict=True))
+        return image.to(self.device), label.to(self.device), logits.to(self.device)
+
+    def _one(self, b: int, matrix: np.ndarray[Any, Any], edges: list[int]) -> tuple[Tensor, ...]:
+        def viewed(frame: np.ndarray[Any, Any], how: int) -> np.ndarray[Any, Any]:
+            left, top, right, bottom = edges
+            canvas = cv2.warpPerspective(frame, matrix, HW[::-1], flags=how)
+            return cv2.resize(canvas[top:bottom, left:right], HW[::-1], interpolation=how)
+
+        image = (self.image[b].permute(1, 2, 0).cpu().numpy() * 255).astype(np.uint8)
+        label = self.label[b].cpu().numpy().astype(np.float32)
+        logits = self.logits[b].detach().permute(1, 2, 0).cpu().numpy()
+        return (
+            torch.from_numpy(viewed(image, cv2.INTER_LINEAR)).permute(2, 0, 1).float() / 255,
+            torch.from_numpy(viewed(label, cv2.INTER_NEAREST)).long(),
+            torch.from_numpy(viewed(logits, cv2.INTER_LINEAR)).permute(2, 0, 1),
+        )
+
+    def plain(self) -> Tensor:
+        """Logits by `grid_sample` alone, forward and backward: whole pixels only to 1e-5."""
+        y, x = torch.meshgrid(*(torch.linspace(-0.9, 0.9, side) for side in HW), indexing="ij")
+        grid = torch.stack([x, y], -1).expand(BATCH, -1, -1, -1).to(self.device)
+        self.logits.grad = None
+        logits = F.grid_sample(self.logits, grid, align_corners=False)
+        logits.backward(self.upstream)
+        return logits
+
+
+Times = list[tuple[float, float]]
+"""Milliseconds of wall clock and of all threads together, one pair per round."""
+
+
+def milliseconds(call: Callable[[], Any], device: str) -> tuple[float, float]:
+    """Wall clock and CPU; on a GPU the time between two events in place of the wall clock."""
+    if device == "cpu":
+        start, work = time.perf_counter(), time.process_time()
+        call()
+        return (time.perf_counter() - start) * 1e3, (time.process_time() - work) * 1e3
+    torch.cuda.synchronize()
+    work = time.process_time()
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    begin.record()
+    call()
+    end.record()
+    end.synchronize()
+    return float(begin.elapsed_time(end)), (time.process_time() - work) * 1e3
+
+
+def measured(calls: dict[str, Callable[[], Any]], device: str) -> dict[str, Times]:
+    """Times of calls that take turns, so that other load on the machine meets all of them."""
+    for call in calls.values():
+        call()
+    times: dict[str, Times] = {name: [] for name in calls}
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            times[name].append(milliseconds(call, device))
+    return times
+
+
+def check(work: Work) -> None:
+    """Both do the same work: released choices give nearly equal frames."""
+    image, label, logits = work.ours("corners", "twice", gradient=False)
+    theirs = work.opencv()
+    assert float((image - theirs[0]).abs().mean()) < 1.5 / 255, "images differ"
+    assert float((label.where(label != 255, 0) != theirs[1]).float().mean()) < 1e-3, "labels differ"
+    assert float((logits - theirs[2]).abs().mean()) < 0.01, "logits differ"
+
+
+def compare(device: str) -> bool:
+    work = Work(device)
+    check(work)
+    calls = {
+        "OpenCV loop, no gradient": work.opencv,
+        "ours with gradient": work.ours,
+        "ours, no gradient": lambda: work.ours(gradient=False),
+        "ours as released, with gradient": lambda: work.ours("corners", "twice"),
+        "logits by grid_sample alone": work.plain,
+    }
+    times = {name: np.array(values) for name, values in measured(calls, device).items()}
+    where = torch.cuda.get_device_name() if device == "cuda" else f"{THREADS} threads"
+    print(f"{BATCH} x {HW[0]}x{HW[1]}, {CLASSES} classes, {where}, OpenCV {cv2.__version__}")
+    print("ms a sample (medians): wall, CPU; times faster than the loop: by wall (range), by CPU")
+    loop = times["OpenCV loop, no gradient"]
+    for name, values in times.items():
+        wall, cpu = np.median(values, axis=0) / BATCH
+        low, middle, high = np.quantile(loop[:, 0] / values[:, 0], [0, 0.5, 1])
+        by_cpu = np.median(loop[:, 1] / values[:, 1])
+        print(
+            f"  {name:32s} {wall:7.2f} {cpu:7.2f}"
+            f"   {middle:6.2f} ({low:.2f} .. {high:.2f}) {by_cpu:6.2f}"
+        )
+    reached = float(np.median(loop[:, 0] / times["ours with gradient"][:, 0]))
+    print(f"with gradient: {reached:.2f} times, wanted {AT_LEAST[device]}")
+    return reached >= AT_LEAST[device]
+
+
+def main() -> int:
+    if "default" not in sys.argv[1:]:
+        keep_memory()
+    torch.set_num_threads(THREADS)
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    return 0 if all([compare(device) for device in devices]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,192 @@
+"""True second frames: where points were, and what a folder of them must hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.data.mfnet import MFNet
+from rgbt.data.next_frames import NextFrames
+from rgbt.data.synth.factors import EgoMotion, SceneFactors
+from rgbt.data.synth.writer import Plan, write
+from tests.conftest import write_data
+
+HW = (6, 8)
+NAMES = ("00001D", "00002N")
+CLASSES = ("unlabeled", "car", "person", "bike", "curve", "stop", "rail", "cone", "bump")
+
+
+def reader(root: Path) -> MFNet:
+    return MFNet(
+        str(root),
+        name="mf",
+        num_classes=9,
+        classes=CLASSES,
+        palette=tuple((n, n, n) for n in range(9)),
+        splits={"test": "test.txt"},
+        layout="auto",
+    )
+
+
+def still() -> np.ndarray:
+    return np.zeros((*HW, 2), np.float32)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two frames that stand still."""
+    for folder in (tmp_path / "mf", tmp_path / "mf" / "next"):
+        write_data(folder, {"test": list(NAMES)}, HW)
+    (tmp_path / "mf" / "next" / "flow").mkdir()
+    for name in NAMES:
+        save(tmp_path / "mf", name, still())
+    return tmp_path / "mf"
+
+
+def save(root: Path, name: str, flow: np.ndarray) -> None:
+    np.save(root / "next" / "flow" / f"{name}.npy", flow)
+
+
+def test_the_second_frames_are_read_like_the_first(root: Path) -> None:
+    first = reader(root)
+    after = NextFrames(first)
+    assert after.dataset.root == root / "next"
+    assert after.dataset.names("test") == first.names("test") == NAMES
+    assert after.dataset.classes == first.classes
+    assert after.dataset.read(NAMES[0]).label.shape == HW
+
+
+def test_no_motion_leads_to_the_same_pixel(root: Path) -> None:
+    rows, columns = NextFrames(reader(root)).source(NAMES[0], HW)
+    assert rows.dtype == columns.dtype == np.int64
+    expected = np.mgrid[:6, :8]
+    assert np.array_equal(rows, expected[0])
+    assert np.array_equal(columns, expected[1])
+
+
+def test_flow_is_rows_then_columns_to_the_nearest_pixel(root: Path) -> None:
+    flow = still()
+    flow[2, 3] = (1.4, -2.6)  # (3.4, 0.4): row 3, column 0
+    flow[5, 7] = (0.4, 0.4)
+    flow[0, 0] = np.nan  # hidden
+    flow[0, 1] = (np.nan, 0)
+    flow[0, 2] = (0, np.inf)
+    save(root, NAMES[0], flow)
+    rows, columns = NextFrames(reader(root)).source(NAMES[0], HW)
+    assert (rows[2, 3], columns[2, 3]) == (3, 0)
+    assert (rows[5, 7], columns[5, 7]) == (5, 7)
+    assert rows[0, :3].tolist() == columns[0, :3].tolist() == [-1] * 3
+    assert (rows == -1).sum() == 3
+
+
+def test_flow_of_the_embedded_data_set_leads_to_the_same_class(tmp_path: Path) -> None:
+    factors = replace(SceneFactors(), height=48, width=64)
+    plan = Plan(
+        seed=0, num_train=1, num_val=1, num_test=3, factors=factors, motion=EgoMotion(0.5, 2.0)
+    )
+    write(plan, tmp_path / "synth")
+    first = reader(tmp_path / "synth")
+    after = NextFrames(first)
+    same = seen = 0
+    for name in first.names("test"):
+        rows, columns = after.source(name, (48, 64))
+        shown = rows >= 0
+        before, now = first.read(name).label, after.dataset.read(name).label
+        same += (before[rows[shown], columns[shown]] == now[shown]).sum()
+        seen += shown.sum()
+    assert 0.6 * 3 * 48 * 64 < seen < 3 * 48 * 64
+    assert same / seen > 0.97  # the rest lies on outlines, half a pixel away
+
+
+# ---- what is refused ------------------------------------------------------------------------
+
+
+def test_a_data_set_of_single_frames_is_refused(tmp_path: Path) -> None:
+    write_data(tmp_path / "mf", {"test": list(NAMES)}, HW)
+    with pytest.raises(InputError, match="mf .* has no second frames: expected the folder next/"):
+        NextFrames(reader(tmp_path / "mf"))
+    (tmp_path / "mf" / "next").mkdir()
+    with pytest.raises(InputError, match="has no second frames"):
+        NextFrames(reader(tmp_path / "mf"))
+
+
+def too_small(root: Path) -> str:
+    save(root, NAMES[0], np.zeros((6, 7, 2), np.float32))
+    return "must be an array of 6 x 8 x 2 .* got 6 x 7 x 2"
+
+
+def one_channel(root: Path) -> str:
+    save(root, NAMES[0], np.zeros(HW, np.float32))
+    return "must be an array of 6 x 8 x 2"
+
+
+def out_of_the_image(root: Path) -> str:
+    flow = still()
+    flow[0, 0] = (-1, 0)
+    save(root, NAMES[0], flow)
+    return "leads out of the first frame of 6x8 pixels"
+
+
+def below_the_image(root: Path) -> str:
+    flow = still()
+    flow[5, 7] = (0.6, 0)
+    save(root, NAMES[0], flow)
+    return "leads out of the first frame"
+
+
+def missing(root: Path) -> str:
+    (root / "next" / "flow" / f"{NAMES[0]}.npy").unlink()
+    return "cannot be read"
+
+
+def cut_short(root: Path) -> str:
+    path = root / "next" / "flow" / f"{NAMES[0]}.npy"
+    path.write_bytes(path.read_bytes()[:100])
+    return "cannot be read"
+
+
+def empty(root: Path) -> str:
+    (root / "next" / "flow" / f"{NAMES[0]}.npy").write_bytes(b"")
+    return "cannot be read"
+
+
+def pickled(root: Path) -> str:
+    np.save(root / "next" / "flow" / f"{NAMES[0]}.npy", np.array([{}], object), allow_pickle=True)
+    return "cannot be read"
+
+
+def archive(root: Path) -> str:
+    with (root / "next" / "flow" / f"{NAMES[0]}.npy").open("wb") as file:
+        np.savez(file, flow=still())
+    return "flow"
+
+
+def broken_archive(root: Path) -> str:
+    (root / "next" / "flow" / f"{NAMES[0]}.npy").write_bytes(b"PK\x03\x04" + b"0" * 40)
+    return "flow"
+
+
+def words(root: Path) -> str:
+    save(root, NAMES[0], np.full((*HW, 2), "far"))
+    return "flow"
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        *(too_small, one_channel, out_of_the_image, below_the_image, missing, cut_short, empty),
+        *(pickled, archive, broken_archive, words),
+    ],
+)
+def test_flow_that_cannot_be_followed_is_named(root: Path, spoil: Callable[[Path], str]) -> None:
+    sentence = spoil(root)
+    after = NextFrames(reader(root))
+    with pytest.raises(InputError, match=sentence) as raised:
+        after.source(NAMES[0], HW)
+    assert f"{NAMES[0]}.npy" in str(raised.value)
+    assert after.source(NAMES[1], HW)[0].min() == 0

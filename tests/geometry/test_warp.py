@@ -1,0 +1,267 @@
+"""Warps against slow ones, OpenCV, and themselves: exact shifts, borders, gradients, sizes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.geometry.homography import homography
+from rgbt.geometry.rectangle import inner_rectangle
+from rgbt.geometry.warp import Resampling, Warp
+from tests.geometry.views import HW, RELEASED, random_angles, random_views
+
+RESAMPLINGS: tuple[Resampling, ...] = ("once", "twice")
+
+
+def whole(hw: tuple[int, int], batch: int = 1) -> Tensor:
+    edges = [-0.5, -0.5, hw[1] - 0.5, hw[0] - 0.5]
+    return torch.tensor([edges], dtype=torch.float64).expand(batch, -1)
+
+
+def shift(x: float, y: float) -> Tensor:
+    return torch.tensor([[[1, 0, x], [0, 1, y], [0, 0, 1]]], dtype=torch.float64)
+
+
+def random_values(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.randn(shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
+
+
+def small_warp(resampling: Resampling) -> Warp:
+    """Two views of 10 x 12 pixels: turned and cut to the corners, and shifted half out."""
+    hw = (10, 12)
+    matrix = torch.tensor([[13.0, 0, 6], [0, 13, 5], [0, 0, 1]])
+    turned = homography(torch.tensor([[6.0, -8.0, 10.0]]), matrix, "zyx")
+    rectangles = torch.cat([inner_rectangle(turned, hw, "corners"), whole(hw)])
+    return Warp(torch.cat([turned, shift(4.3, -2.6)]), rectangles, hw, resampling)
+
+
+def mixed(image: np.ndarray[Any, Any], x: float, y: float, *, repeat: bool) -> Any:
+    """Bilinear value of (C, H, W) at a point, pixel by pixel; zeros or repeated borders."""
+    height, width = image.shape[1:]
+    if repeat:
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            return np.zeros(len(image))
+        x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
+    total = np.zeros(len(image))
+    for row in range(int(np.floor(y)), int(np.floor(y)) + 2):
+        for column in range(int(np.floor(x)), int(np.floor(x)) + 2):
+            if 0 <= row < height and 0 <= column < width:
+                total += (1 - abs(x - column)) * (1 - abs(y - row)) * image[:, row, column]
+    return total
+
+
+def slow(warp: Warp, image: Tensor) -> Tensor:
+    """`Warp.bilinear` of one composed or two separate passes, as loops over pixels."""
+    out = []
+    for values, h, rectangle in zip(image.numpy(), warp.homography, warp.rectangle, strict=True):
+        back, (height, width) = np.linalg.inv(h.numpy()), warp.image_hw
+        left, top, right, bottom = rectangle.tolist()
+        xs = left + (np.arange(width) + 0.5) * (right - left) / width
+        ys = top + (np.arange(height) + 0.5) * (bottom - top) / height
+        source, repeat = values, warp.resampling == "once"
+        if not repeat:
+            source = np.empty_like(values)
+            for i, j in np.ndindex(height, width):
+                x, y, w = back @ [j, i, 1]
+                source[:, i, j] = mixed(values, x / w, y / w, repeat=False)
+        result = np.empty_like(values)
+        for i, j in np.ndindex(height, width):
+            x, y, w = back @ [xs[j], ys[i], 1] if repeat else (xs[j], ys[i], 1.0)
+            if not repeat:  # a cut picture is resized on its own: its border pixels repeat
+                x, y = np.clip(x, left + 0.5, right - 0.5), np.clip(y, top + 0.5, bottom - 0.5)
+            result[:, i, j] = mixed(source, x / w, y / w, repeat=repeat)
+        out.append(result)
+    return torch.from_numpy(np.stack(out))
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("hw", [HW, (7, 5), (64, 48), (1, 3)])
+def test_the_identity_gives_the_input(
+    hw: tuple[int, int], dtype: torch.dtype, resampling: Resampling
+) -> None:
+    values = random_values(1, 2, *hw, dtype=dtype)
+    warp = Warp(shift(0, 0), whole(hw), hw, resampling)
+    assert torch.equal(warp.bilinear(values), values)
+    assert torch.equal(warp.nearest(values, 7.0), values)
+    assert bool(warp.inside().all())
+
+
+def test_no_turn_gives_the_input_too() -> None:
+    """K K^-1 is the identity up to rounding in float64."""
+    values = random_values(1, 2, *HW)
+    view = homography(torch.zeros(1, 3), RELEASED.matrix(HW), "zyx")
+    warp = Warp(view, inner_rectangle(view, HW, "largest"), HW, "once")
+    torch.testing.assert_close(warp.bilinear(values), values, atol=1e-5, rtol=0)
+    assert torch.equal(warp.nearest(values, 7.0), values)
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("hw", [HW, (17, 23)])
+@pytest.mark.parametrize(("x", "y"), [(5, -3), (-1, 0), (0, 16), (-13, 2)])
+def test_whole_shifts_move_pixels_unchanged(
+    x: int, y: int, hw: tuple[int, int], dtype: torch.dtype, resampling: Resampling
+) -> None:
+    values = random_values(1, 2, *hw, dtype=dtype)
+    warp = Warp(shift(x, y), whole(hw), hw, resampling)
+    inside = torch.zeros(hw, dtype=torch.bool)
+    inside[max(y, 0) : hw[0] + min(y, 0), max(x, 0) : hw[1] + min(x, 0)] = True
+    moved = values.roll((y, x), (2, 3))
+    assert torch.equal(warp.bilinear(values), torch.where(inside, moved, 0.0).to(dtype))
+    assert torch.equal(warp.nearest(values, 9.0), torch.where(inside, moved, 9.0).to(dtype))
+    assert torch.equal(warp.inside()[0], inside)
+
+
+def test_a_cut_that_is_enlarged_threefold_holds_its_pixels_in_the_middles() -> None:
+    values = random_values(1, 1, 6, 9)
+    cut = torch.tensor([[2.5, 1.5, 5.5, 3.5]], dtype=torch.float64)
+    warp = Warp(shift(0, 0), cut, (6, 9), "once")
+    torch.testing.assert_close(warp.bilinear(values)[..., 1::3, 1::3], values[..., 2:4, 3:6])
+    repeated = values[..., 2:4, 3:6].repeat_interleave(3, 2).repeat_interleave(3, 3)
+    assert torch.equal(warp.nearest(values, 0.0), repeated)
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_bilinear_is_the_slow_one(resampling: Resampling) -> None:
+    warp, values = small_warp(resampling), random_values(2, 3, 10, 12, dtype=torch.float64)
+    torch.testing.assert_close(warp.bilinear(values), slow(warp, values), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_the_gradient_is_the_numerical_one(resampling: Resampling) -> None:
+    warp = small_warp(resampling)
+    values = random_values(2, 2, 10, 12, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(warp.bilinear, (values,))
+
+
+def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
+    ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
+    once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)
+    # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
+    assert once.bilinear(ones)[0, 0, 0].tolist() == [1, 1, 1, 1, 1, 1]
+    assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
+
+
+def test_the_largest_rectangle_shows_the_first_frame_alone() -> None:
+    views = random_views(40, 5)
+    warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, "once")
+    assert bool(warp.inside().all())
+    torch.testing.assert_close(warp.bilinear(torch.ones(40, 1, *HW)), torch.ones(40, 1, *HW))
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_labels_keep_their_values_and_mark_the_outside(resampling: Resampling) -> None:
+    label = torch.randint(0, 9, (1, *HW), generator=torch.Generator().manual_seed(0))
+    view = homography(torch.tensor([[9.0, -4.0, 5.0]]), RELEASED.matrix(HW), "zyx")
+    warp = Warp(view, whole(HW), HW, resampling)
+    warped, inside = warp.nearest(label, 255), warp.inside()
+    assert warped.dtype == torch.int64
+    assert 0.5 < float(inside.float().mean()) < 0.95
+    assert bool((warped[~inside] == 255).all())
+    assert bool((warped[inside] < 9).all())
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float64, torch.bool])
+def test_nearest_takes_any_dtype_with_and_without_channels(dtype: torch.dtype) -> None:
+    warp = small_warp("once")
+    values = (random_values(2, 3, 10, 12) > 0).to(dtype)
+    warped = warp.nearest(values, 1)
+    assert warped.dtype == dtype
+    assert warped.shape == values.shape
+    assert torch.equal(warp.nearest(values[:, 1], 1), warped[:, 1])
+
+
+def test_half_precision_is_sampled_in_single() -> None:
+    warp, values = small_warp("once"), random_values(2, 3, 10, 12).bfloat16()
+    warped = warp.bilinear(values)
+    assert warped.dtype == torch.bfloat16
+    torch.testing.assert_close(warped, warp.bilinear(values.float()).bfloat16())
+
+
+def test_a_view_without_a_rectangle_shows_nothing() -> None:
+    none = torch.full((1, 4), torch.nan, dtype=torch.float64)
+    for resampling in RESAMPLINGS:
+        warp = Warp(shift(0, 0), none, (4, 6), resampling)
+        assert not bool(warp.inside().any())
+        assert warp.bilinear(torch.ones(1, 1, 4, 6)).abs().sum() == 0
+        assert warp.nearest(torch.zeros(1, 4, 6), 255).unique().tolist() == [255]
+
+
+def test_what_lies_behind_the_camera_is_not_shown() -> None:
+    view = homography(torch.tensor([[180.0, 0.0, 0.0]]), RELEASED.matrix(HW), "zyx")
+    for resampling in RESAMPLINGS:
+        warp = Warp(view, whole(HW), HW, resampling)
+        assert not bool(warp.inside().any())
+        assert warp.bilinear(torch.ones(1, 1, *HW)).abs().sum() == 0
+
+
+def test_a_resized_warp_is_the_warp_by_the_resized_camera() -> None:
+    angles, small = random_angles(3, 2), (240, 320)
+    views = homography(angles, RELEASED.matrix(HW), "zyx")
+    warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, "once")
+    half = homography(angles, RELEASED.matrix(small), "zyx")
+    resized = warp.resized(small)
+    torch.testing.assert_close(resized.homography, half)
+    torch.testing.assert_close(resized.rectangle, inner_rectangle(half, small, "largest"))
+    assert resized.image_hw == small
+    assert warp.resized(HW) is warp
+
+
+def opencv(warp: Warp, values: Tensor, how: int) -> Tensor:
+    """The release's way for (B, C, H, W) float32: warp, cut whole pixels, resize."""
+    out = []
+    height, width = warp.image_hw
+    edges = (warp.rectangle + 0.5).int().tolist()
+    for image, h, (left, top, right, bottom) in zip(values, warp.homography, edges, strict=True):
+        canvas = cv2.warpPerspective(
+            image.permute(1, 2, 0).numpy(), h.numpy(), (width, height), flags=how
+        )
+        cut = canvas.reshape(height, width, -1)[top:bottom, left:right]
+        resized = cv2.resize(cut, (width, height), interpolation=how)
+        out.append(torch.from_numpy(resized.reshape(height, width, -1)).permute(2, 0, 1))
+    return torch.stack(out)
+
+
+def test_twice_is_what_opencv_does() -> None:
+    """Nearly: OpenCV rounds points to 1/32 pixel for nine channels."""
+    views = random_views(6, 11, "zxy")
+    warp = Warp(views, inner_rectangle(views, HW, "corners"), HW, "twice")
+    coarse = torch.rand(6, 9, 30, 40, generator=torch.Generator().manual_seed(0))
+    values = torch.nn.functional.interpolate(coarse, HW, mode="bilinear")
+    difference = (warp.bilinear(values) - opencv(warp, values, cv2.INTER_LINEAR)).abs()
+    assert float(difference.mean()) < 2e-4
+    assert float(difference.max()) < 0.02
+    label = torch.randint(0, 9, (6, 1, *HW), generator=torch.Generator().manual_seed(1)).float()
+    differs = warp.nearest(label, 0) != opencv(warp, label, cv2.INTER_NEAREST)
+    assert float(differs.float().mean()) < 2e-3  # every pixel its own label: points on a boundary
+
+
+def test_once_is_sharper_than_twice_and_close_on_smooth_images() -> None:
+    views = random_views(6, 12, "zxy")
+    rectangles = inner_rectangle(views, HW, "corners")
+    once, twice = (Warp(views, rectangles, HW, each) for each in RESAMPLINGS)
+    rows = torch.arange(HW[0])[:, None] / 30.0
+    smooth = (rows.sin() * (torch.arange(HW[1]) / 40.0).cos()).expand(6, 1, -1, -1)
+    difference = (once.bilinear(smooth) - twice.bilinear(smooth))[..., 20:-20, 20:-20].abs()
+    assert float(difference.max()) < 1e-3
+    noise = random_values(6, 1, *HW)
+    assert float(once.bilinear(noise).std()) > 1.1 * float(twice.bilinear(noise).std())
+
+
+def test_other_shapes_and_words_are_refused() -> None:
+    warp = small_warp("once")
+    with pytest.raises(ValueError, match="values: expected shape B=2 x C x H=10 x W=12"):
+        warp.bilinear(torch.zeros(2, 3, 12, 10))
+    with pytest.raises(ValueError, match="values: expected shape"):
+        warp.nearest(torch.zeros(1, 10, 12), 0)
+    with pytest.raises(ValueError, match="rectangle: expected shape"):
+        Warp(shift(0, 0), whole((4, 4), 2), (4, 4), "once")
+    with pytest.raises(InputError, match="'thrice' is not a choice"):
+        Warp(shift(0, 0), whole((4, 4)), (4, 4), "thrice")  # type: ignore[arg-type]

@@ -1,0 +1,381 @@
+"""Two frames through shared weights: which calls are made, and what the loss is given."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.geometry.camera import Camera
+from rgbt.geometry.warp import Warp
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.temporal import TemporalLoss
+from rgbt.models.mask2former.model import Mask2Former, semantic_logits
+from rgbt.schemes.temporal import Temporal
+from rgbt.transforms.virtual_view import VirtualView
+from rgbt.types import Batch, Frame, Output
+from tests.models.test_mask2former import images, nano
+
+B, K, HW = 3, 4, (48, 64)
+
+
+def generator_of(purpose: str) -> torch.Generator:
+    return torch.Generator().manual_seed(len(purpose))
+
+
+def batch(count: int = B, hw: tuple[int, int] = HW) -> Batch:
+    rgb, thermal = images(count, *hw)
+    label = torch.randint(K, (count, *hw), generator=torch.Generator().manual_seed(5))
+    return Batch(
+        rgb=rgb,
+        thermal=thermal,
+        label=label,
+        name=tuple("abcdefgh"[:count]),
+        centre_yx=torch.zeros(count, 2, dtype=torch.int64),
+        position=None,
+        original_hw=torch.tensor([hw]).expand(count, 2),
+    )
+
+
+class Net(nn.Module):
+    """Two convolutions; counts its calls and keeps the images."""
+
+    def __init__(self, norm: nn.Module) -> None:
+        super().__init__()
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.first, self.last = nn.Conv2d(4, 6, 3, padding=1), nn.Conv2d(6, K, 1)
+        self.norm = norm
+        self.calls: list[tuple[Tensor, Tensor]] = []
+
+    def forward(
+        self, rgb: Tensor, thermal: Tensor, *, generator: torch.Generator | None = None
+    ) -> Output:
+        self.calls.append((rgb, thermal))
+        inner = self.norm(self.first(torch.cat([rgb, thermal], 1))).relu()
+        return Output(self.last(inner), {"inner": inner})
+
+
+class Recorded:
+    """A loss of two frames that keeps what it is given."""
+
+    reads_warped = True
+
+    def __call__(
+        self,
+        first: Frame,
+        second: Frame,
+        warped: Tensor | None,
+        valid: Tensor,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        self.first, self.second, self.warped, self.valid = first, second, warped, valid
+        parts = [(f.logits * f.batch.label[:, None]).square().mean() for f in (first, second)]
+        if warped is not None:
+            parts.append((warped - second.logits.softmax(1)).square().mean())
+        return {str(number): part for number, part in enumerate(parts)}
+
+
+class Segmentation(Recorded):
+    reads_warped = False
+
+
+class Nothing:
+    hides_nothing = True
+
+
+class Halves:
+    hides_nothing = False
+
+
+def view(**changes: Any) -> VirtualView:
+    settings: dict[str, Any] = {
+        "camera": Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=48, width=64),
+        **{"order": "zyx", "yaw": (-10.0, 10.0), "pitch": (-10.0, 10.0), "roll": (-5.0, 5.0)},
+        **{"angles": "uniform", "mode": "both", "rectangle": "largest"},
+        **{"resampling": "once", "outside": "ignore"},
+    }
+    return VirtualView(**{**settings, **changes})
+
+
+def scheme(model: Any, **changes: Any) -> Temporal:
+    settings: dict[str, Any] = {
+        **{"loss": Recorded(), "masker": Nothing(), "view": view()},
+        **{"warps": "probabilities", "detach": False},
+    }
+    return Temporal(model=model, **{**settings, **changes})
+
+
+def step(temporal: Temporal, given: Batch | None = None) -> dict[str, Tensor]:
+    (phase,) = temporal.phases(given or batch(), generator_of)
+    assert phase.optimizer == "main"
+    return dict(phase.parts)
+
+
+def gradients(module: nn.Module) -> list[Tensor]:
+    found = [parameter.grad for parameter in module.parameters()]
+    assert all(each is not None and each.isfinite().all() for each in found)
+    return [each for each in found if each is not None]
+
+
+def by_two_calls(net: Net, loss: Recorded) -> tuple[list[Output], list[Tensor]]:
+    """The outputs and gradients of the frames that `loss` saw, one call after the other."""
+    frames = loss.first.batch, loss.second.batch
+    outputs = [net(each.rgb, each.thermal) for each in frames]
+    first, second = (Frame(o, f, o.logits) for o, f in zip(outputs, frames, strict=True))
+    warp = view().warp(view().draw(B, generator_of("virtual view")), HW)
+    warped = warp.bilinear(outputs[0].logits.softmax(1))
+    parts = Recorded()(first, second, warped, loss.valid, generator_of("loss"))
+    torch.stack(list(parts.values())).sum().backward()
+    return outputs, gradients(net)
+
+
+@pytest.mark.parametrize(
+    ("norm", "calls"),
+    [
+        (nn.BatchNorm2d(6), 2),
+        (nn.SyncBatchNorm(6).eval(), 2),
+        (nn.GroupNorm(2, 6), 1),
+        (nn.InstanceNorm2d(6), 1),
+        (nn.Identity(), 1),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, nn.Module) else f"{value} calls",
+)
+def test_outputs_gradients_and_statistics_are_those_of_two_calls(
+    norm: nn.Module, calls: int
+) -> None:
+    net = Net(norm)
+    apart = deepcopy(net)
+    temporal = scheme(net)
+    torch.stack(list(step(temporal).values())).sum().backward()
+    loss: Any = temporal.loss
+    assert [len(rgb) for rgb, _ in net.calls] == [2 * B // calls] * calls
+
+    outputs, expected = by_two_calls(apart, loss)
+    for frame, output in zip((loss.first, loss.second), outputs, strict=True):
+        torch.testing.assert_close(frame.logits, output.logits)
+        torch.testing.assert_close(frame.output.aux["inner"], output.aux["inner"])
+        assert frame.logits is frame.output.logits
+    for mine, theirs in zip(gradients(net), expected, strict=True):
+        torch.testing.assert_close(mine, theirs)
+    for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
+        torch.testing.assert_close(mine, theirs)
+
+
+def test_one_call_would_change_what_is_normalised() -> None:
+    """What the test above would not see if statistics of frames were near enough to be equal."""
+    net = Net(nn.BatchNorm2d(6))
+    temporal = scheme(net)
+    step(temporal)
+    loss: Any = temporal.loss
+    frames = loss.first.batch, loss.second.batch
+    joint = Net(nn.BatchNorm2d(6))(*(torch.cat([getattr(f, n) for f in frames]) for n in NAMES))
+    assert (joint.logits[:B] - loss.first.logits).abs().max() > 1e-3
+    assert int(net.norm.num_batches_tracked) == 2
+
+
+NAMES = ("rgb", "thermal")
+
+
+def test_the_second_frame_is_the_view_of_the_first() -> None:
+    temporal, given = scheme(Net(nn.Identity())), batch()
+    step(temporal, given)
+    loss: Any = temporal.loss
+    assert loss.first.batch is given
+    drawn = view().draw(B, generator_of("virtual view"))
+    warp = view().warp(drawn, HW)
+    expected = view().batch(given, warp)
+    assert torch.equal(loss.second.batch.rgb, expected.rgb)
+    assert torch.equal(loss.second.batch.label, expected.label)
+    assert torch.equal(loss.valid, warp.inside())
+    # Every sample turns by its own angles.
+    assert len(set(drawn[:, 0].tolist())) == B
+
+
+class Half:
+    """A view that lies half a pixel to the right: each pixel is the mean of two."""
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        return torch.zeros(count, 3)
+
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
+        shift = torch.eye(3, dtype=torch.float64).repeat(len(angles), 1, 1)
+        shift[:, 0, 2] = -0.5
+        edges = [-0.5, -0.5, image_hw[1] - 0.5, image_hw[0] - 0.5]
+        return Warp(shift, torch.tensor([edges]).double().expand(len(angles), 4), image_hw, "once")
+
+    def batch(self, batch: Batch, warp: Warp) -> Batch:
+        return batch
+
+    def valid(self, warp: Warp) -> Tensor:
+        return warp.inside()
+
+
+class Fixed(nn.Module):
+    """Scores of two classes: 0 and log 3 times 0, 1, 2, 0 along a row of four pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        row = torch.tensor([0.0, 1.0, 2.0, 0.0]) * torch.log(torch.tensor(3.0))
+        self.scores = nn.Parameter(torch.stack([torch.zeros(4), row])[None, :, None])
+
+    def forward(self, rgb: Tensor, thermal: Tensor, *, generator: Any = None) -> Output:
+        return Output(self.scores.expand(len(rgb), 2, 1, 4), {})
+
+
+@pytest.mark.parametrize(
+    ("warps", "expected"),
+    [
+        # Shares of class 2: 1/2, 3/4, 9/10, 1/2; the last pixel has no neighbour on the right.
+        ("probabilities", [0.625, 0.825, 0.7, 0.5]),
+        # Mean scores of class 2: log 3 times 1/2, 3/2, 1, 0.
+        ("logits", [3**0.5 / (1 + 3**0.5), 3**1.5 / (1 + 3**1.5), 0.75, 0.5]),
+    ],
+)
+@pytest.mark.parametrize("detach", [False, True])
+def test_scores_or_probabilities_are_brought_into_the_second_frame(
+    warps: Any, expected: list[float], detach: bool
+) -> None:
+    net = Fixed()
+    temporal = scheme(net, view=Half(), warps=warps, detach=detach)
+    given = batch(1, (1, 4))
+    step(temporal, given)
+    warped: Tensor = temporal.loss.warped
+    assert warped[0, 1, 0].tolist() == pytest.approx(expected)
+    assert warped.sum(1)[0, 0].tolist() == pytest.approx([1] * 4)
+    assert warped.requires_grad is not detach
+    if not detach:
+        warped[0, 1, 0, 2].backward()
+        assert net.scores.grad is not None
+        touched = net.scores.grad[0, 1, 0] != 0
+        assert touched.tolist() == [False, False, True, True]
+
+
+def test_a_loss_that_reads_no_warped_prediction_is_given_none() -> None:
+    temporal = scheme(Net(nn.Identity()), loss=Segmentation())
+    step(temporal)
+    assert temporal.loss.warped is None
+
+
+def test_background_views_count_every_pixel() -> None:
+    temporal = scheme(Net(nn.Identity()), view=view(mode="rotation", outside="background"))
+    step(temporal)
+    loss: Any = temporal.loss
+    assert loss.valid.all()
+    assert (loss.second.batch.label < K).all()
+
+
+# ---- networks that predict masks ------------------------------------------------------------
+
+
+class MaskLoss(Recorded):
+    """As `Recorded`, and a part that reads the queries."""
+
+    def __call__(self, first: Frame, second: Frame, *rest: Any) -> dict[str, Tensor]:
+        parts = super().__call__(first, second, *rest)
+        for number, frame in enumerate((first, second)):
+            queries = frame.output.aux["class_logits"], frame.output.aux["mask_logits"]
+            parts[f"masks{number}"] = sum((each.square().mean() for each in queries), Tensor([0]))[
+                0
+            ]
+        return parts
+
+
+def test_mask2former_passes_equal_two_calls() -> None:
+    net, apart = nano().train(), nano().train()
+    temporal = scheme(net, loss=MaskLoss(), view=view())
+    given = batch(2, (96, 128))
+    parts = step(temporal, given)
+    torch.stack(list(parts.values())).sum().backward()
+    loss: Any = temporal.loss
+    frames = loss.first.batch, loss.second.batch
+    for frame, source in zip((loss.first, loss.second), frames, strict=True):
+        single = apart(source.rgb, source.thermal, generator=generator_of("stochastic depth"))
+        assert frame.output.logits is None
+        for name, values in single.aux.items():
+            assert frame.output.aux[name].shape == values.shape
+            torch.testing.assert_close(frame.output.aux[name], values, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            frame.logits, apart.dense_logits(single, (96, 128)), rtol=1e-4, atol=1e-4
+        )
+    for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
+        torch.testing.assert_close(mine, theirs)
+    idle = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
+    # Nothing is hidden; at initialisation, the sampling offsets ignore where they are.
+    assert {name.rpartition(".")[2] for name in idle} <= {"mask_token", "level_embed"}
+    assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("hw", [(64, 96), (60, 84)])
+def test_dense_logits_are_the_logarithm_of_semantic_scores(hw: tuple[int, int]) -> None:
+    net = nano().train()
+    output = net(*images(2, *hw))
+    dense = net.dense_logits(output, hw)
+    assert dense.shape == (2, K, *hw)
+    classes = output.aux["class_logits"][-1, 0].softmax(-1)[..., :-1]
+    masks = F.interpolate(output.aux["mask_logits"][-1, 0], (64, 96), mode="bilinear").sigmoid()
+    scores = torch.einsum("bqk,bqhw->bkhw", classes, masks)[..., : hw[0], : hw[1]]
+    torch.testing.assert_close(dense.softmax(1), scores / scores.sum(1, keepdim=True))
+    dense.softmax(1).square().mean().backward()
+    for part in (net.backbone, net.sem_seg_head.pixel_decoder, net.sem_seg_head.predictor):
+        assert any(p.grad is not None and p.grad.any() for p in part.parameters())
+    assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)
+
+
+def test_dense_logits_are_those_of_evaluation() -> None:
+    net, (rgb, thermal) = nano().eval(), images(2, 60, 84)
+    output = net(rgb, thermal)
+    assert output.logits is not None
+    torch.testing.assert_close(net.dense_logits(output, (60, 84)).exp(), output.logits)
+
+
+def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
+    classes = torch.tensor([[[200.0, -200.0, 0.0]]], requires_grad=True)
+    masks = torch.full((1, 1, 8, 8), 3.0, requires_grad=True)
+    output = Output(None, {"class_logits": classes[None, None], "mask_logits": masks[None, None]})
+    dense = Mask2Former.dense_logits(nano(), output, (32, 32))
+    assert semantic_logits(classes, masks, (32, 32), (32, 32)).min() == 0
+    assert dense.isfinite().all()
+    dense.softmax(1).square().sum().backward()
+    assert classes.grad.isfinite().all()
+    assert masks.grad.isfinite().all()
+
+
+# ---- what is refused ------------------------------------------------------------------------
+
+
+def test_a_loss_of_single_frames_is_refused() -> None:
+    with pytest.raises(InputError, match="CrossEntropy is a loss of single ones; choose loss="):
+        scheme(Net(nn.Identity()), loss=CrossEntropy(class_weights=None))
+
+
+def test_a_masker_that_hides_something_is_refused() -> None:
+    with pytest.raises(InputError, match="the masker hides cells; choose masker=none"):
+        scheme(Net(nn.Identity()), masker=Halves())
+
+
+def test_masks_without_class_scores_are_refused() -> None:
+    net = Net(nn.Identity())
+    net.predicts = "masks"
+    with pytest.raises(InputError, match="Net predicts masks of queries and has no `dense_logits`"):
+        scheme(net)
+
+
+def test_the_loss_of_the_papers_goes_through_the_scheme() -> None:
+    loss = TemporalLoss(
+        segmentation=CrossEntropy(class_weights=None),
+        alpha=1.0,
+        beta=2.0,
+        second="con",
+        form="paper",
+    )
+    net = Net(nn.BatchNorm2d(6))
+    parts = step(scheme(net, loss=loss))
+    assert set(parts) == {"cross_entropy_1", "cross_entropy_2", "dice_1", "con"}
+    torch.stack(list(parts.values())).sum().backward()
+    assert all(each.any() for each in gradients(net)[:1])

@@ -1,0 +1,25 @@
+"""Further evaluations of a run: what makes them and where their counts lie."""
+
+from __future__ import annotations
+
+from rgbt.consistency import OWN as OF_CONSISTENCY
+from rgbt.evaluate import OWN as OF_EVALUATE
+from sweeps.points import Evaluation
+
+
+def test_of_single_frames_every_evaluation_is_a_call_and_a_file() -> None:
+    ring = Evaluation("thermal", "ring9")
+    assert ring.command == ("rgbt.evaluate", "modality=thermal", "regions=ring9")
+    assert ring.path == "evaluations/table_thermal_ring9.npz"
+    assert ring.label == "thermal, ring9"
+    assert {word.partition("=")[0] for word in ring.command[1:]} <= set(OF_EVALUATE)
+
+
+def test_of_virtual_views_one_call_makes_two_files() -> None:
+    aligned, released = Evaluation(frames="aligned"), Evaluation(frames="released")
+    assert aligned.command == released.command == ("rgbt.consistency", "frames=virtual")
+    assert aligned.path == "evaluations/consistency_aligned_test.npz"
+    assert released.path == "evaluations/consistency_released_test.npz"
+    assert aligned.label == "consistency, aligned"
+    assert Evaluation(frames="next").command == ("rgbt.consistency", "frames=next")
+    assert {word.partition("=")[0] for word in aligned.command[1:]} <= set(OF_CONSISTENCY)

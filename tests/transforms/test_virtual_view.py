@@ -1,0 +1,324 @@
+"""Virtual views: what is drawn, where pixels come from, and what becomes of a batch."""
+
+from __future__ import annotations
+
+from math import cos, radians, sin
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.geometry.camera import Camera
+from rgbt.transforms.virtual_view import VirtualView
+from rgbt.types import Batch
+
+CAMERA = Camera(
+    fx=702.6030497884977, fy=703.4541726858521, cx=320.0, cy=240.0, height=480, width=640
+)
+PAPER: dict[str, Any] = {
+    "camera": CAMERA,
+    "order": "zyx",
+    "yaw": (-10.0, 10.0),
+    "pitch": (-10.0, 10.0),
+    "roll": (-5.0, 5.0),
+    "angles": "uniform",
+    "mode": "both",
+    "rectangle": "largest",
+    "resampling": "once",
+    "outside": "ignore",
+}
+RELEASED = {
+    **PAPER,
+    **{"order": "zxy", "angles": "integer", "rectangle": "corners"},
+    **{"resampling": "twice", "outside": "background"},
+}
+HW = (96, 128)
+
+
+def paper(**changes: Any) -> VirtualView:
+    return VirtualView(**{**PAPER, **changes})
+
+
+def released(**changes: Any) -> VirtualView:
+    return VirtualView(**{**RELEASED, **changes})
+
+
+def angles(*triples: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(triples, dtype=torch.float64)
+
+
+def drawn(view: VirtualView, count: int = 4000, seed: int = 0) -> torch.Tensor:
+    return view.draw(count, torch.Generator().manual_seed(seed))
+
+
+def scene(count: int = 1, hw: tuple[int, int] = HW, label_hw: tuple[int, int] = HW) -> Batch:
+    """Blurred noise, which has edges everywhere, and blobs of nine classes."""
+    rng = np.random.default_rng(3)
+    images = np.stack(
+        [cv2.GaussianBlur(rng.random((*hw, 4)), (0, 0), 3, dst=None) for _ in range(count)]
+    )
+    images = (images - images.min()) / (images.max() - images.min())
+    coarse = rng.integers(1, 9, (count, 6, 8))
+    label = np.stack(
+        [cv2.resize(each, label_hw[::-1], interpolation=cv2.INTER_NEAREST) for each in coarse]
+    )
+    image = torch.from_numpy(images).float().permute(0, 3, 1, 2)
+    rows, columns = torch.meshgrid(*map(torch.arange, hw), indexing="ij")
+    return Batch(
+        rgb=image[:, :3].contiguous(),
+        thermal=image[:, 3:].contiguous(),
+        label=torch.from_numpy(label).long(),
+        name=tuple(map(str, range(count))),
+        centre_yx=torch.zeros(count, 2, dtype=torch.int64),
+        position=torch.stack([rows, columns]).float().expand(count, 2, *hw),
+        original_hw=torch.tensor([hw]).expand(count, 2),
+    )
+
+
+# ---- what is drawn --------------------------------------------------------------------------
+
+
+def test_uniform_angles_fill_their_own_intervals() -> None:
+    found = drawn(paper(yaw=(-10.0, 2.0), pitch=(3.0, 4.0), roll=(-5.0, -5.0)))
+    assert found.shape == (4000, 3)
+    assert found.dtype == torch.float64
+    low, high = found.min(0).values, found.max(0).values
+    assert (low >= torch.tensor([-10.0, 3.0, -5.0])).all()
+    assert (high <= torch.tensor([2.0, 4.0, -5.0])).all()
+    # The ends of 4000 draws lie this near to those of the interval with probability 0.998 each.
+    assert (low[:2] - torch.tensor([-10.0, 3.0])).abs().max() < 0.02
+    assert (found[:, 0].mean() + 4).abs() < 0.3  # standard error 0.055
+    assert not torch.equal(found[:, 0], found[:, 0].floor())
+    assert np.corrcoef(found[:, 0], found[:, 1])[0, 1] == pytest.approx(0, abs=0.08)
+
+
+def test_integer_angles_are_whole_degrees_without_the_upper_end() -> None:
+    found = drawn(released())
+    for column, (low, high) in enumerate([(-10, 10), (-10, 10), (-5, 5)]):
+        assert sorted(set(found[:, column].tolist())) == list(range(low, high))
+    counts = np.unique(found[:, 2], return_counts=True)[1]
+    assert counts.min() > 330  # of 400 expected, standard deviation 19
+
+
+def test_draws_follow_from_the_generator_alone() -> None:
+    view = paper()
+    assert torch.equal(drawn(view, 5), drawn(view, 5))
+    assert not torch.equal(drawn(view, 5), drawn(view, 5, seed=1))
+    generator = torch.Generator().manual_seed(0)
+    assert not torch.equal(view.draw(5, generator), view.draw(5, generator))
+    state = torch.get_rng_state()
+    drawn(view)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+# ---- where pixels come from -----------------------------------------------------------------
+
+
+def by_hand(yaw: float, pitch: float, roll: float, order: str) -> np.ndarray:
+    a, b, g = (radians(each) for each in (yaw, pitch, roll))
+    about_y = np.array([[cos(a), 0, sin(a)], [0, 1, 0], [-sin(a), 0, cos(a)]])
+    about_x = np.array([[1, 0, 0], [0, cos(b), -sin(b)], [0, sin(b), cos(b)]])
+    about_z = np.array([[cos(g), -sin(g), 0], [sin(g), cos(g), 0], [0, 0, 1]])
+    turn = about_z @ about_y @ about_x if order == "zyx" else about_z @ about_x @ about_y
+    matrix = np.array([[CAMERA.fx, 0, 320], [0, CAMERA.fy, 240], [0, 0, 1]])
+    found: np.ndarray = matrix @ turn @ np.linalg.inv(matrix)
+    return found
+
+
+@pytest.mark.parametrize("make", [paper, released])
+def test_the_homography_is_that_of_the_order(make: Any) -> None:
+    view, triple = make(), (4.0, 7.0, 1.0)
+    found = view.warp(angles(triple), (480, 640)).homography[0].numpy()
+    assert found == pytest.approx(by_hand(*triple, view.order), rel=1e-9)
+    other = by_hand(*triple, "zxy" if view.order == "zyx" else "zyx")
+    assert np.abs(found - other).max() > 0.1
+
+
+def test_released_views_have_the_rectangles_of_the_release() -> None:
+    # yaw, pitch, roll -> first and last + 1 column, first and last + 1 row of what is cut.
+    cuts = {
+        (4, 7, 1): (63, 639, 0, 375),
+        (-9, 4, -1): (0, 512, 0, 409),
+        (9, 9, 4): (137, 639, 0, 335),
+        (-10, -10, -5): (0, 484, 148, 479),
+        (0, 0, 4): (17, 621, 22, 456),
+    }
+    found = released().warp(angles(*cuts), (480, 640)).rectangle
+    expected = [(x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5) for x0, x1, y0, y1 in cuts.values()]
+    assert found.tolist() == [list(each) for each in expected]
+
+
+def test_rotation_does_not_cut_and_translation_does_nothing_else() -> None:
+    triple = angles((4, 7, 1))
+    both, rotation, translation = (
+        paper(mode=mode).warp(triple, HW) for mode in ("both", "rotation", "translation")
+    )
+    assert torch.equal(rotation.homography, both.homography)
+    assert rotation.rectangle.tolist() == [[-0.5, -0.5, 127.5, 95.5]]
+    assert torch.equal(translation.homography, torch.eye(3, dtype=torch.float64)[None])
+    assert torch.equal(translation.rectangle, both.rectangle)
+    assert translation.inside().all()
+    assert not rotation.inside().all()
+    assert both.inside().all()
+
+
+def test_positive_angles_move_what_is_seen_to_the_right_up_and_clockwise() -> None:
+    view = paper(mode="rotation")
+    centre = torch.zeros(3, 1, *HW)
+    centre[:, :, 44:52, 60:68] = 1
+    centre[2] = 0
+    centre[2, :, 44:52, 100:108] = 1  # right of the middle: clockwise is down
+    moved = view.warp(angles((5, 0, 0), (0, 5, 0), (0, 0, 5)), HW).bilinear(centre)
+    rows, columns = torch.meshgrid(*map(torch.arange, HW), indexing="ij")
+
+    def place(image: torch.Tensor) -> tuple[float, float]:
+        return tuple(float((image[0] * grid).sum() / image.sum()) for grid in (rows, columns))
+
+    assert place(moved[0])[1] > 63.5 + 8
+    assert place(moved[1])[0] < 47.5 - 8
+    assert place(moved[2])[0] > 47.5 + 2
+
+
+# ---- what becomes of a batch ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [paper, released])
+def test_no_turn_changes_nothing(make: Any) -> None:
+    # The release's rule leaves out the last row and column: its cut is not the whole frame.
+    view = make(rectangle="largest")
+    batch = scene(2)
+    found = view.batch(batch, view.warp(angles((0, 0, 0), (0, 0, 0)), HW))
+    assert torch.allclose(found.rgb, batch.rgb, atol=1e-5)
+    assert torch.allclose(found.thermal, batch.thermal, atol=1e-5)
+    assert torch.equal(found.label, batch.label)
+    assert torch.equal(found.position, batch.position)
+    assert found.name == batch.name
+    assert torch.equal(found.original_hw, batch.original_hw)
+
+
+def test_every_sample_has_its_own_view() -> None:
+    view, batch = paper(), scene(2)
+    triples = angles((4, 7, 1), (-9, 4, -1))
+    both = view.batch(batch, view.warp(triples, HW))
+    for number in range(2):
+        alone = scene(2)
+        one = Batch(
+            **{
+                **vars(alone),
+                **{key: getattr(alone, key)[number : number + 1] for key in ("rgb", "thermal")},
+                "label": alone.label[number : number + 1],
+                "position": None,
+            }
+        )
+        found = view.batch(one, view.warp(triples[number : number + 1], HW))
+        assert found.position is None
+        assert torch.allclose(found.rgb[0], both.rgb[number], atol=1e-6)
+        assert torch.equal(found.label[0], both.label[number])
+
+
+@pytest.mark.parametrize(("outside", "label"), [("ignore", 255), ("background", 0)])
+def test_what_the_first_frame_does_not_show(outside: str, label: int) -> None:
+    view = paper(mode="rotation", outside=outside)
+    warp = view.warp(angles((10, 0, 0)), HW)
+    found, inside = view.batch(scene(), warp), warp.inside()
+    assert 0.05 < 1 - inside.float().mean() < 0.5
+    assert (found.label[~inside] == label).all()
+    assert (found.label[inside] > 0).all()
+    assert (found.label[inside] < 9).all()
+    assert not found.rgb.movedim(1, -1)[~inside].any()
+    assert not found.thermal.movedim(1, -1)[~inside].any()
+    assert torch.equal(view.valid(warp), inside if label == 255 else torch.ones_like(inside))
+
+
+def test_positions_say_where_a_pixel_was() -> None:
+    view, batch = paper(), scene()
+    found = view.batch(batch, view.warp(angles((4, 7, 1)), HW))
+    assert found.position is not None
+    rows, columns = found.position[0].long()
+    assert torch.equal(found.label[0], batch.label[0, rows, columns])
+
+
+def test_labels_may_be_larger_than_images() -> None:
+    view = paper()
+    large = (2 * HW[0], 2 * HW[1])
+    batch = scene(label_hw=large)
+    triple = angles((-9, 4, -1))
+    found = view.batch(batch, view.warp(triple, HW))
+    assert found.rgb.shape[2:] == HW
+    assert found.label.shape[1:] == large
+    alone = view.warp(triple, large).nearest(batch.label, 255)
+    assert (found.label != alone).float().mean() < 1e-4  # equal but for rounding on an edge
+
+
+@pytest.mark.parametrize("triple", [(4, 7, 1), (-9, 4, -1), (9, 9, 4), (-10, -10, -5)])
+def test_released_views_are_those_of_opencv(triple: tuple[int, int, int]) -> None:
+    """Warp, cut and resize as OpenCV does them one after the other."""
+    hw, batch = (480, 640), scene(hw=(480, 640), label_hw=(480, 640))
+    view = released()
+    found = view.batch(batch, view.warp(angles(triple), hw))
+    homography = by_hand(*triple, "zxy")
+    left, top, right, bottom = (view.warp(angles(triple), hw).rectangle[0] + 0.5).int().tolist()
+
+    def plain(image: np.ndarray, flags: int) -> np.ndarray:
+        warped = cv2.warpPerspective(image, homography, hw[::-1], flags=flags)
+        return cv2.resize(warped[top:bottom, left:right], hw[::-1], interpolation=flags)
+
+    image = plain(batch.rgb[0].permute(1, 2, 0).numpy(), cv2.INTER_LINEAR)
+    difference = np.abs(found.rgb[0].permute(1, 2, 0).numpy() - image)
+    assert difference.max() < 0.02  # OpenCV rounds places to 1/32 pixel
+    label = plain(batch.label[0].numpy().astype(np.float32), cv2.INTER_NEAREST)
+    assert (found.label[0].numpy() != label).mean() < 0.005
+
+
+def test_the_gradient_of_a_prediction_passes_through_a_view() -> None:
+    logits = torch.rand(1, 3, *HW, requires_grad=True)
+    warped = paper().warp(angles((4, 7, 1)), HW).bilinear(logits)
+    warped.sum().backward()
+    assert logits.grad is not None
+    # Every pixel of the view is a mean of pixels: their weights add up to the number of pixels.
+    assert float(logits.grad.sum()) == pytest.approx(3 * HW[0] * HW[1], rel=1e-4)
+    assert not logits.grad[..., -5:].any()  # what moved out of the picture on the right
+    assert not logits.grad[..., :10, :].any()  # and at the top
+
+
+# ---- what is refused ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"angles": "whole"}, "view.angles: 'whole' is not a choice"),
+        ({"mode": "rot"}, "view.mode: 'rot' is not a choice"),
+        ({"outside": "black"}, "view.outside: 'black' is not a choice"),
+        ({"yaw": (-61.0, 0.0)}, r"view.yaw must lie in \[-60, 60\], got -61"),
+        ({"pitch": (0.0, float("nan"))}, "view.pitch must lie in"),
+        ({"roll": (1.0, -1.0)}, "view.roll must be .low, high. with low <= high"),
+        ({"angles": "integer", "yaw": (-0.5, 3.0)}, "view.yaw must be .* whole degrees"),
+        ({"angles": "integer", "yaw": (3.0, 3.0)}, "view.yaw must be .* low < high"),
+        ({"yaw": (-50.0, 50.0)}, "yaw -50, pitch -10, roll .* degrees leave no valid rectangle"),
+        ({"yaw": (-50.0, 50.0), "mode": "translation"}, "leave no valid rectangle"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        paper(**changes)
+
+
+def test_without_a_cut_no_rectangle_is_needed() -> None:
+    view = paper(yaw=(-50.0, 50.0), mode="rotation")
+    warp = view.warp(angles((50, 0, 0)), HW)
+    assert not warp.inside().any()
+    assert (view.batch(scene(), warp).label == 255).all()
+
+
+def test_a_camera_of_other_images_is_refused() -> None:
+    with pytest.raises(InputError, match="intrinsics of another image size"):
+        paper().warp(angles((0, 0, 0)), (96, 96))
+
+
+def test_a_single_angle_that_leaves_nothing_is_named() -> None:
+    with pytest.raises(InputError, match="yaw 80, pitch 2, roll 3 degrees"):
+        paper().check(angles((0, 0, 0), (80, 2, 3)), HW)
