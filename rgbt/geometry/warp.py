@@ -105,8 +105,11 @@ class Warp:
     def _whole(self) -> tuple[Tensor, Tensor]:
         """Columns (1, W) and rows (1, H), float64."""
         height, width = self.image_hw
-        new = self.rectangle.new_tensor
-        return new(range(width))[None], new(range(height))[None]
+        device = self.rectangle.device
+        return (
+            torch.arange(width, dtype=torch.float64, device=device)[None],
+            torch.arange(height, dtype=torch.float64, device=device)[None],
+        )
 
     def _source(self, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """x, y (B, H, W) float32 in the first frame of canvas points; NaN behind the camera."""
