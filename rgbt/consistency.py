@@ -9,11 +9,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from rgbt.checks import check_choice
+from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
+    from rgbt.metrics.pairs import Protocol
     from rgbt.session import Session
+    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.tables import ConsistencyTable
     from rgbt.two_frames import Pairs
 
 OWN = {
@@ -40,15 +43,17 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     checkpoint  best (by validation mIoU) or last
     out       folder of the counts and of a picture; default: evaluations/ in the run folder, where
-              counts of other images or other views than the published ones say so in their names
+              counts on other images or other views than the published ones say so in their names,
+              and those on second frames of one motion are not replaced by those of another
     overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
               they do not name is as in conf/consistency/views.yaml, whatever the run measured
     """
     from rgbt.session import panel_names, view_of
     from rgbt.stored import open_trained
+    from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import place_lines, rich_table, show
-    from rgbt.two_frames import PROTOCOLS, Frames, consistency_table, count_pairs
+    from rgbt.two_frames import PROTOCOLS, Frames, consistency_table, count_pairs, views_of
 
     check_choice("frames", arguments["frames"], PROTOCOLS)
     if not any(item.split("=")[0] == "consistency" for item in overrides):
@@ -58,18 +63,22 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     session, split = stored.session, arguments["split"]
     view = view_of(session.model, arguments["modality"])
     frames = cast(Frames, arguments["frames"])
-    keep = panel_names(session.dataset, split)
-    found = count_pairs(session, session.model, split, frames, view=view, keep=keep)
     folder = Path(arguments["out"] or stored.folder)
-    folder.mkdir(parents=True, exist_ok=True)
     beside = [arguments["modality"]] if arguments["modality"] != "default" else []
     beside += [] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]]
-    if frames == "virtual" and not arguments["out"]:
+    if frames == "next":
+        _keep_other_motions(session, folder / _name("next", session, split, beside))
+    elif not arguments["out"]:
         beside += _other_images(stored.folder, session)
+    keep = panel_names(session.dataset, split)
+    found = count_pairs(session, session.model, split, frames, view=view, keep=keep)
     table = consistency_table(found.counts, session.regions.absent)
-    title = f"Consistency of {stored.label} ({session.dataset.name}, {split})"
+    what = views_of(session, PROTOCOLS[frames][0]) or "published"
+    title = f"Consistency of {stored.label} ({session.dataset.name}, {split}; {frames}: {what})"
     show(rich_table(consistency_grid(table, title)))
     show(place_lines(_write(found, session, folder, beside)))
+    if frames == "virtual" and arguments["run"] and not (arguments["out"] or beside):
+        _add_to_result(RunFolder(stored.folder.parent), session, split, table)
     return 0
 
 
@@ -77,16 +86,14 @@ def _write(
     found: Pairs, session: Session, folder: Path, beside: list[str]
 ) -> list[tuple[str, str]]:
     """Write counts and picture; (what, where) of each. `beside` ends their names."""
-    from rgbt.metrics.pairs import file_name
     from rgbt.session import legend_of
     from rgbt.tracking.pair_pictures import draw_pairs
     from rgbt.tracking.terminal import tell
-    from rgbt.two_frames import views_of
 
+    folder.mkdir(parents=True, exist_ok=True)
     places: list[tuple[str, str]] = []
     for protocol, counts in reversed(found.counts.items()):
-        usual = Path(file_name(protocol, counts.split, views_of(session, protocol)))
-        path = folder / usual.with_stem("_".join([usual.stem, *beside])).name
+        path = folder / _name(protocol, session, counts.split, beside)
         counts.save(path)
         places.insert(0, (f"counts, {protocol}", str(path)))
     if not found.kept:
@@ -96,6 +103,58 @@ def _write(
     picture = path.with_name(path.stem.replace("consistency_", "pairs_") + ".png")
     draw_pairs(found.kept, legend_of(session.dataset), picture)
     return [*places, ("picture", str(picture))]
+
+
+def _add_to_result(run: RunFolder, session: Session, split: str, table: ConsistencyTable) -> None:
+    """What a run would hold had it measured this itself: result, tables, MLflow."""
+    from dataclasses import asdict
+
+    from rgbt.tracking.mlflow_fill import read_sent
+    from rgbt.tracking.sync import status_of, tracking_of
+    from rgbt.tracking.tables import without_nan
+    from rgbt.tracking.terminal import tell
+    from rgbt.two_frames import consistency_values
+
+    result, tables = run.result(), run.tables()
+    kinds = {session.trainer.selection_split: "val", "test": "test"}
+    if result is None or tables is None or split not in kinds or session.consistency.mark:
+        return
+    kind = kinds[split]
+    result[kind] = {**result[kind], **without_nan(consistency_values(table))}
+    if kind == "test":
+        run.write_tables({**tables, "consistency": without_nan(asdict(table))})
+    run.finish(result)
+    if read_sent(run) is None:
+        return
+    try:
+        tracking_of(run, {}).sync(run, status_of(run))
+    except Exception as error:  # any store may fail in its own way; the folder has everything
+        reason = (str(error).splitlines() or [""])[0]
+        tell(f"MLflow was not told ({reason}); python -m rgbt.tracking.sync run={run.path} does.")
+
+
+def _name(protocol: Protocol, session: Session, split: str, beside: list[str]) -> str:
+    """Name of a file of counts; those of true frames have one name, whatever the motion."""
+    from rgbt.metrics.pairs import file_name
+    from rgbt.two_frames import views_of
+
+    views = "" if protocol == "next" else views_of(session, protocol)
+    usual = Path(file_name(protocol, split, views))
+    return usual.with_stem("_".join([usual.stem, *beside])).name
+
+
+def _keep_other_motions(session: Session, path: Path) -> None:
+    """Refuse to replace counts on other second frames by those on these."""
+    from rgbt.metrics.counts import Counts
+    from rgbt.metrics.pairs import partition_name
+    from rgbt.two_frames import views_of
+
+    asked = partition_name("next", 1, views_of(session, "next"))
+    if path.is_file() and Counts.load(path).partition != asked:
+        raise InputError(
+            f"{path} holds counts on second frames of another motion; name a folder for these with "
+            "out=..., or remove that file."
+        )
 
 
 def _other_images(folder: Path, session: Session) -> list[str]:

@@ -24,7 +24,10 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
     """
     silent = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed")
     pairs = [item.lstrip("+").partition("=")[::2] for item in overrides]
-    changed = [(k, v) for k, v in pairs if k not in silent and not k.startswith("tracking.")]
+    # What is measured beside is no part of the run, and neither are its trackers.
+    beside = ("tracking.", "consistency")
+    places = [(key, value, key.rpartition("@")[2]) for key, value in pairs]
+    changed = [(k, v) for k, v, at in places if k not in silent and not at.startswith(beside)]
     ends = [key.rpartition(".")[2] for key, _ in changed]
     clear = [end != "seed" and ends.count(end) == 1 for end in ends]
     shown = [

@@ -43,6 +43,7 @@ from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.virtual_view import VirtualView
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 from rgbt.types import Batch, Masker, Sample
 
@@ -96,8 +97,8 @@ def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
     places = [folder.path / file_name("aligned", split, asked.mark) for split in asked.splits]
     if asked.sets and not all(place.is_file() for place in places):
         tell(
-            "its consistency on these views has not been measured: python -m rgbt.consistency "
-            f"run={folder.path}, with the same consistency.* settings, does so."
+            "its consistency on these views and splits has not been measured; to add it: "
+            f"python -m rgbt.consistency run={folder.path} split=..."
         )
 
 
@@ -168,15 +169,22 @@ def _check_views(scheme: object, loss: object, session: Session) -> None:
             "network one; choose scheme=temporal_paper or temporal_released, or "
             "loss=cross_entropy."
         )
-    if views is not None:
+    if isinstance(views, VirtualView):
         # One example for nothing: a camera of other images is told before the run is begun.
         sample = _first_readable(session, "train")
         example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
-        views.camera.matrix(example.rgb.shape[:2])
+        _check_camera("scheme", views, example.rgb.shape[:2])
     if session.consistency.sets:
         shown = session.transform.test(_first_readable(session, "test"))
         for image in (shown.rgb, shown.label):
-            session.consistency.view.camera.matrix(image.shape[:2])
+            _check_camera("consistency", session.consistency.view, image.shape[:2])
+
+
+def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> None:
+    try:
+        view.camera.matrix(image_hw)
+    except InputError as error:
+        raise InputError(f"{node}.view.{error}") from error
 
 
 def _first_readable(session: Session, split: str) -> Sample:
@@ -326,7 +334,12 @@ class Run:
         for kind in session.consistency.splits if session.consistency.sets else ():
             split = session.trainer.selection_split if kind == "val" else kind
             keep = panel_names(session.dataset, split) if kind == "test" else ()
-            found = count_pairs(session, session.model, split, "virtual", keep=keep)
+            try:
+                found = count_pairs(session, session.model, split, "virtual", keep=keep)
+            except InputError as error:
+                # The training is done, and is not lost for what is measured beside.
+                tell(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
+                continue
             for protocol, counts in found.counts.items():
                 path = self.folder.path / file_name(protocol, split, session.consistency.mark)
                 path.parent.mkdir(exist_ok=True)

@@ -65,15 +65,15 @@ class Compared(NamedTuple):
 
 @dataclass
 class Collected:
-    """Counts of one protocol, image by image: name -> one (K + 1, K, K) array per set of views."""
+    """Counts of one protocol: name -> number of the set of views -> (K + 1, K, K)."""
 
-    by_name: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
+    by_name: dict[str, dict[int, NDArray[np.int64]]] = field(default_factory=dict)
 
-    def add(self, names: Iterable[str], compared: Compared, num_classes: int) -> None:
-        """Count the scenes of a batch."""
-        for name, each in zip(names, _each(compared), strict=True):
+    def add(self, scenes: Scenes, compared: Compared, num_classes: int) -> None:
+        """Count the scenes of a batch; a name that a list holds twice counts once."""
+        for name, each in zip(scenes.names, _each(compared), strict=True):
             counts = pair_counts(each.first, each.second, each.label, num_classes, each.valid)
-            self.by_name.setdefault(name, []).append(counts)
+            self.by_name.setdefault(name, {})[scenes.number] = counts
 
 
 class Scenes(NamedTuple):
@@ -84,12 +84,14 @@ class Scenes(NamedTuple):
         compared: class maps (B, H', W') by protocol.
         images: (B, 3, H, W) float in [0, 1], RGB of both frames.
         first: (B, H', W') prediction of the first frame, in its own pixels.
+        number: of the set of views, from 0.
     """
 
     names: tuple[str, ...]
     compared: dict[Protocol, Compared]
     images: tuple[Tensor, Tensor]
     first: Tensor
+    number: int
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,7 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
     Raises:
         InputError: no sets of views, no second frames, or no image that can be read.
     """
+    _check_second_frames(session, frames)
     model.eval()
     found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
@@ -140,7 +143,7 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
         task = display.add_task(f"{split} pairs", total=total, note="images")
         for scenes in scenes_of(session, model, split, view):
             for protocol, maps in scenes.compared.items():
-                found[protocol].add(scenes.names, maps, num_classes)
+                found[protocol].add(scenes, maps, num_classes)
             wanted = [name for name in scenes.names if name in keep and name not in kept]
             kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
             display.update(task, completed=len(next(iter(found.values())).by_name))
@@ -148,21 +151,27 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
     return Pairs(counts, tuple(kept.values()))
 
 
+def _check_second_frames(session: Session, frames: Frames) -> None:
+    """Refuse what cannot be measured before anything is drawn or predicted."""
+    if frames == "next":
+        NextFrames(session.dataset)
+    elif not session.consistency.sets:
+        raise InputError(
+            "consistency.sets is empty: no virtual views are named; name sets of angles, such as "
+            "consistency.sets=[released_1], or give consistency=views."
+        )
+
+
 def _virtual(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
     sets = session.consistency
-    if not sets.sets:
-        raise InputError(
-            "consistency.sets is empty: no virtual views are named; give consistency=views."
-        )
     place = {name: index for index, name in enumerate(session.dataset.names(split))}
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
         first = class_maps(model, moved, session.fabric, view)
         indices = [place[name] for name in batch.name]
         for number in range(len(sets.sets)):
-            angles = sets.angles(number, indices).to(first.device)
-            yield _turned(session, model, moved, first, angles, view)
+            yield _turned(session, model, moved, first, (number, indices), view)
 
 
 def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the second one
@@ -170,11 +179,14 @@ def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the secon
     model: nn.Module,
     batch: Batch,
     first: Tensor,
-    angles: Tensor,
+    turn: tuple[int, list[int]],
     view: View | None,
 ) -> Scenes:
-    views = session.consistency.view
-    warp = views.warp(angles, (batch.rgb.shape[2], batch.rgb.shape[3]))
+    views, angles = session.consistency.view, session.consistency.angles(*turn)
+    try:
+        warp = views.warp(angles.to(first.device), (batch.rgb.shape[2], batch.rgb.shape[3]))
+    except InputError as error:
+        raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
     turned = views.batch(batch, warp)
     second = class_maps(model, turned, session.fabric, view)
     at_label = warp.resized((first.shape[1], first.shape[2]))
@@ -187,7 +199,7 @@ def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the secon
     # As released: the first prediction stays where it is, and every pixel counts.
     released = Compared(first, second, turned.label, None)
     compared: dict[Protocol, Compared] = {"aligned": aligned, "released": released}
-    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
+    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first, turn[0])
 
 
 def _next(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
@@ -219,7 +231,7 @@ def _next(session: Session, model: nn.Module, split: str, view: View | None) -> 
         compared: dict[Protocol, Compared] = {
             "next": Compared(followed, second, later.label, valid)
         }
-        yield Scenes(batch.name, compared, (moved[0].rgb, moved[1].rgb), first)
+        yield Scenes(batch.name, compared, (moved[0].rgb, moved[1].rgb), first, 0)
 
 
 def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[Tensor, Tensor]:
@@ -270,7 +282,10 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
     if not collected.by_name:
         raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
     names = tuple(collected.by_name)
-    arrays = [np.concatenate(arrays) for arrays in collected.by_name.values()]
+    arrays = [
+        np.concatenate([by_set[number] for number in sorted(by_set)])
+        for by_set in collected.by_name.values()
+    ]
     sets = len(collected.by_name[names[0]])
     return Counts(
         counts=np.stack(arrays).astype(np.int32),
@@ -284,8 +299,13 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
 
 
 def views_of(session: Session, protocol: Protocol) -> str:
-    """Which virtual views counts are of, for names; "" where they are published or true frames."""
-    return "" if protocol == "next" else session.consistency.mark
+    """Which second frames counts are of: "" for the published views, else six digits of others.
+
+    True frames are told apart by their lists and files, so that those of another motion differ.
+    """
+    if protocol == "next":
+        return NextFrames(session.dataset).dataset.fingerprint()[:6]
+    return session.consistency.mark
 
 
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:

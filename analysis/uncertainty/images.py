@@ -203,6 +203,12 @@ def _like(first: Counts, other: Counts) -> Counts:
     if other.partition != first.partition:
         of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
         how = "rgbt.evaluate regions=..., analysis.score partition=..."
+        if of_pairs and protocol_of(first.partition) == protocol_of(other.partition):
+            raise InputError(
+                f"counts of {first.partition} and of {other.partition} are of different second "
+                "frames (other angles, camera or motion); measure both on the same with "
+                "rgbt.consistency."
+            )
         raise InputError(
             f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
             f"count both by one partition ({'rgbt.consistency frames=...' if of_pairs else how})."

@@ -55,7 +55,8 @@ class Camera:
 
         Images of the same aspect but another size are the same picture resized: focal lengths
         scale by s, and the principal point as pixel centres do, c' = (c + 0.5) s - 0.5. An aspect
-        that differs by less than a pixel, as by rounding after resizing, is the same.
+        that differs by less than a pixel, as by rounding after resizing, is the same. A crop counts
+        as a whole image: as one of a camera with the same field of view.
 
         Raises:
             InputError: `image_hw` has another aspect than the camera's images.

@@ -66,16 +66,22 @@ class Warp:
             image_hw=image_hw,
         )
 
-    def bilinear(self, values: Tensor) -> Tensor:
+    def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
         """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
 
         Where a point falls on a pixel, that pixel's value comes back bit by bit.
+
+        Args:
+            values: scores, or images in [0, 1].
+            levels: 255 rounds to 8-bit levels after each interpolation, as images that are kept
+                in bytes; there is no gradient then. None: nothing is rounded.
         """
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
         for grid in self._grids:
             padded = pad_to(sampled, _powers_of_two(self.image_hw))
             sampled = F.grid_sample(padded, grid.to(padded.dtype), align_corners=False)
+            sampled = sampled if levels is None else (sampled * levels).round() / levels
         return sampled.to(values.dtype)
 
     def nearest(self, values: Tensor, outside: float) -> Tensor:

@@ -76,19 +76,20 @@ class Temporal:
     ) -> None:
         if not hasattr(loss, "reads_warped"):
             raise InputError(
-                f"scheme=temporal trains on pairs of frames, but {type(loss).__name__} is a loss "
-                "of single ones; choose loss=temporal_paper or loss=temporal_released."
+                f"the temporal scheme trains on pairs of frames, but {type(loss).__name__} is a "
+                "loss of single ones; choose loss=temporal_paper or temporal_released, or "
+                "scheme=supervised."
             )
         if not masker.hides_nothing:
             raise InputError(
-                "scheme=temporal shows both frames whole, but the masker hides cells; choose "
+                "the temporal scheme shows both frames whole, but the masker hides cells; choose "
                 "masker=none."
             )
         if getattr(model, "predicts", "scores") == "masks" and not hasattr(model, "dense_logits"):
             raise InputError(
-                f"scheme=temporal compares class scores of two frames, but {type(model).__name__} "
-                "predicts masks of queries and has no `dense_logits` that makes scores of them; "
-                "choose another network."
+                "the temporal scheme compares class scores of two frames, but "
+                f"{type(model).__name__} predicts masks of queries and has no `dense_logits` that "
+                "makes scores of them; choose another network."
             )
         self.model = model
         self.loss = loss

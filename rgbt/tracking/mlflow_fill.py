@@ -60,6 +60,7 @@ class Sent:
         steps: kind of line -> last step sent.
         files: path in the folder -> digest of the content sent.
         profile: whether the region profile was sent.
+        later: scores of the result that no line holds and that were sent, e.g. "test/TC/aligned".
     """
 
     uri: str
@@ -70,6 +71,7 @@ class Sent:
     steps: dict[str, int] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     profile: bool = False
+    later: list[str] = field(default_factory=list)
 
 
 def read_sent(folder: RunFolder) -> Sent | None:
@@ -99,8 +101,11 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     if tables is not None and tables.split == "test" and not sent.profile:
         metrics += _profile(tables, folder)
         sent.profile = True
+    later = _later(folder, sent)
+    metrics += later.values()
     _send(store, sent, (metrics, _params(folder, known_params), _tags(folder, tables)))
     sent.steps |= {line.kind: line.step for line in lines}
+    sent.later += later
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
     description = folder.description()
@@ -134,7 +139,7 @@ def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], st
         store.experiment_id, start_time=_start_time(folder), run_name=run_name
     )
     sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
-    sent.steps, sent.files, sent.profile = {}, {}, False
+    sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
     # Written at once: a crash after this line must not leave a second run behind.
     write_sent(folder, sent)
     return set(), str(run.info.status), run_name
@@ -174,6 +179,29 @@ def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
         for name, value in line.values.items():
             if math.isfinite(value):
                 yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
+
+
+def _later(folder: RunFolder, sent: Sent) -> dict[str, Any]:
+    """Scores of pairs of frames in the result that no line holds and that were not sent yet.
+
+    Those of the selection split, and those that `rgbt.consistency` added to a finished run.
+    """
+    from mlflow.entities import Metric
+
+    result = folder.result() or {}
+    lines = folder.lines()
+    held = {f"{line.kind}/{name}" for line in lines if line.kind == "test" for name in line.values}
+    found = {}
+    for kind in ("val", "test"):
+        for name, value in (result.get(kind) or {}).items():
+            key = f"{kind}/{name}"
+            if name.split("/")[0] not in (names.TC, names.CA) or key in held or key in sent.later:
+                continue
+            if value is not None:
+                label = name if kind == "test" else key
+                time_ms = round(1000 * lines[-1].time)
+                found[key] = Metric(label, shown(name, value), time_ms, 0)
+    return found
 
 
 def shown(name: str, value: float) -> float:

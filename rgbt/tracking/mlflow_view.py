@@ -24,6 +24,8 @@ HEADLINE = "result on test split"
 SECTIONS = {
     HEADLINE: True,
     "region": True,
+    names.TC: True,
+    names.CA: True,
     "val": True,
     "train/loss": True,
     "class": False,
@@ -32,6 +34,8 @@ SECTIONS = {
     "Model metrics": False,
     "val/region": False,
     "val/class": False,
+    f"val/{names.TC}": False,
+    f"val/{names.CA}": False,
     f"val/{names.DAY}": False,
     f"val/{names.NIGHT}": False,
     "train": False,
@@ -39,7 +43,11 @@ SECTIONS = {
 }
 """Sections in order, and whether they are unfolded. MLflow fills all but the first by name."""
 
-COLUMNS = (names.MIOU, names.VAR, *(names.region(number) for number in range(1, 10)))
+COLUMNS = (
+    *(names.MIOU, names.VAR),
+    *(names.consistency(score, "aligned") for score in (names.TC, names.CA)),
+    *(names.region(number) for number in range(1, 10)),
+)
 """Metrics that are columns of the runs table; those that no run has do not appear."""
 
 

@@ -73,4 +73,4 @@ def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> N
         )
         for example in examples
     }
-    draw_columns(rows, (*COLUMNS, "differ"), legend, path)
+    draw_columns(rows, (*COLUMNS, "differ (grey: not seen)"), legend, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -111,9 +112,11 @@ def read_angles(name: str) -> Tensor:
 
 def _triple(path: Path, line: str) -> list[float]:
     try:
-        yaw, pitch, roll = map(float, line.split(","))
-    except ValueError as error:
+        triple = [float(word) for word in line.split(",")]
+    except ValueError:
+        triple = []
+    if len(triple) != 3 or not all(map(math.isfinite, triple)):
         raise InputError(
             f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got '{line}'."
-        ) from error
-    return [yaw, pitch, roll]
+        )
+    return triple

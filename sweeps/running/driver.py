@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import RunError
+from rgbt.metrics.names import CA, TC
 from rgbt.naming import TAGS
 from sweeps import attributes as names
 from sweeps.running.executors import Executor, Job
@@ -220,5 +221,11 @@ def usable_cores() -> int:
 def _finite(name: str, scores: Mapping[str, float]) -> float:
     value = scores.get(name)
     if value is None or not math.isfinite(value):
-        raise PointError(f"its runs have no {name} that is a number")
+        split, _, rest = name.partition("/")
+        measure = (
+            f"; python -m rgbt.consistency run=... split={split} measures it"
+            if rest.startswith((f"{TC}/", f"{CA}/"))
+            else ""
+        )
+        raise PointError(f"its runs have no {name} that is a number{measure}")
     return value

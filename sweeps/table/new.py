@@ -38,7 +38,8 @@ HEAD = """\
 
 COLUMNS = """\
 columns: # or: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
-  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB
+  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB;
+  # {name: TC, metric: TC, frames: aligned} and CA, of two frames (docs/consistency.md)
 """
 
 ROWS = """\
