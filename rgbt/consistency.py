@@ -58,6 +58,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     check_choice("frames", arguments["frames"], PROTOCOLS)
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
+    _check_comparable(arguments, overrides)
     runs_dir = Path(arguments["runs_dir"])
     stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
     session, split = stored.session, arguments["split"]
@@ -80,6 +81,20 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     if frames == "virtual" and arguments["run"] and not (arguments["out"] or beside):
         _add_to_result(RunFolder(stored.folder.parent), session, split, table)
     return 0
+
+
+CHANGES = ("transform", "trainer.precision", "metric")
+"""Settings by which the same run gives other counts, or other scores of them."""
+
+
+def _check_comparable(arguments: dict[str, str], overrides: list[str]) -> None:
+    """Refuse to put counts made in another way beside, or in place of, those of the run."""
+    changed = [word for word in overrides if word.lstrip("+").startswith(CHANGES)]
+    if arguments["run"] and changed and not arguments["out"]:
+        raise InputError(
+            f"{changed[0]} changes how the run is measured; name a folder for these counts with "
+            "out=..."
+        )
 
 
 def _write(

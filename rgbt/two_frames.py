@@ -165,7 +165,8 @@ def _check_second_frames(session: Session, frames: Frames) -> None:
 def _virtual(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
     sets = session.consistency
-    place = {name: index for index, name in enumerate(session.dataset.names(split))}
+    names = session.dataset.names(split)
+    place = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
         first = class_maps(model, moved, session.fabric, view)

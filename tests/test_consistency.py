@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -275,7 +276,8 @@ def test_true_second_frames_are_measured(call: Call, folder: Path, tmp_path: Pat
     (path,) = (tmp_path / "out").glob("*.npz")
     assert path.name == "consistency_next_val.npz"
     counts = pair_counts(path)
-    assert (counts.partition, counts.counts.shape) == ("next1", (2, 10, 9, 9))
+    assert re.fullmatch("next1-[0-9a-f]{6}", counts.partition)
+    assert counts.counts.shape == (2, 10, 9, 9)
     assert 0.5 * 2 * 48 * 64 < counts.counts.sum() < 2 * 48 * 64  # what both frames show
     assert (tmp_path / "out" / "pairs_next_val.png").exists()
 
@@ -298,6 +300,8 @@ REFUSED = {
     "no second frames": (["frames=next"], "has no second frames: expected the folder next/"),
     "no views": (["consistency=none"], "consistency.sets is empty"),
     "empty sets": (["consistency.sets=[]"], "consistency.sets is empty"),
+    "another size": (["transform.test_short_edge=96"], "name a folder for these counts with out="),
+    "another precision": (["trainer.precision=bf16-mixed"], "changes how the run is measured"),
     "no such split": (["split=tset"], "no split 'tset'; did you mean 'test'?"),
     "no such modality": (["modality=rgb"], "modality: 'rgb' is not a choice"),
     "no such checkpoint": (["checkpoint=first"], "checkpoint: 'first' is not a choice"),

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
+from tests.conftest import write_data
+
 MODULE = '''
 import torch
 from torch import nn
@@ -58,6 +61,71 @@ defaults:
 name: mine
 """,
 }
+
+
+VIEW = '''
+from dataclasses import replace
+
+import torch
+
+from rgbt.geometry.warp import Warp
+
+
+class Aside:
+    """The second frame lies a few whole columns to the right; no camera is needed."""
+
+    def __init__(self, *, columns: int) -> None:
+        self.columns = columns
+
+    def draw(self, count, generator):
+        return torch.randint(1, self.columns + 1, (count, 1), generator=generator)
+
+    def warp(self, angles, image_hw):
+        turn = torch.eye(3, dtype=torch.float64).repeat(len(angles), 1, 1)
+        turn[:, 0, 2] = -angles[:, 0]
+        edges = torch.tensor([-0.5, -0.5, image_hw[1] - 0.5, image_hw[0] - 0.5]).double()
+        return Warp(turn, edges.expand(len(angles), 4), image_hw, "once")
+
+    def batch(self, batch, warp):
+        return replace(
+            batch,
+            rgb=warp.bilinear(batch.rgb),
+            thermal=warp.bilinear(batch.thermal),
+            label=warp.nearest(batch.label, 255),
+        )
+
+    def valid(self, warp):
+        return warp.inside()
+'''
+
+
+@pytest.mark.parametrize("hw", [(48, 64), (48, 48)], ids=["3:4", "square"])
+def test_a_second_frame_of_ones_own_is_trained_on(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hw: tuple[int, int]
+) -> None:
+    (tmp_path / "own_views.py").write_text(VIEW)
+    (tmp_path / "conf" / "view").mkdir(parents=True)
+    (tmp_path / "conf" / "view" / "aside.yaml").write_text(
+        "_target_: own_views.Aside\ncolumns: 5\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = (
+        *("+experiment=temporal_con", "view@scheme.view=aside", "consistency=none"),
+        *(f"hydra.searchpath=[file://{tmp_path / 'conf'}]", "masker.patch_size=null"),
+        *(f"scale.crop_hw=[{hw[0]},{hw[1]}]", *short(1)),
+    )
+    data = write_data(tmp_path / "mf", SPLITS, hw)
+    code, _, err = train(call, data, tmp_path / "runs", *words)
+    assert code == 0, err
+    (line,) = (
+        json.loads(text)
+        for text in (only_run(tmp_path / "runs") / "metrics.jsonl").read_text().splitlines()
+        if '"train"' in text
+    )
+    assert 0 < line["values"]["loss/con"] < 1
+    code, _, err = train(call, data, tmp_path / "runs", *words, "scheme.view.column=3")
+    assert code == 2
+    assert_one_sentence(err, "did you mean 'columns'?")
 
 
 def test_own_parts_run_from_outside_the_repository(

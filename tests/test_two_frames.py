@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from math import cos, radians, sin
 from pathlib import Path
@@ -16,7 +17,8 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.config import check, compose
 from rgbt.data.next_frames import NextFrames
-from rgbt.metrics.pairs import ca, tc
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.pairs import Protocol, ca, tc
 from rgbt.session import Session, open_session
 from rgbt.transforms.view_sets import read_angles
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
@@ -129,7 +131,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
             for number in range(3):
                 triple = read_angles(f"released_{number + 1}")[image : image + 1]
                 thermal = torch.from_numpy(28 * classes / 255).float()[None, None]
-                second = Decoder()(thermal, sets.view.warp(triple, HW).bilinear(thermal))
+                second = Decoder()(thermal, sets.view.warp(triple, HW).bilinear(thermal, 255))
                 row, column = source_of(triple[0].tolist())
                 seen = row >= 0
                 brought = np.where(seen, classes[row, column], 0)  # as label and as prediction
@@ -222,6 +224,49 @@ def test_an_unreadable_image_is_left_out(data: Path) -> None:
     assert np.array_equal(found.counts, whole.counts[1:])
 
 
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_a_name_that_a_list_holds_twice_counts_once(data: Path, size: int) -> None:
+    first, *others = SPLITS["test"]
+    (data / "test.txt").write_text("\n".join([first, *others, first]))
+    session = on_mfnet(data, f"scale.eval_batch_size={size}")
+    for counts in count_pairs(session, Decoder(), "test", "virtual").counts.values():
+        assert counts.names == tuple(SPLITS["test"])
+        by_set = counts.counts.reshape(3, 3, 10, 9, 9).sum((2, 3, 4))
+        assert (by_set <= 48 * 64).all()
+        assert (by_set > 0.97 * 48 * 64).all()
+
+
+def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
+    """One set of 10 pixels and two classes; counts[label, first prediction, second prediction]."""
+    pairs = np.zeros((1, 3, 2, 2), np.int32)
+    pairs[0, 0, 0], pairs[0, 1, :, 1] = [4, 2], [1, 3]
+
+    def counts(partition: str) -> Counts:
+        return Counts(
+            counts=pairs,
+            names=("a",),
+            night=None,
+            classes=("road", "car"),
+            partition=partition,
+            dataset="files",
+            split="test",
+        )
+
+    asked: list[Protocol] = ["aligned", "released", "next"]
+    table = consistency_table({each: counts(f"{each}1") for each in asked}, "exclude")
+    # Road: 7, 4 and 6 pixels by the first, the second and the label; 4 by all, 7 by any.
+    # Car: 3, 6 and 4; 3 by all, 6 by any. Released: sum of the three less twice what all share.
+    exact, released = (4 / 7, 3 / 6), (4 / (17 - 8), 3 / (13 - 6))
+    assert table.ca["aligned"] == table.ca["next"] == pytest.approx(exact)
+    assert table.ca["released"] == pytest.approx(released)
+    assert table.mean_ca["aligned"] == pytest.approx(sum(exact) / 2)
+    assert table.mean_ca["released"] == pytest.approx(sum(released) / 2)
+    # Of two predictions: 4 of 7 + 4 - 4 pixels, and 3 of 3 + 6 - 3.
+    for protocol in asked:
+        assert table.tc[protocol] == pytest.approx((4 / 7, 3 / 6))
+    assert table.names == ("road", "car")
+
+
 # ---- true frames ----------------------------------------------------------------------------
 
 
@@ -268,7 +313,7 @@ def test_an_oracle_scores_on_true_frames_what_its_labels_do(cache: Path) -> None
             union[cls] += (one | two).sum()
             triple[cls] += (one & two).sum()
     found = count_pairs(session, oracle, "test", "next").counts["next"]
-    assert found.partition == "next1"
+    assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
     assert tc(found.by_region(), "exclude") == pytest.approx(expected, nan_ok=True)
@@ -280,6 +325,40 @@ def test_an_oracle_scores_on_true_frames_what_its_labels_do(cache: Path) -> None
         "TC/next": pytest.approx(np.nanmean(expected)),
         "CA/next": pytest.approx(np.nanmean(expected)),
     }
+
+
+def test_pixels_of_true_frames_without_a_label_do_not_count(tmp_path: Path) -> None:
+    session = on_synth(tmp_path)
+    after, expected = NextFrames(session.dataset), []
+    for name in session.dataset.names("test"):
+        label = after.dataset.read(name).label.copy()
+        label[10:30, 5:40] = 255
+        write_png(after.dataset.root / "labels" / f"{name}.png", label)
+        _, seen = followed(session, name, label)
+        expected.append(int((seen & (label != 255)).sum()))
+        assert (seen & (label == 255)).any()
+    found = count_pairs(session, Decoder(), "test", "next").counts["next"]
+    assert not found.counts[:, 9].any()
+    assert found.counts.sum((1, 2, 3)).tolist() == expected
+
+
+def test_true_frames_listed_twice_count_once(tmp_path: Path) -> None:
+    once = count_pairs(on_synth(tmp_path), Decoder(), "test", "next").counts["next"]
+    root = on_synth(tmp_path).dataset.root
+    for place in (root, root / "next"):
+        listed = (place / "test.txt").read_text().split()
+        (place / "test.txt").write_text("\n".join([*listed, listed[0]]))
+    found = count_pairs(on_synth(tmp_path), Decoder(), "test", "next").counts["next"]
+    assert found.names == once.names
+    assert np.array_equal(found.counts, once.counts)
+
+
+def test_second_frames_of_another_motion_are_another_partition(cache: Path) -> None:
+    partitions = [
+        count_pairs(on_synth(cache, *more), Decoder(), "test", "next").counts["next"].partition
+        for more in ((), ("seed=1",), ("dataset.ego_forward_m=0.6",))
+    ]
+    assert partitions[0] == partitions[1] != partitions[2]
 
 
 def test_perfect_consistency_on_true_frames_is_100_whatever_is_right(cache: Path) -> None:

@@ -188,7 +188,9 @@ def _later(folder: RunFolder, sent: Sent) -> dict[str, Any]:
     """
     from mlflow.entities import Metric
 
-    result = folder.result() or {}
+    result = folder.result()
+    if result is None:
+        return {}
     lines = folder.lines()
     held = {f"{line.kind}/{name}" for line in lines if line.kind == "test" for name in line.values}
     found = {}

@@ -155,3 +155,13 @@ def test_two_protocols_are_not_compared(runs: Path):
     a, b = (open_counts("plain0", runs, frames=each)[0].counts for each in ("aligned", "released"))
     with pytest.raises(InputError, match="by one partition \\(rgbt.consistency frames="):
         compare([a], [b], ["TC"], Resampling())
+
+
+@pytest.mark.parametrize(
+    ("a", "b"), [("next1-0a1b2c", "next1-d4e5f6"), ("aligned3", "aligned3-0c")]
+)
+def test_different_second_frames_are_not_compared(a: str, b: str):
+    of_a, of_b = (replace(pairs_of(IMAGES, 0.5), partition=each) for each in (a, b))
+    sentence = f"counts of {a} and of {b} are of different second frames .*motion.*rgbt.consistency"
+    with pytest.raises(InputError, match=sentence):
+        compare([of_a], [of_b], ["TC"], Resampling())

@@ -214,6 +214,35 @@ def test_a_resized_warp_is_the_warp_by_the_resized_camera() -> None:
     assert warp.resized(HW) is warp
 
 
+def test_a_resized_cut_may_begin_within_a_pixel() -> None:
+    """Columns 3..7 and rows 1..6 of 8, cut twice: at half the size they begin at 1.5 and 0.5."""
+    cut = torch.tensor([[2.5, 0.5, 7.5, 6.5]], dtype=torch.float64)
+    warp = Warp(shift(0, 0), cut, (8, 8), "twice").resized((4, 4))
+    label = torch.arange(16).view(1, 4, 4)
+    # floor(1.5 + 0.625 i) and floor(0.5 + 0.75 i)
+    columns, rows = torch.tensor([1, 2, 2, 3]), torch.tensor([0, 1, 2, 2])
+    assert torch.equal(warp.nearest(label, 255)[0], 4 * rows[:, None] + columns)
+
+
+def test_levels_are_rounded_after_each_interpolation() -> None:
+    cut = torch.tensor([[2.5, 1.5, 8.5, 7.5]], dtype=torch.float64)
+    values = random_values(1, 2, 10, 12).sigmoid()
+    canvas = Warp(shift(0.3, -0.4), whole((10, 12)), (10, 12), "twice")
+    resize = Warp(shift(0, 0), cut, (10, 12), "twice")
+    both = Warp(shift(0.3, -0.4), cut, (10, 12), "twice")
+    stepwise = (255 * canvas.bilinear(values)).round() / 255
+    stepwise = (255 * resize.bilinear(stepwise)).round()
+    rounded = both.bilinear(values, levels=255)
+    torch.testing.assert_close(255 * rounded, stepwise, atol=1e-3, rtol=0)
+    at_the_end = (255 * both.bilinear(values)).round()
+    assert float((255 * rounded - at_the_end).abs().max()) > 0.5
+    # A quarter of a pixel aside, 0 and 9 levels mix to 2.25: 2 with levels, 2.25 without.
+    pair = torch.tensor([[[[9.0, 0.0]]]]) / 255
+    aside = Warp(shift(0.25, 0), whole((1, 2)), (1, 2), "once")
+    assert 255 * aside.bilinear(pair)[0, 0, 0, 1].item() == pytest.approx(2.25, abs=1e-4)
+    assert 255 * aside.bilinear(pair, 255)[0, 0, 0, 1].item() == pytest.approx(2, abs=1e-6)
+
+
 def opencv(warp: Warp, values: Tensor, how: int) -> Tensor:
     """The release's way for (B, C, H, W) float32: warp, cut whole pixels, resize."""
     out = []

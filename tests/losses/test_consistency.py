@@ -89,15 +89,33 @@ def test_sigma_is_added_per_pixel_as_printed_and_a_floor_as_released() -> None:
     assert score(1e-9, "released") == pytest.approx(4e-18 / 1e-7, abs=1e-12)
 
 
+def test_sigma_counts_the_pixels_that_count_and_no_others() -> None:
+    p = torch.full((1, 1, 2, 4), 1e-6, dtype=torch.float64)  # one class, eight pixels, three valid
+    valid = torch.tensor([[[True, False, False, True], [False, True, False, False]]])
+    # 2 * 3 p^2 over 3 (2 p + sigma).
+    assert 1 - con(p, p, valid, "paper").item() == pytest.approx(2e-12 / 2.1e-6, abs=1e-13)
+    assert 1 - con(p, p, valid, "released").item() == pytest.approx(2e-12 / 2e-6, abs=1e-13)
+
+
+def test_sigma_of_con_acc_is_added_at_every_labelled_pixel() -> None:
+    p = torch.full((1, 1, 2, 4), 1e-6, dtype=torch.float64)
+    p[..., 0, 0] = 1
+    label = torch.tensor([[[0, 255, 255, 0], [255, 0, 255, 255]]])
+    # Three labelled pixels: products 1 + 2 p^2, sums of p, q and y 3 + 2 (2 p + 1), 3 sigma.
+    expected = 1 - 2 * (1 + 2e-12) / (3 + 2 * (2e-6 + 1) + 3 * SIGMA)
+    assert con_acc(p, p, label, "paper").item() == pytest.approx(expected, abs=1e-12, rel=0)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_equal_the_loops_over_classes(form: Form) -> None:
     first, second, label = random_problem(2, 5, 6, 7)
     label[label == 3] = 255  # absent
     p, q = first.softmax(1), second.softmax(1)
     valid = torch.rand(label.shape, generator=torch.Generator().manual_seed(1)) < 0.7
-    assert torch.allclose(con(p, q, valid, form), con_as_printed(p, q, valid, form), atol=1e-9)
+    found, expected = con(p, q, valid, form), con_as_printed(p, q, valid, form)
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
     found, expected = con_acc(p, q, label, form), con_acc_as_printed(p, q, label, form)
-    assert torch.allclose(found, expected, atol=1e-9)
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("form", FORMS)

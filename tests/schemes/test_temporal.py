@@ -197,6 +197,19 @@ def test_the_second_frame_is_the_view_of_the_first() -> None:
     assert len(set(drawn[:, 0].tolist())) == B
 
 
+@pytest.mark.parametrize("norm", [nn.BatchNorm2d(6), nn.Identity()], ids=["apart", "joint"])
+def test_every_part_of_a_step_asks_for_its_own_generator_once(norm: nn.Module) -> None:
+    asked: list[str] = []
+
+    def noting(purpose: str) -> torch.Generator:
+        asked.append(purpose)
+        return generator_of(purpose)
+
+    (_,) = scheme(Net(norm)).phases(batch(), noting)
+    # The same words for every run: they decide the numbers that are drawn.
+    assert sorted(asked) == ["loss", "stochastic depth", "virtual view"]
+
+
 class Half:
     """A view that lies half a pixel to the right: each pixel is the mean of two."""
 

@@ -117,7 +117,8 @@ BROKEN = {
     "two values": (b"yaw,pitch,roll\n1,2\n", "expected yaw,pitch,roll in degrees, got '1,2'"),
     "four values": (b"yaw,pitch,roll\n1,2,3,4\n", "expected yaw,pitch,roll in degrees"),
     "a word": (b"yaw,pitch,roll\n1,2,x\n", "expected yaw,pitch,roll in degrees, got '1,2,x'"),
-    "no number": (b"yaw,pitch,roll\n1,2,nan\n", "nan"),
+    "no number": (b"yaw,pitch,roll\n1,2,nan\n", "expected yaw,pitch,roll .* got '1,2,nan'"),
+    "endless": (b"yaw,pitch,roll\n0,0,0\ninf,2,3\n", "expected yaw,pitch,roll .* got 'inf,2,3'"),
     "too steep": (b"yaw,pitch,roll\n0,0,0\n80,2,3\n", "yaw 80, pitch 2, roll 3 degrees leave no"),
     "no text": (b"\xff\xfe\x00\x01" * 9, "consistency.sets"),
     "another encoding": ("yaw,pitch,roll\n1,2,3\n".encode("utf-16"), "consistency.sets"),
@@ -131,6 +132,12 @@ def test_broken_files_are_named(tmp_path: Path, content: bytes, sentence: str) -
     with pytest.raises(InputError, match=sentence) as raised:
         sets(str(path))
     assert str(path) in str(raised.value)
+
+
+def test_sets_without_a_split_to_measure_are_refused() -> None:
+    with pytest.raises(InputError, match=r"consistency\.splits is empty, .* consistency=none"):
+        ViewSets(view=released(), sets=("released_1",), splits=())
+    assert ViewSets(view=released(), sets=(), splits=()).sets == ()
 
 
 def test_unknown_sets_are_named(tmp_path: Path) -> None:

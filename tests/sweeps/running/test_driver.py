@@ -130,6 +130,15 @@ def test_a_score_that_is_no_number_is_a_failure(tmp_path: Path, score: float | N
     assert "no test/mIoU that is a number" in trial(desk, 0).user_attrs[names.REASON]
 
 
+def test_consistency_that_was_not_measured_says_how_to_get_it(tmp_path: Path) -> None:
+    objectives = (Objective("val/TC/aligned", "maximize"),)
+    desk = search_desk(tmp_path, objectives=objectives, trials=1).run()
+    assert (
+        "no val/TC/aligned that is a number; python -m rgbt.consistency run=... split=val"
+        in trial(desk, 0).user_attrs[names.REASON]
+    )
+
+
 def test_a_configuration_that_changed_meanwhile_is_a_failure_that_says_so(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1), leave(0)).run()
     assert desk.states() == {"x=0": ["FAIL"]}

@@ -27,7 +27,9 @@ def test_one_factor(tmp_path: Path) -> None:
     names = [column.name for column in table.columns]
     assert names == ["IoU1", "IoU2", "IoU3", "IoU4", "IoU5", "mIoU", "Var"]
     assert table.columns[-1].best == "lowest"
-    assert path.read_text().count("#") >= 7
+    text = path.read_text()
+    assert text.count("#") >= 7
+    assert "{name: TC, metric: TC, frames: aligned}" in text
 
 
 def test_a_product_has_no_axis(tmp_path: Path) -> None:
