@@ -17,6 +17,7 @@ from rgbt.tracking.pictures import (
     draw_columns,
     overlay,
 )
+from rgbt.types import IGNORE
 
 AGREES = (235, 235, 235)
 DIFFERS = (200, 30, 30)
@@ -62,15 +63,18 @@ def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> N
     Raises:
         ValueError: no examples.
     """
-    rows = {
-        example.name: (
-            example.first_rgb,
-            overlay(example.first_rgb, example.first, legend.palette),
-            example.second_rgb,
-            overlay(example.second_rgb, example.second, legend.palette),
-            colours(np.where(example.seen, example.followed, 255), legend.palette),
-            example.difference(),
+    rows = [
+        (
+            example.name,
+            (
+                example.first_rgb,
+                overlay(example.first_rgb, example.first, legend.palette),
+                example.second_rgb,
+                overlay(example.second_rgb, example.second, legend.palette),
+                colours(np.where(example.seen, example.followed, IGNORE), legend.palette),
+                example.difference(),
+            ),
         )
         for example in examples
-    }
+    ]
     draw_columns(rows, (*COLUMNS, "differ (grey: not seen)"), legend, path)

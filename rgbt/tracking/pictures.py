@@ -6,7 +6,7 @@ something is drawn and never opens a window.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -113,25 +113,31 @@ def draw_panel(examples: Sequence[Example], legend: Legend, path: Path) -> None:
     Raises:
         ValueError: no examples.
     """
-    rows = {
-        example.name: (
-            example.rgb,
-            np.repeat(example.thermal[..., None], 3, axis=2),
-            colours(example.label, legend.palette),
-            colours(example.prediction, legend.palette),
+    rows = [
+        (
+            example.name,
+            (
+                example.rgb,
+                np.repeat(example.thermal[..., None], 3, axis=2),
+                colours(example.label, legend.palette),
+                colours(example.prediction, legend.palette),
+            ),
         )
         for example in examples
-    }
+    ]
     draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), legend, path)
 
 
 def draw_columns(
-    rows: Mapping[str, Sequence[Image]], titles: Sequence[str], legend: Legend, path: Path
+    rows: Sequence[tuple[str, Sequence[Image]]],
+    titles: Sequence[str],
+    legend: Legend,
+    path: Path,
 ) -> None:
     """Write a PNG of pictures in rows and columns, with the classes below.
 
     Args:
-        rows: name -> one (H, W, 3) picture per column.
+        rows: name, and one (H, W, 3) picture per column.
         titles: of the columns.
         legend: classes and their colours.
         path: of the PNG.
@@ -141,12 +147,12 @@ def draw_columns(
     """
     if not rows:
         raise ValueError("a qualitative panel needs at least one example, got none.")
-    height, width = next(iter(rows.values()))[0].shape[:2]
+    height, width = rows[0][1][0].shape[:2]
     cell_w = 3.0
     cell_h = cell_w * height / width
     figure = _figure(len(titles) * cell_w + 0.4, len(rows) * (cell_h + 0.08) + 0.75)
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
-    for row, (name, pictures) in zip(axes, rows.items(), strict=True):
+    for row, (name, pictures) in zip(axes, rows, strict=True):
         for axis, picture in zip(row, pictures, strict=True):
             _image(axis, picture)
         row[0].set_ylabel(name, fontsize=8)
