@@ -112,6 +112,7 @@ def take_a_step(call: Call, data: Path, runs: Path, *overrides: str) -> dict[str
     return step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["cmx", "rtfnet", "mfnet"])
 def test_networks_of_scores_take_a_step(
     call: Call, data: Path, tmp_path: Path, network: str
