@@ -103,6 +103,8 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     for factor in factors:
         if factor.key == "seed":
             raise InputError("seed=...: seeds are chosen when the table is run, seeds=3.")
+        if factor.key == "runs_dir":
+            raise InputError("runs_dir=...: where runs lie is said when the table is run.")
     if not any(len(factor.values) > 1 for factor in factors):
         raise InputError("nothing is varied; give a comma list, such as masker.sigma_div=1,2,4.")
     points = list(itertools.product(*(factor.values for factor in factors)))

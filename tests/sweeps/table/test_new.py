@@ -65,6 +65,7 @@ def test_values_that_are_no_numbers_and_keys_that_end_alike(tmp_path: Path) -> N
         (("grbm", ["masker.sigma_div=1,abc"]), "masker.sigma_div"),
         (("grbn", ["masker.sigma_div=1,2"]), "did you mean 'grbm'"),
         (("grbm", ["seed=0,1"]), "seeds=3"),
+        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "when the table is run"),
         (("grbm", ["masker.sigma_div=1"]), "nothing is varied"),
     ],
 )
