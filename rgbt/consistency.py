@@ -53,7 +53,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import place_lines, rich_table, show
-    from rgbt.two_frames import PROTOCOLS, Frames, consistency_table, count_pairs, views_of
+    from rgbt.two_frames import PROTOCOLS, Frames, consistency_table, count_pairs
 
     check_choice("frames", arguments["frames"], PROTOCOLS)
     if not any(item.split("=")[0] == "consistency" for item in overrides):
@@ -74,7 +74,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     keep = panel_names(session.dataset, split)
     found = count_pairs(session, session.model, split, frames, view=view, keep=keep)
     table = consistency_table(found.counts, session.regions.absent)
-    what = views_of(session, PROTOCOLS[frames][0]) or "published"
+    partition = found.counts[PROTOCOLS[frames][0]].partition
+    what = partition.partition("-")[2] or "published"
     title = f"Consistency of {stored.label} ({session.dataset.name}, {split}; {frames}: {what})"
     show(rich_table(consistency_grid(table, title)))
     show(place_lines(_write(found, session, folder, beside)))
@@ -151,9 +152,8 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
 def _name(protocol: Protocol, session: Session, split: str, beside: list[str]) -> str:
     """Name of a file of counts; those of true frames have one name, whatever the motion."""
     from rgbt.metrics.pairs import file_name
-    from rgbt.two_frames import views_of
 
-    views = "" if protocol == "next" else views_of(session, protocol)
+    views = "" if protocol == "next" else session.consistency.mark
     usual = Path(file_name(protocol, split, views))
     return usual.with_stem("_".join([usual.stem, *beside])).name
 

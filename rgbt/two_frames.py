@@ -23,16 +23,9 @@ from rgbt.engine.evaluate import class_maps
 from rgbt.engine.progress import progress
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.names import CA, CA_RELEASED, TC, consistency
-from rgbt.metrics.pairs import (
-    HEADLINES,
-    Protocol,
-    ca,
-    ca_released,
-    pair_counts,
-    partition_name,
-    tc,
-)
+from rgbt.metrics.named import OF_PAIRS
+from rgbt.metrics.names import CA, TC, consistency
+from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
 from rgbt.metrics.scores import class_mean
 from rgbt.session import Session
 from rgbt.tracking.pair_pictures import PairExample
@@ -166,6 +159,7 @@ def _virtual(session: Session, model: nn.Module, split: str, view: View | None) 
     """Every batch with each set of views in turn."""
     sets = session.consistency
     names = session.dataset.names(split)
+    # A name that the list holds twice has the views of its first place.
     place = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
@@ -316,12 +310,13 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         found: counts by protocol, see `count_pairs`.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
     """
-    by_protocol = {protocol: counts.by_region() for protocol, counts in found.items()}
-    scores = {protocol: tc(pairs, absent) for protocol, pairs in by_protocol.items()}
-    right = {
-        protocol: (ca_released if CA_RELEASED in HEADLINES[protocol] else ca)(pairs, absent)
-        for protocol, pairs in by_protocol.items()
-    }
+    scores, right = (
+        {
+            protocol: OF_PAIRS[HEADLINES[protocol][place]](counts.by_region(), absent)
+            for protocol, counts in found.items()
+        }
+        for place in (0, 1)
+    )
     return ConsistencyTable(
         names=next(iter(found.values())).classes,
         tc={protocol: tuple(map(float, values)) for protocol, values in scores.items()},

@@ -96,6 +96,26 @@ class Warp:
         """(B, H, W) bool: the pixel shows a point within the outline of the first frame."""
         return self._pixels[1].view(-1, *self.image_hw)
 
+    def moved(self, points_yx: Tensor) -> Tensor:
+        """Where pixels of the first frame lie in the second: the nearest pixel of it, if outside.
+
+        Args:
+            points_yx: (B, 2) row and column, one pixel per frame.
+
+        Returns:
+            (B, 2) int64 row and column.
+        """
+        row, column = points_yx.to(self.homography.device, torch.float64).unbind(1)
+        points = torch.stack([column, row, torch.ones_like(row)], 1)
+        x, y, w = (self.homography @ points[..., None])[..., 0].unbind(1)
+        left, top, right, bottom = self.rectangle.unbind(1)
+        height, width = self.image_hw
+        rows = (y / w - top) * height / (bottom - top) - 0.5
+        columns = (x / w - left) * width / (right - left) - 0.5
+        limit = torch.tensor([height - 1, width - 1], device=row.device)
+        nearest = torch.stack([rows, columns], 1).round().long()
+        return torch.minimum(nearest.clamp(min=0), limit)
+
     def _check(self, values: Tensor, letters: str) -> None:
         height, width = self.image_hw
         check_shape("values", values, letters, B=len(self.homography), H=height, W=width)

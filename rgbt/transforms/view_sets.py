@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -55,11 +56,11 @@ class ViewSets:
         self._triples = [read_angles(name) for name in sets]
         for name, triples in zip(sets, self._triples, strict=True):
             try:
-                view.check(triples, (view.camera.height, view.camera.width))
+                view.check(triples)
             except InputError as error:
                 raise InputError(f"consistency.sets: {name}: {error}") from error
 
-    @property
+    @cached_property
     def mark(self) -> str:
         """Empty for the published views; six hexadecimal digits of any others, for names of files.
 

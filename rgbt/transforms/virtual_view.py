@@ -106,9 +106,11 @@ class VirtualView:
         Raises:
             InputError: the camera is one of images of another shape.
         """
-        turn = homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
-        frame = _whole(turn, image_hw)
-        rectangle = frame if self.mode == "rotation" else self._rectangle(turn, image_hw)
+        turn = self._turn(angles, image_hw)
+        if self.mode == "rotation":
+            rectangle = _whole(turn, image_hw)
+        else:
+            rectangle = inner_rectangle(turn, image_hw, self.rectangle)
         if self.mode == "translation":
             turn = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
         return Warp(turn, rectangle, image_hw, self.resampling)
@@ -124,10 +126,16 @@ class VirtualView:
             "outside": self.outside_label,
         }
 
-    def check(self, angles: Tensor, image_hw: tuple[int, int]) -> None:
-        """Raise InputError where an angle leaves no rectangle; waits for the device."""
-        turn = homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
-        check_rectangle(self._rectangle(turn, image_hw), angles)
+    def check(self, angles: Tensor) -> Tensor:
+        """(B, 4): the rectangles that angles leave of the camera's own images.
+
+        Raises:
+            InputError: one leaves none. Looking for that waits for the device.
+        """
+        size = (self.camera.height, self.camera.width)
+        rectangle = inner_rectangle(self._turn(angles, size), size, self.rectangle)
+        check_rectangle(rectangle, angles)
+        return rectangle
 
     def batch(self, batch: Batch, warp: Warp) -> Batch:
         """The frames as seen from the view: images bilinear, labels and positions nearest.
@@ -143,15 +151,14 @@ class VirtualView:
         """
         levels = BYTE if self.resampling == "twice" else None
         images = warp.bilinear(torch.cat([batch.rgb, batch.thermal], 1), levels)
-        label_hw = (batch.label.shape[1], batch.label.shape[2])
-        of_label = warp if label_hw == warp.image_hw else warp.resized(label_hw)
+        of_label = warp.resized((batch.label.shape[1], batch.label.shape[2]))
         position = batch.position
         return replace(
             batch,
             rgb=images[:, :3],
             thermal=images[:, 3:],
             label=of_label.nearest(batch.label, self.outside_label),
-            centre_yx=_moved(batch.centre_yx, warp),
+            centre_yx=warp.moved(batch.centre_yx),
             position=None if position is None else warp.nearest(position, 0),
         )
 
@@ -160,8 +167,8 @@ class VirtualView:
         inside = warp.inside()
         return inside if self.outside_label == IGNORE else torch.ones_like(inside)
 
-    def _rectangle(self, turn: Tensor, image_hw: tuple[int, int]) -> Tensor:
-        return inner_rectangle(turn, image_hw, self.rectangle)
+    def _turn(self, angles: Tensor, image_hw: tuple[int, int]) -> Tensor:
+        return homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
 
     def _check_ranges(self) -> None:
         for name, (low, high) in self.ranges.items():
@@ -177,13 +184,8 @@ class VirtualView:
         """A grid of turns over the ranges, looked at here so that no step has to wait for it."""
         steps = [torch.linspace(low, high, 5).tolist() for low, high in self.ranges.values()]
         turns = torch.tensor(list(product(*steps)), dtype=torch.float64)
-        size = (self.camera.height, self.camera.width)
-        self.check(turns, size)
-        matrix = self.camera.matrix(size)
-        left, top, right, bottom = self._rectangle(
-            homography(turns, matrix, self.order), size
-        ).unbind(1)
-        share = (right - left) * (bottom - top) / (size[0] * size[1])
+        left, top, right, bottom = self.check(turns).unbind(1)
+        share = (right - left) * (bottom - top) / (self.camera.height * self.camera.width)
         if bool((share < LEAST).any()):
             yaw, pitch, roll = turns[share.argmin()].tolist()
             raise InputError(
@@ -191,20 +193,6 @@ class VirtualView:
                 f"{100 * float(share.min()):.2g} % of the frame, at least {100 * LEAST:g} % is "
                 "needed; choose smaller ranges of angles."
             )
-
-
-def _moved(points_yx: Tensor, warp: Warp) -> Tensor:
-    """(B, 2) int64: pixels (row, column) of the first frame in the view, or the nearest there."""
-    row, column = points_yx.to(warp.homography.device, torch.float64).unbind(1)
-    points = torch.stack([column, row, torch.ones_like(row)], 1)
-    x, y, w = (warp.homography @ points[..., None])[..., 0].unbind(1)
-    left, top, right, bottom = warp.rectangle.unbind(1)
-    height, width = warp.image_hw
-    rows = (y / w - top) * height / (bottom - top) - 0.5
-    columns = (x / w - left) * width / (right - left) - 0.5
-    limit = torch.tensor([height - 1, width - 1], device=row.device)
-    nearest = torch.stack([rows, columns], 1).round().long()
-    return torch.minimum(nearest.clamp(min=0), limit)
 
 
 def _whole(turn: Tensor, image_hw: tuple[int, int]) -> Tensor:

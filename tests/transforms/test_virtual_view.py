@@ -391,4 +391,4 @@ def test_a_camera_of_other_images_is_refused() -> None:
 
 def test_a_single_angle_that_leaves_nothing_is_named() -> None:
     with pytest.raises(InputError, match="yaw 80, pitch 2, roll 3 degrees"):
-        paper().check(angles((0, 0, 0), (80, 2, 3)), HW)
+        paper().check(angles((0, 0, 0), (80, 2, 3)))
