@@ -65,6 +65,11 @@ class Example(Protocol):
         """Name in the split list."""
         ...
 
+    @property
+    def confidence(self) -> NDArray[np.float32] | None:
+        """(H', W') how sure the labels are, or None."""
+        ...
+
 
 class Transform(Protocol):
     """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
@@ -86,9 +91,11 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
         advice: ends the message where sizes differ; says which key to change.
 
     Raises:
-        InputError: images or labels differ in size, naming the first two that do.
+        InputError: images or labels differ in size, naming the first two that do; labels of some
+            examples alone carry confidences.
     """
     _check_sizes(examples, advice)
+    confidences = _confidences(examples)
     positions = [example.position for example in examples if example.position is not None]
     rgb_BHWC = torch.from_numpy(np.stack([example.rgb for example in examples]))
     thermal_BHW = torch.from_numpy(np.stack([example.thermal for example in examples]))
@@ -101,7 +108,24 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
         centre_yx=torch.tensor([example.centre_yx for example in examples]),
         position=torch.from_numpy(np.stack(positions)) if positions else None,
         original_hw=torch.tensor([example.original_hw for example in examples]),
+        confidence=torch.from_numpy(np.stack(confidences)) if confidences else None,
     )
+
+
+def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
+    """Those of all examples, or none."""
+    found = [each.confidence for each in examples if each.confidence is not None]
+    if 0 < len(found) < len(examples):
+        with_one, without = (
+            next(each.name for each in examples if (each.confidence is None) == missing)
+            for missing in (False, True)
+        )
+        raise InputError(
+            f"either all labels of one batch must carry confidences or none, but those of "
+            f"'{with_one}' do and those of '{without}' do not; write the pseudo-labels of the "
+            "whole split again."
+        )
+    return found
 
 
 def _check_sizes(examples: Sequence[Example], advice: str) -> None:

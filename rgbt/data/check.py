@@ -1,6 +1,7 @@
 """Command that reads a whole data set and reports what it holds and what is wrong.
 
     python -m rgbt.data.check dataset=mfnet dataset.root=...
+    python -m rgbt.data.check dataset=freiburg dataset.root=...
 
 Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: problems, 2: wrong input.
 """
@@ -14,11 +15,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rgbt.checks import InputError
 from rgbt.command import command
 from rgbt.config import build
-from rgbt.data.mfnet import MFNet
-from rgbt.data.report import Report, SplitReport, check_dataset, num_listed
+from rgbt.data.dataset import LabelledDataset
+from rgbt.data.report import check_dataset, layout_of, num_listed
+from rgbt.data.report_values import Report, SplitReport
 
 WIDTH_WITHOUT_TERMINAL = 120
 
@@ -26,12 +27,7 @@ WIDTH_WITHOUT_TERMINAL = 120
 @command()
 def main(config: DictConfig) -> int:
     """Check ``config.dataset``; 1 where there are problems."""
-    dataset = build(config.dataset)
-    if not isinstance(dataset, MFNet):
-        raise InputError(
-            f"dataset: expected a data set in MFNet's layout, got {type(dataset).__name__}; choose "
-            "dataset=mfnet or dataset=synth."
-        )
+    dataset: LabelledDataset = build(config.dataset)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("reading", total=num_listed(dataset))
         report = check_dataset(
@@ -43,15 +39,16 @@ def main(config: DictConfig) -> int:
     return 1 if report.problems else 0
 
 
-def print_report(dataset: MFNet, report: Report) -> None:
+def print_report(dataset: LabelledDataset, report: Report) -> None:
     """Write the report to stdout: two tables, then one line per note and per problem."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
-    console.print(f"{dataset.name} ({dataset.layout} layout): {dataset.root}", soft_wrap=True)
+    console.print(f"{dataset.name} ({layout_of(dataset).title}): {dataset.root}", soft_wrap=True)
     if report.splits:
         console.print(split_table(report.splits))
-        console.print(class_table(report.splits, (*dataset.classes, "ignored")))
+        labelled = tuple(split for split in report.splits if split.pixels.any())
+        console.print(class_table(labelled, (*dataset.classes, "ignored")))
     for kind, lines in (("note", report.notes), ("problem", report.problems)):
         for line in lines:
             console.print(f"{kind}: {line}", soft_wrap=True, markup=False, highlight=False)
@@ -60,11 +57,12 @@ def print_report(dataset: MFNet, report: Report) -> None:
 
 def split_table(splits: tuple[SplitReport, ...]) -> Table:
     """Numbers of names and sizes, one row per split."""
-    table = Table("split", "names", "read", "day", "night", "mirrored", "sizes")
+    table = Table("split", "names", "read", "day", "night", "mirrored", "unlabelled", "sizes")
     for split in splits:
         numbers = (split.num_names, split.num_read, split.num_day, split.num_night)
         sizes = ", ".join(f"{h}x{w} ({count})" for (h, w), count in sorted(split.sizes.items()))
-        table.add_row(split.split, *map(str, (*numbers, split.num_flipped)), sizes)
+        others = (split.num_flipped, split.num_unlabelled)
+        table.add_row(split.split, *map(str, (*numbers, *others)), sizes)
     return table
 
 

@@ -1,4 +1,4 @@
-"""Decoding of PNG files into RGB, thermal and label arrays, refusing what would be misread.
+"""Decoding of files into RGB, thermal and label arrays, refusing what would be misread.
 
 OpenCV only decodes here. It drops a fourth channel unless told otherwise and returns B, G, R; the
 thermal image lies in the alpha slot, so that nothing may treat the four channels as one image.
@@ -6,7 +6,9 @@ thermal image lies in the alpha slot, so that nothing may treat the four channel
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from rgbt.checks import InputError
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
+Counts = NDArray[np.uint16]
 
 
 def read_packed(path: Path) -> tuple[Array, Array]:
@@ -41,13 +44,43 @@ def read_channels(rgb_path: Path, thermal_path: Path) -> tuple[Array, Array]:
     Raises:
         InputError: missing, not decodable, not 8 bit, or other channels.
     """
-    rgb = _decode(rgb_path)
+    advice = "dataset.layout=packed reads images with thermal as fourth channel"
+    return read_rgb(rgb_path, advice), _read_thermal(thermal_path)
+
+
+def read_rgb(path: Path, advice: str = "use the original file") -> Array:
+    """RGB (H, W, 3) uint8 of a file of three channels; `advice` says what to do with another one.
+
+    Raises:
+        InputError: missing, not decodable, not 8 bit, or other channels.
+    """
+    rgb = _decode(path)
     if _channels(rgb) != 3:
         raise InputError(
-            f"{rgb_path}: expected 3 channels (red, green, blue), got {_channels(rgb)}; "
-            "dataset.layout=packed reads images with thermal as fourth channel."
+            f"{path}: expected 3 channels (red, green, blue), got {_channels(rgb)}; {advice}."
         )
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_BGR2RGB), np.uint8), _read_thermal(thermal_path)
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_counts(path: Path) -> Counts:
+    """Counts of a thermal camera, (H, W) uint16, at their full depth.
+
+    Raises:
+        InputError: missing, not decodable, not 16 bit, or several channels.
+    """
+    counts = _decoded(path)
+    if counts.dtype != np.uint16:
+        raise InputError(
+            f"{path}: expected a thermal image of 16 bits (counts of the camera), got "
+            f"{counts.dtype}; use the original file, a converted one no longer holds the counts "
+            "that dataset.thermal_range cuts."
+        )
+    if counts.ndim != 2:
+        raise InputError(
+            f"{path}: expected a thermal image of one channel, got {counts.shape[2]}; use the "
+            "original file."
+        )
+    return np.asarray(counts, np.uint16)
 
 
 def read_label(path: Path, num_classes: int) -> Array:
@@ -62,14 +95,43 @@ def read_label(path: Path, num_classes: int) -> Array:
             f"{path}: expected one channel of class indices, got {_channels(label)} channels; "
             "save the indices themselves, not their colours."
         )
-    wrong = (label >= num_classes) & (label != IGNORE)
+    _check_values(label, num_classes, path)
+    return label
+
+
+def read_label_array(path: Path, num_classes: int) -> Array:
+    """Class indices of a `.npy` file, as `read_label`.
+
+    Raises:
+        InputError: missing, no array of whole numbers (H, W), or a value that is no class.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} is missing.")
+    try:
+        label = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path} cannot be read as an array ({error}): the file is damaged or none; replace "
+            "it, or use data.on_error=skip to leave it out."
+        ) from error
+    if not isinstance(label, np.ndarray) or label.dtype.kind not in "iu" or label.ndim != 2:
+        what = f"{label.shape} {label.dtype}" if isinstance(label, np.ndarray) else "several arrays"
+        raise InputError(
+            f"{path}: expected class indices, whole numbers of shape (rows, columns), got {what}; "
+            "use the original file."
+        )
+    _check_values(label, num_classes, path)
+    return label.astype(np.uint8)
+
+
+def _check_values(label: NDArray[Any], num_classes: int, path: Path) -> None:
+    wrong = ((label < 0) | (label >= num_classes)) & (label != IGNORE)
     if wrong.any():
         values = ", ".join(str(value) for value in np.unique(label[wrong])[:8])
         raise InputError(
             f"{path}: label value {values} is out of range; expected 0 to {num_classes - 1}, or "
             f"{IGNORE} to ignore a pixel."
         )
-    return label
 
 
 def _read_thermal(path: Path) -> Array:
@@ -86,6 +148,14 @@ def _read_thermal(path: Path) -> Array:
 
 
 def _decode(path: Path) -> Array:
+    image = _decoded(path)
+    if image.dtype != np.uint8:
+        raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
+    return np.asarray(image, np.uint8)
+
+
+def _decoded(path: Path) -> NDArray[Any]:
+    """The file as it lies: unchanged means at any depth and with every channel."""
     if not path.is_file():
         copies = (
             "; the list names a mirrored copy: write it, or point dataset.splits to a list without "
@@ -98,9 +168,7 @@ def _decode(path: Path) -> Array:
             f"{path} cannot be decoded, the file is damaged or no image; replace it, or use "
             "data.on_error=skip to leave it out."
         )
-    if image.dtype != np.uint8:
-        raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
-    return np.asarray(image, np.uint8)
+    return np.asarray(image)
 
 
 def _channels(image: Array) -> int:

@@ -65,6 +65,9 @@ class MFNet:
         InputError: no such root, no known layout, numbers of classes, names and colours differ.
     """
 
+    unscored: tuple[str, ...] = ()
+    """Every class counts in the means, as in the published tables."""
+
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         root: str,
@@ -96,6 +99,10 @@ class MFNet:
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
 
+    def has(self, split: str) -> bool:
+        """Whether the list of `split` is there; InputError where the split is unknown."""
+        return self.list_path(split).is_file()
+
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in the order of its list.
 
@@ -116,7 +123,7 @@ class MFNet:
             InputError: a file is missing, cannot be decoded, has other channels, bits or size than
                 expected, or the label holds a value that is neither a class nor 255.
         """
-        label = read_label(self.label_path(name), self.num_classes)
+        label = self.label(name)
         rgb, thermal = self._read_images(name)
         if rgb.shape[:2] != label.shape:
             raise InputError(
@@ -125,6 +132,10 @@ class MFNet:
                 f"{self.label_path(name)}."
             )
         return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+
+    def label(self, name: str) -> NDArray[np.uint8]:
+        """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
+        return read_label(self.label_path(name), self.num_classes)
 
     def is_night(self, name: str) -> bool:
         """Whether the letter before the ending says night (N) and not day (D).

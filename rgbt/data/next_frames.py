@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
+from rgbt.data.dataset import LabelledDataset
 from rgbt.data.mfnet import MFNet
 
 FOLDER = "next"
@@ -26,16 +27,22 @@ class NextFrames:
     """The second frames of a data set, and where their points were in the first.
 
     Args:
-        first: the data set of the first frames.
+        first: the data set of the first frames, in MFNet's layout.
 
     Attributes:
         dataset: reader of the second frames.
 
     Raises:
-        InputError: the data set has no second frames.
+        InputError: the data set has no second frames, or another layout.
     """
 
-    def __init__(self, first: MFNet) -> None:
+    def __init__(self, first: LabelledDataset) -> None:
+        if not isinstance(first, MFNet):
+            raise InputError(
+                f"{first.name} ({first.root}) cannot hold second frames: they are read in MFNet's "
+                "layout alone; choose dataset=synth with dataset.ego_forward_m=0.5, and "
+                "frames=virtual needs none."
+            )
         root = first.root / FOLDER
         if not (root / "flow").is_dir():
             raise InputError(

@@ -122,8 +122,8 @@ def padded(example: Example, hw: tuple[int, int], rgb: ArrayLike, thermal: Array
         thermal: () grey level of the padding.
 
     Returns:
-        images of `hw` and dtypes of `example`; padding is 255 in the label, and where positions are
-        tracked it has that of the nearest pixel of the image.
+        images of `hw` and dtypes of `example`; padding is 255 in the label and 0 in its confidence,
+        and where positions are tracked it has that of the nearest pixel of the image.
     """
     height, width = example.label.shape
     top, left = (hw[0] - height) // 2, (hw[1] - width) // 2
@@ -135,12 +135,13 @@ def padded(example: Example, hw: tuple[int, int], rgb: ArrayLike, thermal: Array
         canvas[top : top + height, left : left + width] = values
         return canvas
 
-    position = example.position
+    position, confidence = example.position, example.confidence
     return replace(
         example,
         rgb=framed(example.rgb, rgb),
         thermal=framed(example.thermal, thermal),
         label=framed(example.label, IGNORE),
+        confidence=None if confidence is None else framed(confidence, 0.0),
         centre_yx=(example.centre_yx[0] + top, example.centre_yx[1] + left),
         position=None if position is None else np.pad(position, ((0, 0), *margins), mode="edge"),
     )

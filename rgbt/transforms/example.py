@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from rgbt.transforms.joint import View, short_edge_hw, whole_view
 from rgbt.types import IGNORE, Sample
+
+ImageResize = Callable[[View, NDArray[np.uint8], DTypeLike], NDArray[Any]]
+"""(view, image, dtype) -> the view of the image, of that dtype; such as `View.bilinear`."""
+
+LabelResize = Callable[[View, NDArray[np.uint8]], NDArray[np.uint8]]
+"""(view, label) -> the view of the label; such as `View.nearest`."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,8 @@ class Example:
             where it is not tracked.
         original_hw: size of the original image.
         name: name in the split list.
+        confidence: (H', W') float32, of the label, moved as the label is and by nearest; None
+            where labels carry none.
     """
 
     rgb: NDArray[Any]
@@ -36,6 +45,7 @@ class Example:
     position: NDArray[np.float32] | None
     original_hw: tuple[int, int]
     name: str
+    confidence: NDArray[np.float32] | None = None
 
 
 def image_hw(sample: Sample) -> tuple[int, int]:
@@ -44,16 +54,30 @@ def image_hw(sample: Sample) -> tuple[int, int]:
     return height, width
 
 
-def viewed(sample: Sample, view: View, dtype: DTypeLike, *, track_position: bool) -> Example:
-    """RGB, thermal and label of a sample through one view; without a label, all are ignored.
+def viewed(  # noqa: PLR0913 - three of one kind
+    sample: Sample,
+    view: View,
+    dtype: DTypeLike,
+    *,
+    track_position: bool,
+    of_image: ImageResize = View.bilinear,
+    of_label: LabelResize = View.nearest,
+) -> Example:
+    """RGB, thermal, label and confidence of a sample through one view; no label: all ignored.
 
     Args:
         sample: as it lies on disk.
         view: of images of its size.
         dtype: of the images: uint8, rounded, or float32.
         track_position: whether the example carries the map of source positions.
+        of_image: how RGB and thermal are resized.
+        of_label: how the label is resized.
     """
-    return _example(sample, view, dtype, view.nearest(_label(sample)), track_position)
+    confidence = None if sample.confidence is None else view.nearest(sample.confidence)
+    images = of_image(view, sample.rgb, dtype), of_image(view, sample.thermal, dtype)
+    return _example(
+        sample, view, images, of_label(view, _label(sample)), confidence, track_position
+    )
 
 
 def evaluated(
@@ -63,6 +87,7 @@ def evaluated(
     dtype: DTypeLike,
     *,
     track_position: bool,
+    of_image: ImageResize = View.bilinear,
 ) -> Example:
     """The whole images of a sample, resized where that is asked for; the label as it is.
 
@@ -72,30 +97,34 @@ def evaluated(
         max_size: limit of their long edge in pixels (see `short_edge_hw`).
         dtype: see `viewed`.
         track_position: see `viewed`.
+        of_image: how RGB and thermal are resized.
     """
     source_hw = image_hw(sample)
     resized_hw = source_hw
     if short_edge is not None:
         resized_hw = short_edge_hw(source_hw, short_edge, max_size)
     view = whole_view(source_hw, resized_hw)
-    return _example(sample, view, dtype, _label(sample), track_position)
+    images = of_image(view, sample.rgb, dtype), of_image(view, sample.thermal, dtype)
+    return _example(sample, view, images, _label(sample), sample.confidence, track_position)
 
 
 def _example(
     sample: Sample,
     view: View,
-    dtype: DTypeLike,
+    images: tuple[NDArray[Any], NDArray[Any]],
     label: NDArray[np.uint8],
+    confidence: NDArray[np.float32] | None,
     track_position: bool,
 ) -> Example:
     return Example(
-        rgb=view.bilinear(sample.rgb, dtype),
-        thermal=view.bilinear(sample.thermal, dtype),
+        rgb=images[0],
+        thermal=images[1],
         label=label,
         centre_yx=view.centre_yx(),
         position=view.position() if track_position else None,
         original_hw=view.source_hw,
         name=sample.name,
+        confidence=confidence,
     )
 
 

@@ -138,7 +138,10 @@ class VirtualView:
         return rectangle
 
     def batch(self, batch: Batch, warp: Warp) -> Batch:
-        """The frames as seen from the view: images bilinear, labels and positions nearest.
+        """The frames as seen from the view: images bilinear, the other maps nearest.
+
+        What the first frame does not show has the confidence 1 where it is trained on as
+        background.
 
         Networks that divide thermal by its own maximum do so for the view again. The release
         divides before the view is made, so that its second frame is the darker by what the view
@@ -152,7 +155,8 @@ class VirtualView:
         levels = BYTE if self.resampling == "twice" else None
         images = warp.bilinear(torch.cat([batch.rgb, batch.thermal], 1), levels)
         of_label = warp.resized((batch.label.shape[1], batch.label.shape[2]))
-        position = batch.position
+        position, confidence = batch.position, batch.confidence
+        sure = float(self.outside_label != IGNORE)
         return replace(
             batch,
             rgb=images[:, :3],
@@ -160,6 +164,7 @@ class VirtualView:
             label=of_label.nearest(batch.label, self.outside_label),
             centre_yx=warp.moved(batch.centre_yx),
             position=None if position is None else warp.nearest(position, 0),
+            confidence=None if confidence is None else of_label.nearest(confidence, sure),
         )
 
     def valid(self, warp: Warp) -> Tensor:

@@ -14,7 +14,7 @@ from rgbt.data.batches import collate
 from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.transforms.crm import CrmTransform
-from rgbt.types import Batch
+from rgbt.types import Batch, Sample
 
 NAMES = [f"{number:05d}{'DN'[number % 2]}" for number in range(1, 11)]
 
@@ -264,6 +264,30 @@ def test_collate_stacks_in_order(dataset: MFNet) -> None:
     np.testing.assert_array_equal(batch.thermal[1, 0].numpy(), examples[1].thermal)
     # The centre of a whole image is its own centre pixel.
     assert batch.centre_yx.tolist() == [[12, 16], [12, 16]]
+
+
+def confident(sample: Sample, value: float | None) -> Sample:
+    assert sample.label is not None
+    full = None if value is None else np.full(sample.label.shape, value, np.float32)
+    return dataclasses.replace(sample, confidence=full)
+
+
+def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
+    first, second = (dataset.read(name) for name in NAMES[:2])
+
+    def batch(*values: float | None) -> Batch:
+        pairs = zip((first, second), values, strict=True)
+        return collate([crm().test(confident(sample, value)) for sample, value in pairs])
+
+    found = batch(0.25, 0.75).confidence
+    assert found is not None
+    assert found.dtype == torch.float32
+    assert found.shape == batch(0.25, 0.75).label.shape
+    assert found.flatten(1).unique(dim=1).tolist() == [[0.25], [0.75]]
+    assert batch(None, None).confidence is None
+    message = f"those of '{NAMES[1]}' do and those of '{NAMES[0]}' do not"
+    with pytest.raises(InputError, match=message):
+        batch(None, 0.75)
 
 
 @pytest.mark.gpu

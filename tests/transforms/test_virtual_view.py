@@ -15,7 +15,7 @@ from rgbt.checks import InputError
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp
 from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import Batch
+from rgbt.types import IGNORE, Batch
 
 CAMERA = Camera(
     fx=702.6030497884977, fy=703.4541726858521, cx=320.0, cy=240.0, height=480, width=640
@@ -238,6 +238,22 @@ def test_what_the_first_frame_does_not_show(outside: str, label: int) -> None:
     assert not found.rgb.movedim(1, -1)[~inside].any()
     assert not found.thermal.movedim(1, -1)[~inside].any()
     assert torch.equal(view.valid(warp), inside if label == 255 else torch.ones_like(inside))
+
+
+@pytest.mark.parametrize("label_hw", [HW, (2 * HW[0], 2 * HW[1])])
+@pytest.mark.parametrize(("outside", "confidence"), [("ignore", 0.0), ("background", 1.0)])
+def test_confidences_move_with_their_labels(
+    outside: str, confidence: float, label_hw: tuple[int, int]
+) -> None:
+    view = paper(mode="rotation", outside=outside)
+    batch = scene(label_hw=label_hw)
+    batch = replace(batch, confidence=batch.label / 16)
+    found = view.batch(batch, view.warp(angles((10, 0, 0)), HW))
+    assert found.confidence is not None
+    inside = (found.label > 0) & (found.label < IGNORE)
+    assert torch.equal(found.confidence[inside], found.label[inside] / 16)
+    assert (found.confidence[~inside] == confidence).all()
+    assert not inside.all()
 
 
 def test_positions_say_where_a_pixel_was() -> None:

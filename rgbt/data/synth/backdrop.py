@@ -115,7 +115,7 @@ def utility_pole() -> Shape:
             Part(upright(rectangle(-0.15, 0.0, 0.15, 9.0)), "pole", thin=True),
             Part(upright(rectangle(-0.9, 8.2, 0.9, 8.34), -0.01), "pole", thin=True),
             Part(upright(rectangle(-0.7, 7.4, 0.7, 7.52), -0.01), "pole", thin=True),
-            Part(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "vent", thin=True),
+            Part(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "transformer", thin=True),
         ]
     )
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
+from rgbt.data.synth.cache import default_cache, written_once
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.writer import Plan, write
 
@@ -116,47 +115,14 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     return MFNet(str(folder), name="synth", num_classes=num_classes)
 
 
-def default_cache() -> Path:
-    """$XDG_CACHE_HOME/rgbt, or ~/.cache/rgbt where that is not set."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "rgbt"
-
-
 def cached(plan: Plan, cache: Path) -> Path:
     """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
-
-    It is written under another name and renamed when complete, so that an interrupted generation
-    leaves nothing that looks like a data set, and two at once cannot mix.
 
     Raises:
         InputError: the cache cannot be written.
     """
     folder = cache / f"synth-{plan_key(plan)}"
-    if folder.is_dir():
-        return folder
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".synth-", dir=cache) as scratch:
-            made = Path(scratch) / "made"
-            made.mkdir()
-            write(plan, made)
-            (made / "plan.json").write_text(_described(plan) + "\n", encoding="utf-8")
-            _publish(made, folder)
-    except OSError as error:
-        raise InputError(
-            f"dataset.cache_dir: cannot write {folder} ({error.strerror or error}); "
-            "name a folder that can be written."
-        ) from error
-    return folder
-
-
-def _publish(made: Path, folder: Path) -> None:
-    try:
-        made.rename(folder)
-    except OSError:
-        # Another process was first; equal plans give equal files, so its folder is as good.
-        if not folder.is_dir():
-            raise
+    return written_once(folder, _described(plan), lambda made: write(plan, made))
 
 
 def plan_key(plan: Plan) -> str:

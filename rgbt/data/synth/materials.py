@@ -94,6 +94,8 @@ MATERIALS: dict[str, Material] = {
     "rail_light": Material((0.80, 0.81, 0.82), 5, -4, rgb_texture=0.06),
     "rail_dark": Material((0.46, 0.48, 0.52), 4, -4, rgb_texture=0.06),
     "rail_mesh": Material((0.30, 0.34, 0.36), 3, -2, rgb_texture=0.25),
+    # last, so that all above keep their numbers
+    "transformer": Material((0.45, 0.45, 0.45), 15, 18),
 }
 """Name -> material. The sky comes first: index 0 is what is seen where nothing is drawn."""
 

@@ -32,6 +32,8 @@ class Scene:
         thermal: (H, W) uint8.
         label: (H, W) uint8, MFNet's class ids 0..8.
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
+        grey: (H, W) float32, `thermal` before it became bytes: 1 = full scale, and not clipped.
+        material: (H, W) index into `MATERIALS` of what each pixel shows.
         is_night: whether it is night.
         camera: where the frame was taken from.
     """
@@ -40,6 +42,8 @@ class Scene:
     thermal: NDArray[np.uint8]
     label: NDArray[np.uint8]
     depth: Floats
+    grey: Floats
+    material: NDArray[np.intp]
     is_night: bool
     camera: Camera
 
@@ -121,11 +125,14 @@ def _frame(
     heat = thermal.render_thermal(surface, light, strength)
     rgb_noise = numpy_generator(seed, "synth/rgb_noise", index, frame)
     thermal_noise = numpy_generator(seed, "synth/thermal_noise", index, frame)
+    grey = thermal.develop(heat, factors, seed, index, thermal_noise)
     return Scene(
         rgb=rgb.develop(image, factors, rgb_noise),
-        thermal=thermal.develop(heat, factors, seed, index, thermal_noise),
+        thermal=rgb.eight_bits(grey.copy()),
         label=np.take(np.concatenate([[0], facets.label]).astype(np.uint8), drawing.ids),
         depth=surface.depth,
+        grey=grey,
+        material=surface.material,
         is_night=light.is_night,
         camera=camera,
     )

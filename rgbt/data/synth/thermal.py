@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rgbt.data.synth import materials
 from rgbt.data.synth.camera import Floats
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.light import Light
 from rgbt.data.synth.raster import average
-from rgbt.data.synth.rgb import eight_bits
 from rgbt.data.synth.surface import Surface
 from rgbt.randomness import numpy_generator
 
@@ -70,8 +68,8 @@ def _facet_degrees(surface: Surface, light: Light) -> Floats:
 
 def develop(
     heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Contrast, lens, drift, noise and eight bits.
+) -> Floats:
+    """Contrast, lens, drift and noise.
 
     The noise has three parts of the same strength factor: per pixel, per column, and smeared over
     neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
@@ -85,7 +83,7 @@ def develop(
         generator: of the noise of this frame.
 
     Returns:
-        (H, W) uint8.
+        (H, W) float32 grey levels, 1 = full scale; some lie below 0 or above 1.
     """
     height, width = heat.shape
     drift = numpy_generator(seed, "synth/drift", index)
@@ -100,7 +98,7 @@ def develop(
         generator.standard_normal(width, np.float32),
     )
     grey += factors.thermal_noise * (0.75 * pixel + 0.35 * column + 1.4 * _blurred(pixel))
-    return eight_bits(grey)
+    return np.asarray(grey, np.float32)
 
 
 def _blurred(image: Floats) -> Floats:

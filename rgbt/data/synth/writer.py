@@ -88,8 +88,8 @@ def write(plan: Plan, folder: Path) -> None:
     for root in roots:
         for sub in ("images", "labels", *(["flow"] if root != folder else [])):
             (root / sub).mkdir(parents=True)
-    with _advancing(plan.num_scenes) as advance:
-        for _ in _for_each(partial(write_index, plan, folder), range(plan.num_scenes)):
+    with advancing(plan.num_scenes) as advance:
+        for _ in for_each(partial(write_index, plan, folder), range(plan.num_scenes)):
             advance()
     for root in roots:
         _write_lists(plan, root)
@@ -126,16 +126,17 @@ def write_index(plan: Plan, folder: Path, index: int) -> None:
 def _write_scene(scene: Scene, root: Path, name: str) -> None:
     # OpenCV stores its first three channels as B, G, R; the fourth, alpha, is thermal.
     packed = np.dstack([scene.rgb[..., ::-1], scene.thermal])
-    _write_png(root / "images" / f"{name}.png", packed)
-    _write_png(root / "labels" / f"{name}.png", scene.label)
+    write_png(root / "images" / f"{name}.png", packed)
+    write_png(root / "labels" / f"{name}.png", scene.label)
 
 
-def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write an image as it is (OpenCV's order of channels), compressed for speed."""
     _, encoded = cv2.imencode(".png", image, _FAST_PNG)
     path.write_bytes(encoded.tobytes())
 
 
-def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
+def for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
     """``work(index)`` for every index, on all cores where there are many."""
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if len(indices) < _WORTH_A_POOL or cores == 1:
@@ -148,7 +149,7 @@ def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
 
 
 @contextmanager
-def _advancing(total: int) -> Iterator[partial[None]]:
+def advancing(total: int) -> Iterator[partial[None]]:
     """A progress bar on stderr, gone when done; none for what takes less than about a second."""
     hidden = total < _WORTH_A_BAR
     with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:

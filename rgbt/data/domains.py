@@ -1,0 +1,158 @@
+"""Which images a run is trained on: one domain, or a labelled source and a target to adapt to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rgbt.checks import InputError
+from rgbt.types import View
+
+GIVEN, NONE = "given", "none"
+
+TestedHead = Literal["own", "source", "target"]
+"""Which head predicts an image: that of its domain, or one domain's for all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domain:
+    """One domain: its training images, how they are seen, whose labels they have.
+
+    Attributes:
+        split: of the data set.
+        view: what the network sees of a pair; null leaves it to the network.
+        head: the network's head for this domain; null where it has one for all.
+        labels: "given", those of the data set; "none", none at all, whatever the data set has; or a
+            folder that `python -m rgbt.predict ... pseudo_labels=true` wrote.
+            "experiment:NAME/best.pt" predicts them with that checkpoint of the run of the
+            experiment NAME, with the same seed and on the same data, which is trained first.
+        teacher_view: what the network of "experiment:..." sees; null for all else, and where it
+            is left to that network.
+        threshold: least confidence of a pixel that keeps its label of "experiment:..."; 0 for all
+            else.
+        confidence: whether pixels count in the loss as much as their label is sure; needs
+            pseudo-labels.
+
+    Raises:
+        InputError: a setting that has no effect with these labels.
+    """
+
+    split: str
+    view: View | None
+    head: str | None
+    labels: str
+    teacher_view: View | None = None
+    threshold: float = 0.0
+    confidence: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.threshold < 1:
+            raise InputError(
+                f"domains: threshold must lie in [0, 1), got {self.threshold:g}; 0 keeps every "
+                "pseudo-label."
+            )
+        predicts = self.labels.startswith("experiment:")
+        if not predicts and (self.threshold or self.teacher_view is not None):
+            raise InputError(
+                f"domains: threshold and teacher_view are for labels=experiment:..., with labels="
+                f"{self.labels} they have no effect; leave them away."
+            )
+        if self.confidence and self.labels in (GIVEN, NONE):
+            raise InputError(
+                f"domains: confidence=true needs pseudo-labels, but labels={self.labels} carry no "
+                "confidence; name a folder that python -m rgbt.predict ... pseudo_labels=true "
+                "wrote, or set confidence=false."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domains:
+    """The domains of a run, and which head predicts which image in evaluation.
+
+    Attributes:
+        source: labelled.
+        target: null for ordinary training on the source alone.
+        target_is: which images belong to the target domain: those seen in the target's view
+            ("view": RGB to thermal), or those of the night ("night": day to night); null without
+            heads of their own.
+        tested_head: the head that predicts an image in evaluation: "own", that of its domain, or
+            "source", one head for all. The thesis' day-to-night scripts score the night images
+            with the head for the day ("source").
+
+    Raises:
+        InputError: heads that cannot be told apart, or settings without effect.
+    """
+
+    source: Domain
+    target: Domain | None
+    target_is: Literal["view", "night"] | None
+    tested_head: Literal["own", "source"]
+
+    def __post_init__(self) -> None:
+        heads = self.heads
+        if self.target is not None and len(heads) == 1 and None in self._own_heads():
+            raise InputError(
+                "domains: source and target need a head each, or none; got "
+                f"{self.source.head or 'null'} and {self.target.head or 'null'}."
+            )
+        if (self.target_is is not None) != (len(heads) == 2):
+            raise InputError(
+                f"domains.target_is={self.target_is or 'null'} with {len(heads)} heads: it says "
+                "which of two heads predicts an image; give it with two, and null otherwise."
+            )
+        if self.tested_head == "source" and len(heads) < 2:
+            raise InputError(
+                "domains.tested_head=source chooses between two heads, but there are "
+                f"{len(heads)}; leave it at own."
+            )
+
+    @property
+    def named(self) -> dict[str, Domain]:
+        """The domains by name: "source" and, where there is one, "target"."""
+        both = {"source": self.source, "target": self.target}
+        return {name: domain for name, domain in both.items() if domain is not None}
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Names of the heads, the source's first; () where the network has one for all."""
+        return tuple(dict.fromkeys(head for head in self._own_heads() if head is not None))
+
+    def head_of(self, view: View, night: bool | None, asked: TestedHead) -> str | None:
+        """The head that predicts an image.
+
+        Args:
+            view: what the network sees of it.
+            night: whether it was taken at night; None where the data set does not say.
+            asked: "own", or the domain whose head shall predict all images.
+
+        Returns:
+            its name; None where the network has one head for all.
+
+        Raises:
+            InputError: a choice between heads that there are not; no head can be chosen because
+                the data set does not tell night from day.
+        """
+        heads = self.heads
+        if len(heads) < 2:
+            if asked != "own":
+                raise InputError(
+                    f"head={asked} chooses between the heads of two domains, but this run has one "
+                    "for all images; leave it away."
+                )
+            return heads[0] if heads else None
+        if asked == "own":
+            asked = self._domain_of(view, night)
+        return self.named[asked].head
+
+    def _domain_of(self, view: View, night: bool | None) -> TestedHead:
+        if self.target_is == "view":
+            return "target" if view == self.named["target"].view else "source"
+        if night is None:
+            raise InputError(
+                "domains.target_is=night: the data set does not say which images were taken at "
+                "night, so that no head can be chosen; say head=source or head=target."
+            )
+        return "target" if night else "source"
+
+    def _own_heads(self) -> tuple[str | None, ...]:
+        return tuple(domain.head for domain in self.named.values())

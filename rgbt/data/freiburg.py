@@ -1,0 +1,355 @@
+"""Freiburg Thermal: labelled days and unlabelled nights for training, both labelled for testing.
+
+A reader only: it cuts the frame, maps counts of the thermal camera to grey and brings labels to the
+size of the frame, each as the configuration says, and refuses what it cannot read exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, check_choice, nearest
+from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb
+from rgbt.data.freiburg_layout import Frame, find_frames, inside
+from rgbt.types import IGNORE, Sample
+
+CLASSES = (
+    *("road", "sidewalk", "building", "curb", "fence", "pole", "vegetation", "terrain", "sky"),
+    *("person", "car", "bicycle", "background", "ignore"),
+)
+PALETTE = (
+    *((128, 64, 128), (244, 35, 232), (70, 70, 70), (196, 196, 196), (190, 153, 153)),
+    *((153, 153, 153), (107, 142, 35), (152, 251, 152), (70, 130, 180), (220, 20, 60)),
+    *((0, 0, 142), (119, 11, 32), (138, 43, 226), (0, 0, 0)),
+)
+SPLITS = {
+    "train": "train/seq_*_day/*/fl_rgb/fl_rgb_*.png",
+    "train_day": "train/seq_*_day/*/fl_rgb/fl_rgb_*.png",
+    "train_night": "train/seq_*_night/*/fl_rgb/fl_rgb_*.png",
+    "val": "train/seq_*_day/*/fl_rgb/fl_rgb_*.png of dataset.val_sequences",
+    "test": "test/*/ImagesRGB/*_rgb.png",
+    "test_day": "test/day/ImagesRGB/*_rgb.png",
+    "test_night": "test/night/ImagesRGB/*_rgb.png",
+}
+CROP = (5, 645, 360, 1640)
+THERMAL_RANGE = (21800, 23700)
+
+MOST_STRETCH = 0.02
+"""How far the aspect of a label may be from that of its frame: what rounding a size leaves."""
+
+Array = NDArray[np.uint8]
+Pixel = TypeVar("Pixel", np.uint8, np.uint16)
+
+
+class Freiburg:
+    """RGB-thermal street scenes of Freiburg as their archives lay them out.
+
+    Layout (XX and YY are digits; sec and nsec are seconds and nanoseconds):
+        train/seq_XX_{day|night}/YY/fl_rgb/fl_rgb_<sec>_<nsec>.png               8 bit, RGB
+                                    fl_ir_aligned/fl_ir_aligned_<sec>_<nsec>.png   16 bit, counts
+                                    fl_rgb_labels/fl_rgb_labels_<sec>_<nsec>.png   8 bit, by day
+        test/{day|night}/ImagesRGB/*_rgb.png   ImagesIR/*_ir.png   SegmentationClass/*.npy
+
+    Splits: "train_day", "train_night", and "train", which is "train_day": what is trained on where
+    no domains are named; "val", day sequences that are taken out of "train_day"; "test_day",
+    "test_night", and "test", the day followed by the night. Training frames at night have no
+    labels. Those by day, and so those of "val", carry predictions of an RGB network that was
+    trained on Mapillary Vistas; only the test part is labelled by hand.
+
+    Thermal counts c become grey levels of eight bits, round(255 (min(max(c, low), high) - low) /
+    (high - low)), halves upwards; a level is 7.5 counts wide with the thesis' range. The thesis
+    (Eq. 7) and HeatNet compute the same in real numbers from 0 to 1; the code of the thesis stores
+    it with eight bits as well.
+
+    Source: HeatNet (Vertens et al., IROS 2020); crop and range: J. Sun, "Semantic segmentation
+    using thermal images" (TU Eindhoven, 2022) and its code.
+
+    Args:
+        root: folder that holds `train`, `test` or both.
+        name: what the data set is called in messages and tables.
+        num_classes: number of classes; other nodes of the configuration interpolate it.
+        classes: their names, in order of the class index.
+        palette: their (red, green, blue) colours, 0..255.
+        unscored: classes that are counted but left out of every mean over classes.
+        crop: first row, row after the last, first column, column after the last of what is cut out
+            of every frame and label; None keeps whole frames.
+        thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
+            [21800, 25000] in the HeatNet release.
+        ignored_test: classes whose pixels do not count in "val" and "test" (they become 255):
+            "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
+        val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
+            "val".
+
+    Raises:
+        InputError: no such root, neither part in it, a crop, range or class that cannot be, or
+            numbers of classes, names and colours that differ.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        root: str,
+        *,
+        name: str = "freiburg",
+        num_classes: int = len(CLASSES),
+        classes: tuple[str, ...] = CLASSES,
+        palette: tuple[tuple[int, int, int], ...] = PALETTE,
+        unscored: tuple[str, ...] = ("background", "ignore"),
+        crop: tuple[int, int, int, int] | None = CROP,
+        thermal_range: tuple[int, int] = THERMAL_RANGE,
+        ignored_test: tuple[str, ...] = ("ignore",),
+        val_sequences: tuple[str, ...] = ("seq_04_day",),
+    ) -> None:
+        self.root = Path(root).expanduser()
+        self.name = name
+        self.num_classes = num_classes
+        self.classes = classes
+        self.palette = palette
+        self.unscored = unscored
+        self.crop = crop
+        self.thermal_range = thermal_range
+        self.ignored_test = ignored_test
+        self.val_sequences = val_sequences
+        self.splits = SPLITS
+        self._split_frames: dict[str, tuple[Frame, ...]] = {}
+        _check_root(self.root, root)
+        for key, length in (("classes", len(classes)), ("palette", len(palette))):
+            if length != num_classes:
+                raise InputError(
+                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                    "make them agree."
+                )
+        for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
+            for word in chosen:
+                check_choice(f"dataset.{key}", word, classes)
+        _check_numbers(crop, thermal_range)
+
+    def has(self, split: str) -> bool:
+        """Whether there are frames of `split`; InputError where the split is unknown."""
+        return bool(self._of(split))
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, sorted by folder and file, the day before the night.
+
+        Raises:
+            InputError: unknown split, no frame of it, a sequence for "val" that is not there.
+        """
+        frames = self._of(split)
+        if split in ("train", "train_day", "val"):
+            self._check_sequences()
+        if not frames:
+            raise InputError(self._why_empty(split))
+        return tuple(frame.name for frame in frames)
+
+    def read(self, name: str) -> Sample:
+        """The frame called `name`, decoded, cut, thermal as grey levels.
+
+        Returns:
+            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8; the label is None
+            for training frames at night.
+
+        Raises:
+            InputError: no such name, a file is missing, cannot be decoded, has other channels, bits
+                or size than expected, the label holds a value that is no class, or the frame is
+                smaller than the crop.
+        """
+        frame = self.frame(name)
+        rgb, thermal = read_rgb(frame.rgb), self._thermal(frame)
+        if rgb.shape[:2] != thermal.shape:
+            raise InputError(
+                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but thermal is "
+                f"{thermal.shape[0]}x{thermal.shape[1]}; both must have one size, see "
+                f"{frame.thermal}."
+            )
+        label = None if frame.label is None else self._label(frame, thermal.shape)
+        grey = np.take(_grey_levels(*self.thermal_range), self._cut(thermal, name))
+        return Sample(
+            rgb=np.ascontiguousarray(self._cut(rgb, name)),
+            thermal=grey,
+            label=None if label is None else np.ascontiguousarray(self._cut(label, name)),
+            name=name,
+        )
+
+    def label(self, name: str) -> Array | None:
+        """The label of `read` alone; the frame is read as well, for its size."""
+        return self.read(name).label
+
+    def counts(self, name: str) -> NDArray[np.uint16]:
+        """Counts of the thermal camera, (H, W) uint16, cut as in `read`; InputError as there."""
+        return self._cut(self._thermal(self.frame(name)), name)
+
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
+        """Whether each frame lies in a folder that says night; InputError where there is none."""
+        return tuple(self.frame(name).night for name in names)
+
+    def fingerprint(self) -> str:
+        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+
+        What labels look like belongs to it (crop, `ignored_test`). Nothing is decoded and the root
+        is left out, so that equal copies have equal fingerprints; files that are missing count as
+        such.
+        """
+        digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
+        for split in sorted(self.splits):
+            names = [frame.name for frame in self._of(split)]
+            digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
+        for name, frame in self._frames.items():
+            paths = [path for path in (frame.rgb, frame.thermal, frame.label) if path is not None]
+            sizes = [_size(path) for path in paths]
+            digest.update(f"{name} {sizes}\n".encode())
+        return digest.hexdigest()
+
+    def frame(self, name: str) -> Frame:
+        """The files of `name`; InputError where there is no such frame."""
+        if name not in self._frames:
+            raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
+        return self._frames[name]
+
+    @cached_property
+    def frames(self) -> tuple[Frame, ...]:
+        """Every frame, listed once: later changes of the folder are not seen."""
+        return find_frames(self.root)
+
+    @cached_property
+    def _frames(self) -> dict[str, Frame]:
+        return {frame.name: frame for frame in self.frames}
+
+    def _of(self, split: str) -> tuple[Frame, ...]:
+        if split not in self._split_frames:
+            self._split_frames[split] = self._select(split)
+        return self._split_frames[split]
+
+    def _select(self, split: str) -> tuple[Frame, ...]:
+        if split not in self.splits:
+            raise InputError(
+                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
+            )
+        place, _, time = split.partition("_")
+        time = time or ("day" if place in ("train", "val") else "")
+        return tuple(
+            frame
+            for frame in self.frames
+            if self._place(frame) == place and time in ("", "night" if frame.night else "day")
+        )
+
+    def _place(self, frame: Frame) -> str:
+        if frame.is_test:
+            return "test"
+        held_out = not frame.night and not set(frame.sequences).isdisjoint(self.val_sequences)
+        return "val" if held_out else "train"
+
+    def _check_sequences(self) -> None:
+        by_day = [frame for frame in self.frames if not (frame.is_test or frame.night)]
+        known = {word for frame in by_day for word in frame.sequences}
+        for word in self.val_sequences:
+            if by_day and word not in known:
+                raise InputError(
+                    f"dataset.val_sequences: there is no day sequence '{word}' in {self.root}; "
+                    f"{nearest(word, {sequence for sequence in known if '/' not in sequence})}."
+                )
+
+    def _why_empty(self, split: str) -> str:
+        hint = f"unpack the archive '{split.partition('_')[0]}' there"
+        if split == "val":
+            hint = f"it is {list(self.val_sequences)}, name day sequences that are there"
+        elif split in ("train", "train_day") and self.has("val"):
+            hint = "every day sequence is in dataset.val_sequences, leave one out of it"
+        return (
+            f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
+            f"{self.root}; {hint}."
+        )
+
+    def _thermal(self, frame: Frame) -> NDArray[np.uint16]:
+        if not frame.thermal.is_file():
+            raise InputError(
+                f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
+                "data.on_error=skip to leave the frame out."
+            )
+        return read_counts(frame.thermal)
+
+    def _label(self, frame: Frame, hw: tuple[int, ...]) -> Array:
+        """The label at the size of the frame, at the nearest pixel."""
+        assert frame.label is not None, "only frames with a label are asked for it"
+        if not frame.label.is_file():
+            raise InputError(
+                f"'{frame.name}': its label {frame.label} is missing; restore it, or use "
+                "data.on_error=skip to leave the frame out."
+            )
+        read = read_label if frame.label.suffix == ".png" else read_label_array
+        label = read(frame.label, self.num_classes)
+        if label.shape != hw:
+            aspects = [height / width for height, width in (label.shape, hw)]
+            if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
+                raise InputError(
+                    f"{frame.label} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
+                    f"{hw[0]}x{hw[1]}, which is another shape and no other size; use the label of "
+                    "the whole frame."
+                )
+            size = (hw[1], hw[0])
+            label = np.asarray(
+                cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8
+            )
+        if self._place(frame) != "train" and self.ignored_test:
+            ignored = [self.classes.index(word) for word in self.ignored_test]
+            label = np.where(np.isin(label, ignored), np.uint8(IGNORE), label)
+        return label
+
+    def _cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
+        if self.crop is None:
+            return image
+        top, bottom, left, right = self.crop
+        if bottom > image.shape[0] or right > image.shape[1]:
+            raise InputError(
+                f"'{name}': the frame is {image.shape[0]}x{image.shape[1]} pixels but "
+                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}; give "
+                "a crop inside it, or dataset.crop=null for whole frames."
+            )
+        return image[top:bottom, left:right]
+
+
+def _size(path: Path) -> int:
+    # One question to the file system per file: there are sixty thousand.
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return -1
+
+
+def _check_root(root: Path, given: str) -> None:
+    if not root.is_dir():
+        raise InputError(
+            f"dataset.root: there is no folder '{given}'; give the one that holds train and test."
+        )
+    if not any(inside(root, part).is_dir() for part in ("train", "test")):
+        raise InputError(
+            f"dataset.root: '{root}' holds neither the folder train nor test; give the folder into "
+            "which both archives were unpacked."
+        )
+
+
+def _check_numbers(crop: tuple[int, int, int, int] | None, thermal_range: tuple[int, int]) -> None:
+    if crop is not None and not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
+        raise InputError(
+            "dataset.crop: expected [first row, row after the last, first column, column after the "
+            f"last], such as {list(CROP)}, got {list(crop)}."
+        )
+    low, high = thermal_range
+    if not 0 <= low < high <= np.iinfo(np.uint16).max:
+        raise InputError(
+            f"dataset.thermal_range: expected counts 0 <= low < high <= 65535, such as "
+            f"{list(THERMAL_RANGE)}, got {[low, high]}."
+        )
+
+
+@lru_cache(maxsize=4)
+def _grey_levels(low: int, high: int) -> Array:
+    """(65536,) uint8, the grey level of every count."""
+    above = np.clip(np.arange(np.iinfo(np.uint16).max + 1), low, high) - low
+    span = high - low
+    return ((2 * 255 * above + span) // (2 * span)).astype(np.uint8)

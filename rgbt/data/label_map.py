@@ -1,0 +1,82 @@
+"""Class ids of one data set as those of another, for networks trained on other classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, check_range, nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelMap:
+    """Which class of a data set stands for each class that a network knows.
+
+    Ids are mapped after the argmax, as in the thesis: probabilities of classes that come to one
+    class are not added up, so that its confidence is that of the class that was most probable.
+
+    Attributes:
+        num_source: classes of the network, 1 to 255; their ids are 0 .. num_source - 1.
+        targets: names of the classes of the data set, in order of their ids.
+        groups: name of a target class -> ids of the classes that become it; each id stands once.
+
+    Raises:
+        InputError: a name that is no target, an id that is missing, unknown or there twice.
+    """
+
+    num_source: int
+    targets: tuple[str, ...]
+    groups: dict[str, tuple[int, ...]]
+
+    def __post_init__(self) -> None:
+        check_range("label_map.num_source", self.num_source, 1, 255)
+        for name in self.groups:
+            if name not in self.targets:
+                raise InputError(
+                    f"label_map.groups: '{name}' is no class of label_map.targets; "
+                    f"{nearest(name, self.targets)}."
+                )
+        mapped = sorted(source for group in self.groups.values() for source in group)
+        known = range(self.num_source)
+        wrong = {
+            "unknown": [source for source in mapped if source not in known],
+            "mapped twice": [a for a, b in zip(mapped, mapped[1:], strict=False) if a == b],
+            "not mapped": [source for source in known if source not in mapped],
+        }
+        for what, ids in wrong.items():
+            if ids:
+                raise InputError(
+                    f"label_map.groups: expected every id from 0 to {self.num_source - 1} once, "
+                    f"but {', '.join(map(str, dict.fromkeys(ids)))} is {what}; correct the lists."
+                )
+
+    def __call__(self, classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Ids of the data set for ids of the network, any shape, below `num_source`."""
+        table = np.empty(self.num_source, np.uint8)
+        for name, group in self.groups.items():
+            table[list(group)] = self.targets.index(name)
+        return table[classes]
+
+    def check(self, num_source: int, targets: tuple[str, ...], dataset: str) -> None:
+        """Refuse a network or a data set that this map is not about.
+
+        Args:
+            num_source: classes of the network.
+            targets: names of the classes of the data set.
+            dataset: what it is called.
+
+        Raises:
+            InputError: either differs.
+        """
+        if num_source != self.num_source:
+            raise InputError(
+                f"label_map is for a network with {self.num_source} classes, but model.num_classes "
+                f"is {num_source}; choose the label_map of the network's own classes."
+            )
+        if targets != self.targets:
+            raise InputError(
+                f"label_map leads to the classes {', '.join(self.targets)}, but {dataset} has "
+                f"{', '.join(targets)}; choose another label_map or data set."
+            )

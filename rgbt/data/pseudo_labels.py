@@ -1,0 +1,204 @@
+"""Labels that a trained network predicted, in the place of those of a data set.
+
+A folder of them (written by `rgbt.pseudo`) holds:
+
+    labels/NAME.png       8 bit, class ids of the data set, 255 where the network was not sure
+    confidence/NAME.png   16 bit, 65535 times the probability of the predicted class
+    pseudo_labels.json    who predicted what; written last, so that it stands for a whole folder
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.data.batches import Dataset
+from rgbt.data.files import read_label
+from rgbt.types import Sample
+
+FORMAT = "rgbt pseudo-labels 1"
+MANIFEST = "pseudo_labels.json"
+FULL = 65535
+"""What confidence 1 is in a file."""
+
+
+class PseudoLabels:
+    """A whole folder of pseudo-labels.
+
+    Args:
+        folder: see the module.
+
+    Attributes:
+        folder: where it lies.
+        manifest: what ``pseudo_labels.json`` says: "format", "teacher" (a run's key, or a file),
+            "weights" (SHA-256 of the teacher's parameters), "network" (SHA-256 of how it is
+            built and fed), "view", "head", "label_map" (num_source, targets, groups; None: none),
+            "threshold", "dataset", "fingerprint" (of the data set), "split", "classes" (their
+            names), "images" (how many), "skipped" (unreadable ones), "kept" (share of pixels with
+            a label), "mean_confidence" (of all pixels), "by_class" (per class: "share" of all
+            pixels, "mean_confidence" of those; None without pixels) and "digest".
+
+    Raises:
+        InputError: no such folder, or one that is not finished.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder).expanduser()
+        path = self.folder / MANIFEST
+        if not path.is_file():
+            state = "is not finished" if self.folder.is_dir() else "is not there"
+            raise InputError(
+                f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it; "
+                f"write it with python -m rgbt.predict ... out={self.folder} pseudo_labels=true."
+            )
+        try:
+            self.manifest: dict[str, Any] = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise InputError(
+                f"{path} is damaged ({error}); remove it and predict again."
+            ) from error
+        if self.manifest.get("format") != FORMAT:
+            raise InputError(
+                f"{path}: expected the format '{FORMAT}', got '{self.manifest.get('format')}'; "
+                "predict into another folder."
+            )
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in order of their ids."""
+        return tuple(self.manifest["classes"])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the names and the decoded labels and confidences: their content."""
+        return str(self.manifest["digest"])
+
+    def read(self, name: str, num_classes: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Label and confidence of the image `name`, see `read_pair`."""
+        label, confidence = read_pair(self.folder, name, num_classes)
+        return label, (confidence / np.float32(FULL)).astype(np.float32)
+
+
+def label_path(folder: Path, name: str) -> Path:
+    """The file of the label of `name`."""
+    return folder / "labels" / f"{name}.png"
+
+
+def confidence_path(folder: Path, name: str) -> Path:
+    """The file of the confidence of `name`."""
+    return folder / "confidence" / f"{name}.png"
+
+
+def read_pair(
+    folder: Path, name: str, num_classes: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """Label (H, W) uint8, 255 = no label, and confidence (H, W) uint16, 65535 = 1, of one image.
+
+    Raises:
+        InputError: a file is missing, cannot be decoded, or holds something else.
+    """
+    if not label_path(folder, name).is_file():
+        raise InputError(
+            f"'{name}' has no pseudo-label in {folder}; predict the split that it belongs to."
+        )
+    label = read_label(label_path(folder, name), num_classes)
+    path = confidence_path(folder, name)
+    confidence = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if confidence is None or confidence.dtype != np.uint16 or confidence.shape != label.shape:
+        found = (
+            "none that can be read"
+            if confidence is None
+            else f"{8 * confidence.itemsize} bit, {' x '.join(map(str, confidence.shape))}"
+        )
+        raise InputError(
+            f"{path}: expected one channel of 16 bit and {label.shape[0]} x {label.shape[1]} "
+            f"pixels, as the label has, got {found}; predict into another folder."
+        )
+    return label, np.asarray(confidence, np.uint16)
+
+
+class PseudoLabelled:
+    """A data set whose labels are replaced by pseudo-labels; all else is the data set's.
+
+    Args:
+        dataset: the data set; its `classes` must be those of the pseudo-labels.
+        folder: of pseudo-labels.
+        with_confidence: whether samples carry the confidence as well.
+
+    Raises:
+        InputError: no finished folder, or one of other classes.
+    """
+
+    def __init__(self, dataset: Dataset, folder: str | Path, *, with_confidence: bool) -> None:
+        self.dataset = dataset
+        self.name = dataset.name
+        self.labels = PseudoLabels(folder)
+        self.with_confidence = with_confidence
+        classes: tuple[str, ...] = tuple(self.classes)
+        if self.labels.classes != classes:
+            raise InputError(
+                f"the pseudo-labels of {self.labels.folder} have the classes "
+                f"{', '.join(self.labels.classes)}, but {self.name} has {', '.join(classes)}; "
+                "predict them for this data set (label_map=... for a teacher of other classes)."
+            )
+
+    def __getattr__(self, key: str) -> Any:
+        return _passed_on(self, key)
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in order."""
+        return self.dataset.names(split)
+
+    def read(self, name: str) -> Sample:
+        """The sample with its pseudo-label.
+
+        Raises:
+            InputError: as the data set; no pseudo-label, or one of another size.
+        """
+        sample = self.dataset.read(name)
+        label, confidence = self.labels.read(name, len(self.labels.classes))
+        if label.shape != sample.thermal.shape:
+            sizes = [" x ".join(map(str, each.shape)) for each in (sample.thermal, label)]
+            raise InputError(
+                f"'{name}' has {sizes[0]} pixels but its pseudo-label in {self.labels.folder} "
+                f"{sizes[1]}; predict them for the data set as it is cut now."
+            )
+        carried = confidence if self.with_confidence else None
+        return replace(sample, label=label, confidence=carried)
+
+
+class Unlabelled:
+    """A data set without labels; all else is the data set's.
+
+    Args:
+        dataset: the data set.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+        self.name = dataset.name
+
+    def __getattr__(self, key: str) -> Any:
+        return _passed_on(self, key)
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in order."""
+        return self.dataset.names(split)
+
+    def read(self, name: str) -> Sample:
+        """The sample without label and confidence."""
+        return replace(self.dataset.read(name), label=None, confidence=None)
+
+
+def _passed_on(wrapper: PseudoLabelled | Unlabelled, key: str) -> Any:
+    # Copying and unpickling ask before there is a data set.
+    if key == "dataset" or key.startswith("__"):
+        raise AttributeError(key)
+    return getattr(wrapper.dataset, key)

@@ -1,0 +1,136 @@
+"""The augmentation of the thesis on networks with two heads (J. Sun): shrink, mirror, blur."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.joint import View, check_lengths
+from rgbt.types import IGNORE, Sample
+
+
+class ThesisTransform:
+    """Resizes the whole image to a fixed size, mirrors it, blurs RGB and thermal together.
+
+    Source: thesis (J. Sun), its code: mirrored alone (networks with one or two heads); mirrored
+    and blurred (maximum squares; by its text, HeatNet too). Images are 640 x 1280, cut from the
+    frames, and are shrunk to 320 x 640 by area.
+    Intended: labels by nearest.   Released: labels bilinearly, so that pixels at the border of
+    two classes get the number of a third: ``label_resize="bilinear"``. Where an ignored pixel
+    takes part, the pixel is ignored; the thesis has none.
+
+    Confidences of labels are resized by nearest, and mirrored with the image, the label and the
+    thermal image (the thesis' code forgets them).
+
+    Args:
+        crop_hw: size of the result in pixels, always; the aspect is not kept, nothing is cut.
+        flip_probability: in [0, 1].
+        blur_probability: in [0, 1].
+        blur_kernel: side of OpenCV's Gaussian kernel in pixels, odd; of 5 pixels, the weights are
+            1, 4, 6, 4 and 1 sixteenths along each axis.
+        label_resize: "nearest" (intended) or "bilinear" (released).
+        test_short_edge: short edge of evaluated images in pixels; None keeps their size. Labels
+            keep the size of the file.
+        track_position: whether examples carry the map of source positions.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        *,
+        crop_hw: tuple[int, int],
+        flip_probability: float,
+        blur_probability: float,
+        blur_kernel: int,
+        label_resize: Literal["nearest", "bilinear"],
+        test_short_edge: int | None,
+        track_position: bool,
+    ) -> None:
+        check_range("transform.flip_probability", flip_probability, 0, 1)
+        check_range("transform.blur_probability", blur_probability, 0, 1)
+        check_choice("transform.label_resize", label_resize, ("nearest", "bilinear"))
+        check_lengths(crop_hw=crop_hw, test_short_edge=(test_short_edge,))
+        if blur_kernel < 1 or blur_kernel % 2 == 0:
+            raise InputError(
+                f"transform.blur_kernel must be an odd number of pixels, got {blur_kernel}; the "
+                "thesis has 5."
+            )
+        self.crop_hw = crop_hw
+        self.flip_probability = flip_probability
+        self.blur_probability = blur_probability
+        self.blur_kernel = blur_kernel
+        self.of_label = View.nearest if label_resize == "nearest" else mixed
+        self.test_short_edge = test_short_edge
+        self.track_position = track_position
+
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example of `crop_hw`.
+
+        Args:
+            sample: as it lies on disk; without a label, all pixels are ignored.
+            rng: every draw comes from here.
+        """
+        flipped = bool(rng.random() < self.flip_probability)
+        blurred = bool(rng.random() < self.blur_probability)
+        view = View(image_hw(sample), self.crop_hw, (0, 0), self.crop_hw, flipped)
+        example = viewed(
+            sample,
+            view,
+            np.uint8,
+            track_position=self.track_position,
+            of_image=area,
+            of_label=self.of_label,
+        )
+        if not blurred:
+            return example
+        return replace(example, rgb=self._blur(example.rgb), thermal=self._blur(example.thermal))
+
+    def test(self, sample: Sample) -> Example:
+        """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
+        return evaluated(
+            sample,
+            self.test_short_edge,
+            None,
+            np.uint8,
+            track_position=self.track_position,
+            of_image=area,
+        )
+
+    def _blur(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        size = (self.blur_kernel, self.blur_kernel)
+        return np.asarray(cv2.GaussianBlur(image, size, 0), np.uint8)
+
+
+def area(view: View, image: NDArray[np.uint8], dtype: DTypeLike) -> NDArray[Any]:
+    """As `View.bilinear`, but where an image shrinks, every pixel is the mean of what it covers.
+
+    Args:
+        view: of a whole image.
+        image: (H, W) or (H, W, C), uint8.
+        dtype: of the result.
+    """
+    height, width = view.resized_hw
+    if height > image.shape[0] or width > image.shape[1]:
+        return view.bilinear(image, dtype)
+    shrunk = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    whole = View(view.resized_hw, view.resized_hw, view.corner_yx, view.window_hw, view.flipped)
+    return whole.bilinear(np.asarray(shrunk, np.uint8), dtype)
+
+
+def mixed(view: View, label: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The view of a label whose numbers are interpolated as if they were brightness.
+
+    Args:
+        view: of images of its size.
+        label: (H, W) uint8; pixels that an ignored one takes part in are ignored.
+    """
+    touched = view.bilinear((label == IGNORE).astype(np.uint8), np.float32) > 0
+    return np.where(touched, np.uint8(IGNORE), view.bilinear(label, np.uint8))

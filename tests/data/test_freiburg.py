@@ -1,0 +1,451 @@
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rgbt.checks import InputError
+from rgbt.data import freiburg
+from rgbt.data.dataset import LabelledDataset
+from rgbt.data.freiburg import CLASSES, CROP, PALETTE, THERMAL_RANGE, Freiburg
+from rgbt.data.mfnet import MFNet
+from rgbt.data.next_frames import NextFrames
+from tests.conftest import write_png
+from tests.data import freiburg_files as files
+from tests.data.freiburg_files import reader, write_freiburg
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_freiburg(tmp_path / "freiburg")
+
+
+def path_of(dataset: Freiburg, name: str, kind: str) -> Path:
+    path = getattr(dataset.frame(name), kind)
+    assert isinstance(path, Path)
+    return path
+
+
+# ---- splits ---------------------------------------------------------------------------------
+
+
+def test_splits_by_folder(root: Path) -> None:
+    dataset = reader(root)
+    names = {split: dataset.names(split) for split in dataset.splits}
+    assert names["train"] == names["train_day"]
+    assert names["train_day"] == (
+        "seq_00_day_00_1570_0000",
+        "seq_00_day_00_1571_0010",
+        "seq_00_day_01_1572_0020",
+    )
+    assert names["val"] == ("seq_04_day_00_1573_0030", "seq_04_day_00_1574_0040")
+    assert names["train_night"][0] == "seq_00_night_00_1575_0050"
+    assert len(names["train_night"]) == 3
+    assert names["test_day"] == ("test_day_1578_0080", "test_day_1579_0090")
+    assert names["test"] == names["test_day"] + names["test_night"]
+    assert all(dataset.has(split) for split in dataset.splits)
+
+
+def test_order_does_not_follow_the_file_system(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = {split: reader(root).names(split) for split in freiburg.SPLITS}
+    listed = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: reversed(sorted(listed(path))))
+    assert {split: reader(root).names(split) for split in freiburg.SPLITS} == expected
+
+
+def test_night_is_what_the_path_says(root: Path) -> None:
+    dataset = reader(root)
+    assert dataset.nights(dataset.names("train_day")) == (False,) * 3
+    assert dataset.nights(dataset.names("train_night")) == (True,) * 3
+    assert dataset.nights(dataset.names("test")) == (False, False, True, True)
+    with pytest.raises(InputError, match="has no frame called 'other'"):
+        dataset.nights(("other",))
+
+
+def test_a_root_that_says_night_is_no_night(tmp_path: Path) -> None:
+    dataset = reader(write_freiburg(tmp_path / "night_drives"))
+    assert dataset.nights(dataset.names("test")) == (False, False, True, True)
+
+
+@pytest.mark.parametrize("folder", ["seq_05_dusk", "seq_05_day_and_night"])
+def test_a_sequence_of_no_time_is_refused(root: Path, folder: str) -> None:
+    (root / "train" / folder / "00").mkdir(parents=True)
+    with pytest.raises(InputError, match=rf"{folder}: expected the name of a sequence to say day"):
+        reader(root).names("test")
+
+
+def test_val_may_be_pieces_of_sequences(root: Path) -> None:
+    dataset = reader(root, val_sequences=("seq_00_day/01",))
+    assert dataset.names("val") == ("seq_00_day_01_1572_0020",)
+    assert len(dataset.names("train_day")) == 4
+
+
+@pytest.mark.parametrize("split", ["train", "train_day", "val"])
+def test_an_unknown_val_sequence_is_named(root: Path, split: str) -> None:
+    dataset = reader(root, val_sequences=("seq_40_day",))
+    with pytest.raises(InputError, match=r"no day sequence 'seq_40_day' in .*did you mean 'seq_"):
+        dataset.names(split)
+    assert len(dataset.names("test")) == 4  # which is another archive
+    with pytest.raises(InputError, match="no day sequence 'seq_00_night'"):
+        reader(root, val_sequences=("seq_00_night",)).names("val")
+
+
+def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
+    files.write_training(tmp_path, "seq_04_day/00", "1_0")
+    dataset = reader(tmp_path)
+    for split, said in (
+        (
+            "train_night",
+            r"split 'train_night' of freiburg is empty: expected train/seq_\*_night/.*",
+        ),
+        ("test", r"split 'test' .* unpack the archive 'test' there\."),
+        ("train", r"every day sequence is in dataset.val_sequences, leave one out of it\."),
+    ):
+        assert not dataset.has(split)
+        with pytest.raises(InputError, match=said):
+            dataset.names(split)
+    with pytest.raises(InputError, match=r"'val' .* is empty: .* it is \[\], name day sequences"):
+        reader(tmp_path, val_sequences=()).names("val")
+    with pytest.raises(InputError, match="no split 'tran'; did you mean 'train'"):
+        dataset.names("tran")
+
+
+# ---- partners -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time", ["day", "night"])
+def test_stamps_of_test_thermal_may_lack_the_last_zero(tmp_path: Path, time: str) -> None:
+    files.write_test(tmp_path, time, "1570_120", thermal="1570_12")
+    files.write_test(tmp_path, time, "1571_130", thermal="1571_130")
+    dataset = reader(tmp_path)
+    for name, partner in zip(dataset.names("test"), ("1570_12", "1571_130"), strict=True):
+        assert path_of(dataset, name, "thermal").name == f"{partner}_ir.png"
+        stamp = name.removeprefix(f"test_{time}_")
+        assert np.array_equal(dataset.counts(name), files.contents(stamp)[1][1:12, 5:23])
+        assert dataset.read(name).label is not None
+
+
+def test_two_frames_with_one_thermal_image_are_refused(tmp_path: Path) -> None:
+    files.write_test(tmp_path, "day", "1570_120", thermal="1570_12")
+    files.write_test(tmp_path, "day", "1570_12")
+    with pytest.raises(InputError, match=r"would both have .*1570_12_ir.png as their thermal"):
+        reader(tmp_path).names("test")
+
+
+@pytest.mark.parametrize(
+    "folders",
+    [
+        ("ImagesRgb", "ImagesIr", "SegmentationClass"),
+        ("imagesrgb", "IMAGESIR", "segmentationclass"),
+    ],
+)
+def test_capitals_of_folders_do_not_count(tmp_path: Path, folders: tuple[str, ...]) -> None:
+    files.write_test(tmp_path, "night", "1570_120", folders=folders)
+    dataset = reader(tmp_path)
+    assert dataset.names("test_night") == ("test_night_1570_120",)
+    assert dataset.read("test_night_1570_120").label is not None
+
+
+def test_what_is_no_frame_is_passed_over(root: Path) -> None:
+    expected = reader(root).names("train")
+    piece = root / "train/seq_00_day/00"
+    for stray in ("fl_rgb/._fl_rgb_1_0.png", "fl_rgb/other.png", "fl_rgb/fl_rgb_1_0.txt"):
+        (piece / stray).write_bytes(b"")
+    (root / "train/.cache/00").mkdir(parents=True)
+    (root / "train/readme.txt").write_text("")
+    assert reader(root).names("train") == expected
+
+
+@pytest.mark.parametrize("split", ["train_day", "train_night", "test_night"])
+def test_a_missing_thermal_partner_is_named(root: Path, split: str) -> None:
+    dataset = reader(root)
+    name = dataset.names(split)[0]
+    path = path_of(dataset, name, "thermal")
+    path.unlink()
+    with pytest.raises(InputError) as caught:
+        reader(root).read(name)
+    assert str(caught.value) == (
+        f"'{name}': its thermal image {path} is missing; restore it, or use data.on_error=skip to "
+        "leave the frame out."
+    )
+
+
+@pytest.mark.parametrize("split", ["train_day", "val", "test_night"])
+def test_a_missing_label_is_named(root: Path, split: str) -> None:
+    dataset = reader(root)
+    name = dataset.names(split)[0]
+    path_of(dataset, name, "label").unlink()
+    with pytest.raises(InputError, match=rf"'{name}': its label .* is missing; restore it"):
+        reader(root).read(name)
+
+
+# ---- images ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split", ["train_day", "val", "test_night"])
+def test_reads_what_lies_there(root: Path, split: str) -> None:
+    dataset = reader(root, ignored_test=())
+    name = dataset.names(split)[0]
+    rgb, counts, label = files.contents("_".join(name.split("_")[-2:]))
+    sample = dataset.read(name)
+    assert sample.name == name
+    assert (sample.rgb.dtype, sample.thermal.dtype) == (np.uint8, np.uint8)
+    assert np.array_equal(sample.rgb, rgb[1:12, 5:23])
+    grey = np.clip((counts[1:12, 5:23].astype(float) - 21800) / 1900, 0, 1) * 255
+    assert np.array_equal(sample.thermal, np.floor(grey + 0.5))
+    assert sample.label is not None
+    assert sample.label.dtype == np.uint8
+    assert np.array_equal(sample.label, label[1:12, 5:23])
+    assert np.array_equal(dataset.label(name), sample.label)
+
+
+def test_nights_of_training_have_no_label(root: Path) -> None:
+    dataset = reader(root)
+    name = dataset.names("train_night")[0]
+    assert dataset.read(name).label is None
+    assert dataset.label(name) is None
+
+
+@pytest.mark.parametrize(
+    ("count", "thesis", "heatnet"),
+    [
+        # (c - 21800) 255 / 1900 and / 3200; 22750 is the middle of the first: 127.5, upwards.
+        (0, 0, 0),
+        (21800, 0, 0),
+        (21803, 0, 0),  # 0.403
+        (21804, 1, 0),  # 0.537, 0.319
+        (22750, 128, 76),  # 127.5, 75.70
+        (23000, 161, 96),  # 161.05, 95.6
+        (23696, 254, 151),  # 254.46, 151.09
+        (23697, 255, 151),  # 254.597, 151.17
+        (23700, 255, 151),
+        (24000, 255, 175),  # 175.31
+        (25000, 255, 255),
+        (65535, 255, 255),
+    ],
+)
+def test_counts_are_clipped_and_scaled(root: Path, count: int, thesis: int, heatnet: int) -> None:
+    name = "seq_00_day_00_1570_0000"
+    write_png(path_of(reader(root), name, "thermal"), np.full(files.HW, count, np.uint16))
+    assert set(reader(root).read(name).thermal.flat) == {thesis}
+    assert set(reader(root, thermal_range=(21800, 25000)).read(name).thermal.flat) == {heatnet}
+    assert set(reader(root).counts(name).flat) == {count}
+
+
+def test_eight_bits_where_sixteen_are_meant(root: Path) -> None:
+    dataset = reader(root)
+    name = dataset.names("train_night")[1]
+    path = path_of(dataset, name, "thermal")
+    write_png(path, np.full(files.HW, 85, np.uint8))
+    with pytest.raises(InputError) as caught:
+        dataset.read(name)
+    assert str(caught.value) == (
+        f"{path}: expected a thermal image of 16 bits (counts of the camera), got uint8; use the "
+        "original file, a converted one no longer holds the counts that dataset.thermal_range cuts."
+    )
+    write_png(path, np.zeros((*files.HW, 3), np.uint16))
+    with pytest.raises(InputError, match=r"expected a thermal image of one channel, got 3;"):
+        dataset.read(name)
+    write_png(path, np.zeros((5, 26), np.uint16))
+    with pytest.raises(InputError, match=f"'{name}': RGB is 13x26 pixels but thermal is 5x26"):
+        dataset.read(name)
+    path.write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"fl_ir_aligned.* cannot be decoded"):
+        dataset.read(name)
+
+
+def test_rgb_of_other_form_is_refused(root: Path) -> None:
+    dataset = reader(root)
+    name = dataset.names("test_day")[0]
+    path = path_of(dataset, name, "rgb")
+    write_png(path, np.zeros(files.HW, np.uint8))
+    with pytest.raises(InputError, match=r"_rgb.png: expected 3 channels .*, got 1; use the orig"):
+        dataset.read(name)
+
+
+def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
+    name = "seq_00_day_00_1570_0000"
+    whole = reader(root, crop=None).read(name)
+    assert np.array_equal(whole.rgb, files.contents("1570_0000")[0])
+    assert whole.thermal.shape == files.HW
+    assert reader(root, crop=(0, 13, 0, 26)).read(name).rgb.shape[:2] == files.HW
+    for crop in ((0, 14, 0, 26), (0, 13, 5, 27)):
+        with pytest.raises(InputError, match=r"the frame is 13x26 pixels but dataset.crop=\[0, 1"):
+            reader(root, crop=crop).read(name)
+    with pytest.raises(InputError, match=r"frame is 13x26 .* reaches to row 645 and column 1640;"):
+        Freiburg(str(root)).read(name)
+
+
+# ---- labels ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hw", [(39, 78), (15, 30), (11, 22)])
+def test_labels_of_another_size_are_read_at_the_nearest_pixel(
+    root: Path, hw: tuple[int, int]
+) -> None:
+    dataset = reader(root, crop=None, ignored_test=())
+    label = files.contents("label", hw)[2]
+    write_png(path_of(dataset, "seq_00_day_00_1570_0000", "label"), label)
+    np.save(path_of(dataset, "test_day_1578_0080", "label"), label.astype(np.int16))
+    # The middle of pixel x of n lies in pixel (x + 0.5) m / n, rounded down, of m.
+    rows, columns = (
+        np.floor((np.arange(n) + 0.5) * m / n).astype(int)
+        for n, m in zip(files.HW, hw, strict=True)
+    )
+    for name in ("seq_00_day_00_1570_0000", "test_day_1578_0080"):
+        assert np.array_equal(dataset.label(name), label[np.ix_(rows, columns)])
+
+
+@pytest.mark.parametrize("hw", [(26, 13), (13, 24), (11, 26)])
+def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) -> None:
+    dataset = reader(root)
+    path = path_of(dataset, "seq_00_day_00_1570_0000", "label")
+    write_png(path, np.zeros(hw, np.uint8))
+    with pytest.raises(InputError) as caught:
+        dataset.read("seq_00_day_00_1570_0000")
+    assert str(caught.value) == (
+        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another shape and no "
+        "other size; use the label of the whole frame."
+    )
+
+
+@pytest.mark.parametrize(
+    ("ignored", "gone"), [(("ignore",), [13]), ((), []), (("background", "ignore"), [12, 13])]
+)
+def test_what_is_ignored_is_so_in_testing_alone(
+    root: Path, ignored: tuple[str, ...], gone: list[int]
+) -> None:
+    dataset = reader(root, ignored_test=ignored, crop=None)
+    for split, counts in (("train_day", False), ("val", True), ("test", True)):
+        for name in dataset.names(split):
+            label = files.contents("_".join(name.split("_")[-2:]))[2]
+            if counts:
+                label[np.isin(label, gone)] = 255
+            assert np.array_equal(dataset.label(name), label)
+
+
+def test_labels_that_are_none(root: Path) -> None:
+    dataset = reader(root)
+    day, test = dataset.names("train_day")[0], dataset.names("test_day")[0]
+    write_png(path_of(dataset, day, "label"), np.full(files.HW, 14, np.uint8))
+    with pytest.raises(InputError, match=r"fl_rgb_labels_.*png: label value 14 is out of range"):
+        dataset.read(day)
+    path = path_of(dataset, test, "label")
+    for wrong, said in (
+        (np.full(files.HW, 14), "label value 14 is out of range; expected 0 to 13, or 255"),
+        (np.full(files.HW, -1), "label value -1 is out of range"),
+        (np.full(files.HW, 256 + 3), "label value 259 is out of range"),
+        (np.zeros(files.HW), r"whole numbers of shape \(rows, columns\), got \(13, 26\) float64"),
+        (np.zeros((*files.HW, 3), int), r"got \(13, 26, 3\) int64"),
+        (np.array({}), "cannot be read as an array"),
+    ):
+        np.save(path, wrong)
+        with pytest.raises(InputError, match=said):
+            dataset.read(test)
+    label = np.full(files.HW, 255)
+    np.save(path, label)
+    assert np.array_equal(dataset.label(test), label[1:12, 5:23])
+    for damaged in (b"", b"no array", path.read_bytes()[:100]):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"\.npy cannot be read as an array .*on_error=skip"):
+            dataset.read(test)
+    with path.open("wb") as file:
+        np.savez(file, label=label)
+    with pytest.raises(InputError, match=r"\.npy: expected class indices, .* got several arrays"):
+        dataset.read(test)
+
+
+# ---- fingerprint, settings ------------------------------------------------------------------
+
+
+def test_fingerprint(root: Path, tmp_path: Path) -> None:
+    expected = reader(root).fingerprint()
+    assert len(expected) == 64
+    other = write_freiburg(tmp_path / "elsewhere")
+    assert reader(other).fingerprint() == expected
+    assert reader(other, thermal_range=(21800, 25000)).fingerprint() == expected
+    for changed in (
+        {"crop": None},
+        {"ignored_test": ()},
+        {"val_sequences": ("seq_00_day",)},
+    ):
+        assert reader(other, **changed).fingerprint() != expected
+    path_of(reader(other), "test_day_1578_0080", "label").write_bytes(b"shorter")
+    assert reader(other).fingerprint() != expected
+    path_of(reader(root), "seq_00_night_00_1575_0050", "thermal").unlink()
+    assert reader(root).fingerprint() != expected
+
+
+def test_fingerprint_of_a_part(tmp_path: Path) -> None:
+    files.write_test(tmp_path, "day", "1_0")
+    assert len(reader(tmp_path).fingerprint()) == 64
+
+
+def test_workers_get_the_same_frames(root: Path) -> None:
+    dataset = reader(root)
+    dataset.names("train")
+    copy = pickle.loads(pickle.dumps(dataset))
+    assert copy.names("test") == dataset.names("test")
+    assert np.array_equal(
+        copy.read("test_day_1578_0080").rgb, dataset.read("test_day_1578_0080").rgb
+    )
+
+
+def test_wrong_roots(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"dataset.root: there is no folder '/nowhere'"):
+        Freiburg("/nowhere")
+    with pytest.raises(InputError, match="holds neither the folder train nor test"):
+        Freiburg(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"crop": (5, 5, 0, 1)}, r"dataset.crop: expected \[first row, row after the last, "),
+        ({"crop": (-1, 5, 0, 1)}, "dataset.crop: expected"),
+        ({"crop": (0, 5, 9, 1)}, "dataset.crop: expected"),
+        ({"thermal_range": (23700, 21800)}, r"dataset.thermal_range: expected counts 0 <= low"),
+        ({"thermal_range": (0, 65536)}, r"got \[0, 65536\]"),
+        ({"ignored_test": ("ignored",)}, "dataset.ignored_test: 'ignored' .* mean 'ignore'"),
+        ({"unscored": ("void",)}, "dataset.unscored: 'void' is not a choice"),
+        ({"num_classes": 13}, "num_classes is 13 but dataset.classes has 14"),
+    ],
+)
+def test_wrong_settings_are_named(root: Path, wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        reader(root, **wrong)
+
+
+def test_configuration_repeats_the_defaults() -> None:
+    node = yaml.safe_load((ROOT / "conf/dataset/freiburg.yaml").read_text())
+    assert tuple(node["classes"]) == CLASSES
+    assert tuple(map(tuple, node["palette"])) == PALETTE
+    assert (tuple(node["crop"]), tuple(node["thermal_range"])) == (CROP, THERMAL_RANGE)
+    assert (node["unscored"], node["ignored_test"]) == (["background", "ignore"], ["ignore"])
+    assert node["val_sequences"] == ["seq_04_day"]
+    assert node["num_classes"] == len(CLASSES) == len(set(PALETTE)) == 14
+
+
+# ---- what asks for any data set -------------------------------------------------------------
+
+
+def test_both_readers_are_data_sets(root: Path, write_mfnet) -> None:
+    datasets: list[LabelledDataset] = [reader(root), MFNet(str(write_mfnet({"test": ["00001D"]})))]
+    assert [len(dataset.unscored) for dataset in datasets] == [2, 0]
+    for dataset in datasets:
+        assert dataset.has("test")
+        assert dataset.label(dataset.names("test")[0]) is not None
+
+
+def test_second_frames_are_of_the_other_layout(root: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        NextFrames(reader(root))
+    assert str(caught.value) == (
+        f"freiburg ({root}) cannot hold second frames: they are read in MFNet's layout alone; "
+        "choose dataset=synth with dataset.ego_forward_m=0.5, and frames=virtual needs none."
+    )
