@@ -57,11 +57,15 @@ def save_checkpoint(path: Path, payload: dict[str, Any]) -> None:
 
 
 def training_payload(
-    model: nn.Module, optimizers: dict[str, torch.optim.Optimizer], state: State
+    model: nn.Module,
+    others: dict[str, nn.Module],
+    optimizers: dict[str, torch.optim.Optimizer],
+    state: State,
 ) -> dict[str, Any]:
     """Everything a run needs to go on as if it had not stopped."""
     return {
         "model": model.state_dict(),
+        "others": {name: module.state_dict() for name, module in others.items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
         "state": asdict(state),
     }

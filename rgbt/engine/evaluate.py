@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from lightning_fabric import Fabric
@@ -11,6 +11,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.types import Batch, View
+
+HeadsOf = Callable[[tuple[str, ...]], tuple[str | None, ...]]
+"""Names of images -> the head that predicts each; None: the network's only one."""
 
 
 class Prediction(NamedTuple):
@@ -25,6 +28,7 @@ def predictions(
     batches: Iterable[Batch],
     fabric: Fabric,
     view: View | None = None,
+    heads_of: HeadsOf | None = None,
 ) -> Iterator[Prediction]:
     """Class maps at the resolution of the labels, batch by batch.
 
@@ -36,13 +40,22 @@ def predictions(
         batches: from `rgbt.data.loaders.eval_batches`.
         fabric: device and precision.
         view: what is predicted from; None leaves it to the network.
+        heads_of: which of several heads predicts an image; None leaves it to the network.
     """
     model.eval()
     for batch in batches:
-        yield Prediction(batch, class_maps(model, batch.to(fabric.device), fabric, view).cpu())
+        heads = () if heads_of is None else heads_of(batch.name)
+        classes = class_maps(model, batch.to(fabric.device), fabric, view, heads)
+        yield Prediction(batch, classes.cpu())
 
 
-def class_maps(model: nn.Module, batch: Batch, fabric: Fabric, view: View | None = None) -> Tensor:
+def class_maps(
+    model: nn.Module,
+    batch: Batch,
+    fabric: Fabric,
+    view: View | None = None,
+    heads: Sequence[str | None] = (),
+) -> Tensor:
     """(B, H', W') uint8: class index of every pixel of the labels of one batch.
 
     Args:
@@ -50,12 +63,31 @@ def class_maps(model: nn.Module, batch: Batch, fabric: Fabric, view: View | None
         batch: on the device, images in [0, 1].
         fabric: precision.
         view: what is predicted from; None leaves it to the network.
+        heads: which head predicts each image of the batch; () leaves it to the network.
     """
-    asked = {} if view is None else {"views": (view,)}
     with torch.inference_mode(), fabric.autocast():
-        scores = model(batch.rgb, batch.thermal, **asked).logits.float()
+        scores = class_scores(model, batch, view, heads).float()
         label_hw = batch.label.shape[-2:]
         if scores.shape[-2:] != label_hw:
             scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
         classes: Tensor = scores.argmax(1).to(torch.uint8)
     return classes
+
+
+def class_scores(
+    model: nn.Module, batch: Batch, view: View | None = None, heads: Sequence[str | None] = ()
+) -> Tensor:
+    """(B, K, H, W) scores at the size of the images; arguments as in `class_maps`."""
+    asked: dict[str, Any] = {} if view is None else {"views": (view,)}
+    distinct = tuple(dict.fromkeys(heads))
+    if len(distinct) < 2:
+        asked |= {} if distinct in ((), (None,)) else {"head": distinct[0]}
+        scores: Tensor = model(batch.rgb, batch.thermal, **asked).logits
+        return scores
+    # One pass per head over the images that are its own; normalisations do not look at the batch.
+    found: dict[str | None, Tensor] = {}
+    for head in distinct:
+        own = torch.tensor([each == head for each in heads], device=batch.rgb.device)
+        found[head] = model(batch.rgb[own], batch.thermal[own], head=head, **asked).logits
+    taken = {head: iter(scores) for head, scores in found.items()}
+    return torch.stack([next(taken[head]) for head in heads])

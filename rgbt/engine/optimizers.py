@@ -12,6 +12,7 @@ from rgbt.checks import InputError, check_range
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table",)
 BIASES = ("bias", "in_proj_bias")
+BELOW_ONE = 1.0 - 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +43,12 @@ class AdamW:
 
     def __post_init__(self) -> None:
         _check(self.lr, self.backbone_multiplier, self.weight_decay)
-        for beta in self.betas:
-            check_range("optimizer.betas", beta, 0.0, 1.0 - 1e-12)
+        _check_betas(self.betas)
 
-    def __call__(self, model: nn.Module) -> torch.optim.Optimizer:
-        """The optimizer of all trainable parameters of `model`."""
+    def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
+        """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
         undecayed = UNDECAYED_NAMES if self.decay_biases else (*UNDECAYED_NAMES, *BIASES)
-        groups = parameter_groups(model, undecayed)
+        groups = parameter_groups(model, undecayed, without)
         settings = [
             {
                 **_rates(self.lr, self.backbone_multiplier if pretrained else 1.0),
@@ -64,7 +64,8 @@ class AdamW:
 class SGD:
     """Builder of a `torch.optim.SGD` with momentum that decays every parameter.
 
-    Source: MFNet and RTFNet releases (momentum 0.9, weight decay 5e-4).
+    Source: MFNet and RTFNet releases; thesis (J. Sun), code of the networks with one or two heads
+    (all: momentum 0.9, weight decay 5e-4).
 
     Attributes:
         lr: learning rate, > 0.
@@ -80,12 +81,12 @@ class SGD:
 
     def __post_init__(self) -> None:
         _check(self.lr, self.backbone_multiplier, self.weight_decay)
-        check_range("optimizer.momentum", self.momentum, 0.0, 1.0 - 1e-12)
+        check_range("optimizer.momentum", self.momentum, 0.0, BELOW_ONE)
 
-    def __call__(self, model: nn.Module) -> torch.optim.Optimizer:
-        """The optimizer of all trainable parameters of `model`."""
+    def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
+        """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
         by_part: dict[bool, list[nn.Parameter]] = {}
-        for (pretrained, _), parameters in parameter_groups(model, ()).items():
+        for (pretrained, _), parameters in parameter_groups(model, (), without).items():
             by_part.setdefault(pretrained, []).extend(parameters)
         settings = [
             {
@@ -99,11 +100,73 @@ class SGD:
         )
 
 
-def _check(lr: float, backbone_multiplier: float, weight_decay: float) -> None:
+@dataclass(frozen=True, kw_only=True)
+class RMSprop:
+    """Builder of a `torch.optim.RMSprop` with one rate, without momentum and weight decay.
+
+    Source: HeatNet release (rate 1e-4, the rest as torch has it).
+
+    Attributes:
+        lr: learning rate, > 0.
+        alpha: decay of the mean of squared gradients, in [0, 1).
+        eps: added to the denominator.
+    """
+
+    lr: float
+    alpha: float
+    eps: float
+
+    def __post_init__(self) -> None:
+        _check(self.lr)
+        check_range("optimizer.alpha", self.alpha, 0.0, BELOW_ONE)
+
+    def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
+        """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
+        settings = [{**_rates(self.lr, 1.0), "params": trainable(model, without)}]
+        return torch.optim.RMSprop(settings, lr=self.lr, alpha=self.alpha, eps=self.eps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adam:
+    """Builder of a `torch.optim.Adam` with one rate, for critics.
+
+    Source: AdaptSegNet (rate 1e-4, betas 0.9 and 0.99, no weight decay); thesis (J. Sun), code
+    (rate 1e-5).
+
+    Attributes:
+        lr: learning rate, > 0.
+        betas: exponential decay rates of the two moments, in [0, 1).
+        weight_decay: added to the gradient of every parameter, as Adam has it.
+        eps: added to the denominator.
+    """
+
+    lr: float
+    betas: tuple[float, float]
+    weight_decay: float
+    eps: float
+
+    def __post_init__(self) -> None:
+        _check(self.lr, weight_decay=self.weight_decay)
+        _check_betas(self.betas)
+
+    def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
+        """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
+        settings = [{**_rates(self.lr, 1.0), "params": trainable(model, without)}]
+        return torch.optim.Adam(
+            settings, betas=self.betas, weight_decay=self.weight_decay, eps=self.eps, fused=True
+        )
+
+
+def _check(lr: float, backbone_multiplier: float = 1.0, weight_decay: float = 0.0) -> None:
     if lr <= 0:
         raise InputError(f"optimizer.lr must be positive, got {lr:g}.")
     check_range("optimizer.backbone_multiplier", backbone_multiplier, 0.0, 1e6)
     check_range("optimizer.weight_decay", weight_decay, 0.0, 1e6)
+
+
+def _check_betas(betas: tuple[float, float]) -> None:
+    for beta in betas:
+        check_range("optimizer.betas", beta, 0.0, BELOW_ONE)
 
 
 def _rates(lr: float, factor: float) -> dict[str, float]:
@@ -112,22 +175,43 @@ def _rates(lr: float, factor: float) -> dict[str, float]:
 
 
 def parameter_groups(
-    model: nn.Module, undecayed_names: tuple[str, ...]
+    model: nn.Module, undecayed_names: tuple[str, ...], without: tuple[str, ...] = ()
 ) -> dict[tuple[bool, bool], list[nn.Parameter]]:
     """(pretrained, decayed) -> parameters, each parameter once even where modules are shared.
 
     Source: CRM release. Mask tokens and raw level embeddings are decayed; affine parameters of
     normalisations, `nn.Embedding` weights and `undecayed_names` are not.
+
+    Args:
+        model: of parameters that are not trained, none is listed.
+        undecayed_names: last words of names.
+        without: beginnings of names that are left out, for two optimizers that share a backbone
+            and have a head each ("heads.target.").
+
+    Raises:
+        ValueError: no name begins with one of `without`.
     """
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
     seen: set[int] = set()
     parts: tuple[str, ...] = getattr(model, "pretrained_parts", ())
+    known = [name for name, _ in model.named_parameters()]
+    for beginning in without:
+        if not any(name.startswith(beginning) for name in known):
+            raise ValueError(f"without: no parameter's name begins with '{beginning}'.")
     for module_name, module in model.named_modules():
         for name, parameter in module.named_parameters(recurse=False):
+            full_name = f"{module_name}.{name}".lstrip(".")
             if id(parameter) in seen or not parameter.requires_grad:
+                continue
+            if full_name.startswith(without):
                 continue
             seen.add(id(parameter))
             decayed = not isinstance(module, (*NORMS, nn.Embedding)) and name not in undecayed_names
-            pretrained = f"{module_name}.{name}".lstrip(".").startswith(parts)
-            groups.setdefault((pretrained, decayed), []).append(parameter)
+            groups.setdefault((full_name.startswith(parts), decayed), []).append(parameter)
     return groups
+
+
+def trainable(model: nn.Module, without: tuple[str, ...] = ()) -> list[nn.Parameter]:
+    """All parameters of `parameter_groups` in one list."""
+    groups = parameter_groups(model, (), without)
+    return [parameter for group in groups.values() for parameter in group]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Literal, Protocol
 
 from rgbt.checks import check_range
@@ -44,6 +45,26 @@ class Poly:
         done = step if self.per == "iteration" else step // steps_per_epoch
         decay = max(0.0, 1.0 - done / max_steps) ** self.power
         return (step + 1) / self.warmup_steps if step < self.warmup_steps else float(decay)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisPoly:
+    """``(1 - t / max_steps) ** power``, iterations t counted from 1: the last step has rate 0.
+
+    Source: thesis (J. Sun), code of all networks with one or two heads.
+
+    Attributes:
+        power: 0.9 there.
+    """
+
+    power: float
+
+    def __post_init__(self) -> None:
+        check_range("schedule.power", self.power, 0.0, 100.0)
+
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
+        """See `Schedule`."""
+        return float((1.0 - (step + 1) / max_steps) ** self.power)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,3 +143,27 @@ class Exponential:
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""
         return float(self.factor ** (step // (self.epoch_steps or steps_per_epoch)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """``factor ** n``, n counting how often a share of the run has passed, rounded down.
+
+    Source: HeatNet release (half every 60 of 200 epochs).
+
+    Attributes:
+        factor: in [0, 1]; 0.5 there.
+        every: share of the run, in (0, 1]; 0.3 there.
+    """
+
+    factor: float
+    every: float
+
+    def __post_init__(self) -> None:
+        check_range("schedule.factor", self.factor, 0.0, 1.0)
+        check_range("schedule.every", self.every, 1e-6, 1.0)
+
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
+        """See `Schedule`."""
+        # As a fraction: 0.3 of 608400 steps are 182520, and not the float below.
+        return float(self.factor ** (step // (Fraction(str(self.every)) * max_steps)))

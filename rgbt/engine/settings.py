@@ -24,6 +24,9 @@ class TrainerSettings:
         accelerator: "auto" takes a GPU where there is one.
         threads: CPU threads; null leaves torch's choice.
         selection_split: split whose mIoU picks the best checkpoint. Released: "test".
+        tested: what the test split is evaluated with: "best", the checkpoint with the highest mIoU
+            on the selection split, or "last", where that split says little (it holds no images
+            of the target domain).
     """
 
     max_steps: int
@@ -36,6 +39,7 @@ class TrainerSettings:
     accelerator: Literal["auto", "cpu", "cuda", "mps"]
     threads: int | None
     selection_split: str
+    tested: Literal["best", "last"] = "best"
 
     def __post_init__(self) -> None:
         for name in ("max_steps", "eval_every", "checkpoint_every", "log_every", "accumulate"):
@@ -59,6 +63,7 @@ class Recipe:
         crop_hw: training crop, pixels.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for what is pretrained.
+        critic_lr: learning rate of a critic, where the scheme has one.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         demo_steps: optimiser steps at scale=demo, which takes nothing else from here.
@@ -71,6 +76,7 @@ class Recipe:
     crop_hw: tuple[int, int]
     lr: float
     backbone_multiplier: float
+    critic_lr: float
     clip_norm: float | None
     warmup_steps: int
     demo_steps: int
@@ -81,6 +87,7 @@ class Scale:
     """How big an experiment is run: the sizes that other groups refer to as ``${scale.*}``.
 
     Attributes:
+        name: of its file.
         pixel_factor: size of a scale's images relative to the paper's, for ``${px:...}``.
         train_sizes: shortest edges that the training resize draws from, pixels.
         crop_hw: training crop, pixels.
@@ -94,12 +101,15 @@ class Scale:
         eval_every: steps between evaluations.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for the backbone.
+        critic_width: channels of a critic's first convolution, where the scheme has a critic.
+        critic_lr: learning rate of a critic, where the scheme has one.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
         pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
     """
 
+    name: str
     pixel_factor: float
     train_sizes: tuple[int, ...]
     crop_hw: tuple[int, int]
@@ -112,6 +122,8 @@ class Scale:
     eval_every: int
     lr: float
     backbone_multiplier: float
+    critic_width: int
+    critic_lr: float
     clip_norm: float | None
     warmup_steps: int
     precision: str

@@ -21,16 +21,17 @@ from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.randomness import torch_generator
-from rgbt.types import Batch, GeneratorOf, Phase
+from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
 RecordStep = Callable[[int, dict[str, float]], None]
 Validate = Callable[[int], float]
+StepData = Batch | TwoDomains
 
 
 class Scheme(Protocol):
     """What the loop asks a scheme."""
 
-    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+    def phases(self, batch: StepData, generator_of: GeneratorOf, /) -> Iterator[Phase]:
         """The backward passes of one step, in order."""
         ...
 
@@ -43,6 +44,7 @@ class Trainer:
         settings: durations and limits.
         scheme: yields the phases of a step.
         model: the network as Fabric wrapped it.
+        others: further networks that are trained (a critic), by the name they have in checkpoints.
         optimizers: by the names that phases use.
         schedule: learning rate factor per step.
         steps_per_epoch: optimiser steps in one epoch.
@@ -58,6 +60,7 @@ class Trainer:
         settings: TrainerSettings,
         scheme: Scheme,
         model: nn.Module,
+        others: dict[str, nn.Module],
         optimizers: dict[str, torch.optim.Optimizer],
         schedule: Schedule,
         steps_per_epoch: int,
@@ -69,6 +72,7 @@ class Trainer:
         self.settings = settings
         self.scheme = scheme
         self.model = model
+        self.others = others
         self.optimizers = optimizers
         self.schedule = schedule
         self.steps_per_epoch = steps_per_epoch
@@ -83,12 +87,14 @@ class Trainer:
             return False
         payload = load_checkpoint(self.last)
         self.model.load_state_dict(payload["model"])
+        for name, module in self.others.items():
+            module.load_state_dict(payload["others"][name])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(payload["optimizers"][name])
         vars(state).update(payload["state"])
         return True
 
-    def fit(self, batches: Iterator[Batch], state: State) -> None:
+    def fit(self, batches: Iterator[StepData], state: State) -> None:
         """Train from ``state.step`` to the last step, keeping `state` up to date.
 
         Args:
@@ -116,52 +122,53 @@ class Trainer:
         if due or state.step % self.settings.eval_every == 0:
             score = self.validate(state.step)
             self.model.train()
-            if score > state.best_score:
+            if score > state.best_score or self.settings.tested == "last":
                 state.best_score, state.best_step = score, state.step
                 save_checkpoint(self.best, {"model": self.model.state_dict(), "step": state.step})
             due = True
         if due or state.step % self.settings.checkpoint_every == 0:
-            save_checkpoint(self.last, training_payload(self.model, self.optimizers, state))
+            payload = training_payload(self.model, self.others, self.optimizers, state)
+            save_checkpoint(self.last, payload)
 
-    def _step(self, step: int, batches: Iterator[Batch], seed: int) -> dict[str, float]:
+    def _step(self, step: int, batches: Iterator[StepData], seed: int) -> dict[str, float]:
         """One optimiser step of every phase; what to record of it."""
         started = time.perf_counter()
-        waited = 0.0
-        images = 0
-        values: dict[str, float] = {}
         rates = self._set_rates(step)
-        for micro in range(self.settings.accumulate):
-            before = time.perf_counter()
-            batch = next(batches).to(self.fabric.device)
-            waited += time.perf_counter() - before
-            images += len(batch.name)
-            index = step * self.settings.accumulate + micro
-            generator_of = partial(
-                torch_generator_of, seed=seed, index=index, device=self.fabric.device
-            )
-            with _naming(step):
-                for phase in self.scheme.phases(batch, generator_of):
-                    _add(values, self._run_phase(phase, micro))
+        first = step * self.settings.accumulate
+        micro = [next(batches) for _ in range(self.settings.accumulate)]
+        waited = time.perf_counter() - started
+        parts = [
+            self.scheme.phases(batch.to(self.fabric.device), self._generators(seed, first + number))
+            for number, batch in enumerate(micro)
+        ]
+        values: dict[str, float] = {}
+        with _naming(step):
+            for phase in parts[0]:
+                # A phase of all batches ends before the next one of any begins: that one may
+                # read, or clear, what this one stepped.
+                _add(values, self._run_phase(phase, parts[1:]))
         elapsed = time.perf_counter() - started
         return {
             **values,
             **rates,
-            "images_per_s": images / elapsed,
+            "images_per_s": sum(len(batch.name) for batch in micro) / elapsed,
             "wait_share": waited / elapsed,
             "peak_memory_mib": _peak_memory_mib(self.fabric.device),
         }
 
-    def _run_phase(self, phase: Phase, micro: int) -> dict[str, float]:
-        optimizer = self.optimizers[phase.optimizer]
-        share = 1.0 / self.settings.accumulate
-        if micro == 0:
-            optimizer.zero_grad()
-        total = torch.stack(list(phase.parts.values())).sum()
-        values = _finite_values(phase.parts)
-        self.fabric.backward(total * share)
-        logged = {f"loss/{name}": value * share for name, value in values.items()}
-        logged["loss"] = sum(values.values()) * share
-        if micro == self.settings.accumulate - 1:
+    def _generators(self, seed: int, index: int) -> GeneratorOf:
+        return partial(torch_generator_of, seed=seed, index=index, device=self.fabric.device)
+
+    def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
+        """Backward through a phase of every accumulated batch, then its optimisers' steps."""
+        if phase.clear:
+            for optimizer in self.optimizers.values():
+                optimizer.zero_grad()
+        logged = self._backward(phase)
+        for phases in others:
+            _add(logged, self._backward(next(phases)))
+        for name in phase.optimizers:
+            optimizer = self.optimizers[name]
             norm = self.fabric.clip_gradients(
                 self.model,
                 optimizer,
@@ -169,8 +176,18 @@ class Trainer:
                 error_if_nonfinite=False,
             )
             assert norm is not None, "clipping by norm returns the norm"
-            logged |= {"grad_norm": _finite_values({"gradient norm": norm})["gradient norm"]}
+            key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{name}"
+            logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
             optimizer.step()
+        return logged
+
+    def _backward(self, phase: Phase) -> dict[str, float]:
+        share = 1.0 / self.settings.accumulate
+        total = torch.stack(list(phase.parts.values())).sum()
+        values = _finite_values(phase.parts)
+        self.fabric.backward(total * share)
+        logged = {f"loss/{name}": value * share for name, value in values.items()}
+        logged["loss"] = sum(values.values()) * share
         return logged
 
     def _set_rates(self, step: int) -> dict[str, float]:

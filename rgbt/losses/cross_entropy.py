@@ -11,9 +11,12 @@ from rgbt.types import IGNORE, Batch, Output, Predicts
 
 
 class CrossEntropy:
-    """Mean over labelled pixels of ``-c_y log softmax(s)_y``, divided by the mean of ``c_y``.
+    """Mean over labelled pixels of ``-q c_y log softmax(s)_y``, divided by the mean of ``c_y``.
 
-    Pixels labelled 255 are left out; a batch without a labelled pixel costs 0.
+    q is the confidence of the label, 1 where labels carry none; it does not enter the mean that is
+    divided by, so that labels of which the teacher is not sure cost little (HeatNet's release,
+    weight_ir_sup). Pixels labelled 255 are left out; a batch without a labelled pixel
+    costs 0.
 
     Args:
         class_weights: c, one value >= 0 per class; null weighs all classes alike.
@@ -41,7 +44,7 @@ class CrossEntropy:
 
         Args:
             output: with `logits` (B, K, H, W).
-            batch: with `label` (B, H, W).
+            batch: with `label` (B, H, W), and `confidence` (B, H, W) or None.
             generator: not drawn from.
 
         Returns:
@@ -49,7 +52,7 @@ class CrossEntropy:
 
         Raises:
             InputError: a network without dense scores, or class weights of another number.
-            ValueError: label and scores of different size.
+            ValueError: label or confidence, and scores, of different size.
         """
         if output.logits is None:
             raise InputError(
@@ -60,7 +63,7 @@ class CrossEntropy:
         check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
         weights = self._weights(sizes["K"], output.logits.device)
         logits = output.logits.float()
-        total = F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="sum")
+        total = _total(logits, batch, weights)
         kept = batch.label[batch.label != IGNORE]
         # The smallest float only matters where nothing is labelled and the sum is 0.
         normaliser = weights[kept].sum().clamp(min=torch.finfo(torch.float32).tiny)
@@ -74,3 +77,14 @@ class CrossEntropy:
                 "classes; give one per class."
             )
         return torch.tensor(weights, device=device)
+
+
+def _total(logits: Tensor, batch: Batch, weights: Tensor) -> Tensor:
+    """() the sum over labelled pixels of ``-q c_y log softmax(s)_y``."""
+    if batch.confidence is None:
+        return F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="sum")
+    check_shape(
+        "confidence", batch.confidence, "B H W", **dict(zip("BHW", batch.label.shape, strict=True))
+    )
+    costs = F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="none")
+    return (batch.confidence * costs).sum()

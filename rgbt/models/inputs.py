@@ -15,6 +15,9 @@ from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import pad_to, padded_hw
 from rgbt.types import MaskPair, View
 
+LUMA = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in the luma of ITU-R BT.601."""
+
 
 class Images(NamedTuple):
     """Normalised images: rgb (N, 3, H', W') and thermal (N, c, H', W'), padded with 0."""
@@ -27,7 +30,8 @@ class Inputs(nn.Module):
     """Images in [0, 1] to what a network was trained on: ``(255 x - mean) / std`` per channel.
 
     Args:
-        rgb_order: "rgb", or "bgr" as OpenCV reads files.
+        rgb_order: "rgb"; "bgr" as OpenCV reads files; or "gray": all three channels are the luma
+            0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
         rgb_mean: in grey levels 0..255, in the order of `rgb_order`.
         rgb_std: likewise, > 0.
         thermal_mean: in grey levels 0..255, one value per channel that the network's thermal
@@ -49,7 +53,7 @@ class Inputs(nn.Module):
     def __init__(
         self,
         *,
-        rgb_order: Literal["rgb", "bgr"],
+        rgb_order: Literal["rgb", "bgr", "gray"],
         rgb_mean: tuple[float, float, float],
         rgb_std: tuple[float, float, float],
         thermal_mean: tuple[float, ...],
@@ -97,6 +101,9 @@ class Inputs(nn.Module):
         check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
         if self.rgb_order == "bgr":
             rgb = rgb.flip(1)
+        elif self.rgb_order == "gray":
+            luma = torch.tensor(LUMA, dtype=rgb.dtype, device=rgb.device).view(1, 3, 1, 1)
+            rgb = (rgb * luma).sum(1, keepdim=True).expand_as(rgb)
         if self.thermal_scale == "image_max":
             # The smallest float only matters where the whole image is 0.
             brightest = thermal.amax((1, 2, 3), keepdim=True)

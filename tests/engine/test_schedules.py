@@ -1,4 +1,4 @@
-"""The schedule of the CMX and temporal releases, against a loop that counts as they do."""
+"""Schedules: those of the CMX and temporal releases against a loop, those of domain adaptation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.engine.schedules import LatePoly
+from rgbt.config import build
+from rgbt.engine.schedules import LatePoly, Poly, Steps, ThesisPoly
 from tests.models.golden import compose
 
 LR = 6e-5
@@ -119,3 +120,53 @@ def test_the_recipe_of_cmx_as_released() -> None:
     assert config.schedule.warmup_steps == 10 * 99
     assert (config.model.decoder_norm_eps, config.model.decoder_norm_eps_eval) == (1e-3, 1e-5)
     assert config.model.inputs.rgb_order == "bgr"
+
+
+def test_thesis_poly_counts_from_one_and_ends_at_zero() -> None:
+    """Rates of the thesis at a quarter, half, three quarters and nine tenths of the run."""
+    schedule = ThesisPoly(power=0.9)
+    steps = 100 * 761
+    rates = [2.5e-4 * schedule(share * steps // 100 - 1, steps, 761) for share in (25, 50, 75, 90)]
+    assert rates == pytest.approx([1.9297e-4, 1.3397e-4, 7.179e-5, 3.147e-5], rel=1e-4)
+    assert schedule(0, 10, 1) == pytest.approx(0.9**0.9)
+    assert schedule(9, 10, 1) == 0.0
+    assert schedule(0, 1, 1) == 0.0
+    poly = Poly(power=0.9, per="iteration", warmup_steps=0)
+    assert [schedule(step, 50, 7) for step in range(49)] == [
+        poly(step + 1, 50, 7) for step in range(49)
+    ]
+
+
+def test_steps_halve_the_rate_every_sixty_of_two_hundred_epochs() -> None:
+    schedule = Steps(factor=0.5, every=0.3)
+    for epoch_steps in (1, 7, 3042):
+        total = 200 * epoch_steps
+        for epoch, expected in ((0, 1), (59, 1), (60, 0.5), (120, 0.25), (179, 0.25), (180, 0.125)):
+            first, last = epoch * epoch_steps, (epoch + 1) * epoch_steps - 1
+            assert schedule(first, total, epoch_steps) == expected
+            assert schedule(last, total, epoch_steps) == expected
+    assert [schedule(step, 10, 1) for step in range(10)] == [
+        *[1.0] * 3, *[0.5] * 3, *[0.25] * 3, 0.125
+    ]  # fmt: skip
+    assert Steps(factor=0.5, every=1.0)(99, 100, 1) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "key"),
+    [
+        (ThesisPoly, {"power": -1.0}, "power"),
+        (Steps, {"factor": 1.5, "every": 0.3}, "factor"),
+        (Steps, {"factor": 0.5, "every": 0.0}, "every"),
+        (Steps, {"factor": 0.5, "every": 1.5}, "every"),
+    ],
+)
+def test_schedules_of_domain_adaptation_refuse_values_out_of_range(
+    make: Any, values: dict[str, float], key: str
+) -> None:
+    with pytest.raises(InputError, match=f"schedule.{key} must lie in"):
+        make(**values)
+
+
+def test_configurations_of_domain_adaptation() -> None:
+    assert build(compose("schedule=steps_heatnet").schedule) == Steps(factor=0.5, every=60 / 200)
+    assert build(compose("schedule=poly_thesis").schedule) == ThesisPoly(power=0.9)

@@ -48,7 +48,7 @@ class Noisy:
         if self.calls == self.poison:
             loss = loss * float("nan")
         self.calls += 1
-        yield Phase("main", {"fit": loss, "extra": 0 * loss})
+        yield Phase(("main",), {"fit": loss, "extra": 0 * loss})
 
 
 def batches(start: int, batch_size: int = 4) -> Iterator[Batch]:
@@ -86,6 +86,7 @@ def make(folder: Path, poison: int | None = None, **changes: object) -> tuple[Tr
         settings=TrainerSettings(**{**SETTINGS, **changes}),
         scheme=Noisy(wrapped, poison),
         model=wrapped,
+        others={},
         optimizers={"main": optimizer},
         schedule=Poly(power=0.9, per="iteration", warmup_steps=0),
         steps_per_epoch=2,
@@ -159,7 +160,7 @@ def quiet(model: nn.Module):
     def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         guess = model(batch.rgb.mean((2, 3)))
         target = batch.rgb.mean((1, 2, 3))[:, None]
-        yield Phase("main", {"fit": (guess - target).square().mean()})
+        yield Phase(("main",), {"fit": (guess - target).square().mean()})
 
     return phases
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -57,3 +58,60 @@ def test_raises(make_batch: Any) -> None:
     for wrong in [(), (1.0, -1.0)]:
         with pytest.raises(InputError, match="at least 0"):
             CrossEntropy(class_weights=wrong)
+
+
+def test_uniform_scores_of_fourteen_classes(make_batch: Any) -> None:
+    batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
+    output = Output(torch.zeros(1, 14, 2, 2), {})
+    part = CrossEntropy(class_weights=None)(output, batch, NOTHING)["cross_entropy"]
+    assert part.item() == pytest.approx(2.639057, abs=1e-6)
+
+
+def test_confidences_by_hand(make_batch: Any) -> None:
+    """Costs log 2, log 2, log 4 of confidence 1, 0.5, 0.25; the ignored pixel counts nowhere."""
+    label = torch.tensor([[[0, 1, 1, 255]]])
+    logits = torch.zeros(1, 2, 1, 4)
+    logits[0, 0, 0, 2] = torch.tensor(3.0).log()  # the probability of class 1 is 1/4
+    batch = replace(make_batch(label), confidence=torch.tensor([[[1.0, 0.5, 0.25, 1.0]]]))
+    part = CrossEntropy(class_weights=None)(Output(logits, {}), batch, NOTHING)["cross_entropy"]
+    log2 = torch.tensor(2.0).log()
+    assert torch.allclose(part, (1 + 0.5 + 0.25 * 2) * log2 / 3)
+    assert part.shape == (1,)
+    # Class weights enter the mean that is divided by, confidences do not.
+    weighted = CrossEntropy(class_weights=(2.0, 0.5))
+    part = weighted(Output(logits, {}), batch, NOTHING)["cross_entropy"]
+    assert torch.allclose(part, (2 * 1 + 0.5 * 0.5 + 0.5 * 0.25 * 2) * log2 / (2 + 0.5 + 0.5))
+
+
+@pytest.mark.parametrize("weights", [None, (1.0, 2.0, 0.5)])
+def test_full_confidence_changes_nothing(make_batch: Any, weights: Any) -> None:
+    generator = torch.Generator().manual_seed(3)
+    label = torch.randint(0, 4, (2, 4, 5), generator=generator)
+    batch = make_batch(torch.where(label == 3, 255, label))
+    output = Output(torch.randn(2, 3, 4, 5, generator=generator), {})
+    loss = CrossEntropy(class_weights=weights)
+    sure = loss(output, replace(batch, confidence=torch.ones(2, 4, 5)), NOTHING)
+    assert torch.allclose(sure["cross_entropy"], loss(output, batch, NOTHING)["cross_entropy"])
+
+
+def test_gradient_is_weighted_by_the_confidence(make_batch: Any) -> None:
+    logits = torch.zeros(1, 3, 1, 2, dtype=torch.float64, requires_grad=True)
+    confidence = torch.tensor([[[0.25, 0.0]]])
+    batch = replace(make_batch(torch.zeros(1, 1, 2, dtype=torch.long)), confidence=confidence)
+    CrossEntropy(class_weights=None)(Output(logits, {}), batch, NOTHING)["cross_entropy"].backward()
+    assert logits.grad is not None
+    assert logits.grad[0, :, 0, 1].abs().sum() == 0
+    assert logits.grad[0, :, 0, 0].tolist() == pytest.approx([-0.25 / 3, 0.125 / 3, 0.125 / 3])
+
+
+def test_confidences_of_another_size_are_refused(make_batch: Any) -> None:
+    batch = replace(make_batch(torch.zeros(1, 2, 2, dtype=torch.long)), confidence=torch.ones(1, 2))
+    with pytest.raises(ValueError, match="confidence: expected shape B=1 x H=2 x W=2"):
+        CrossEntropy(class_weights=None)(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
+
+
+def test_nothing_labelled_costs_nothing_whatever_the_confidence(make_batch: Any) -> None:
+    batch = replace(make_batch(torch.full((1, 2, 2), 255)), confidence=torch.ones(1, 2, 2))
+    output = Output(torch.ones(1, 3, 2, 2), {})
+    part = CrossEntropy(class_weights=None)(output, batch, NOTHING)["cross_entropy"]
+    assert part.item() == 0.0

@@ -44,6 +44,17 @@ def test_bgr_swaps_the_images_channels_and_not_the_means() -> None:
     assert rgb[0, :, 0, 0].tolist() == pytest.approx([0.0, -1.0, 6.0])
 
 
+def test_gray_is_the_luma_in_all_three_channels() -> None:
+    """Red 0.299, green 0.587, blue 0.114 (BT.601); the means are those of `inputs`."""
+    for channel, luma in enumerate((0.299, 0.587, 0.114)):
+        image = torch.zeros(1, 3, 32, 32)
+        image[:, channel] = 1
+        rgb, _ = inputs(rgb_order="gray")(image, ones()[1])
+        expected = [255 * luma / 255, (255 * luma - 51) / 51, (255 * luma - 102) / 25.5]
+        assert rgb.shape == (1, 3, 32, 32)
+        assert rgb[0, :, 5, 7].tolist() == pytest.approx(expected, rel=1e-5)
+
+
 def test_thermal_is_repeated_for_three_channels() -> None:
     three = inputs(thermal_mean=(0.0, 127.5, 0.0), thermal_std=(255.0, 255.0, 127.5))
     assert three.thermal_channels == 3
@@ -130,6 +141,7 @@ def test_one_view_at_a_time() -> None:
         ("unit", ([1.0] * 3, [0.5])),
         ("half", ([1.0] * 3, [0.0])),
         ("half_three", ([1.0] * 3, [0.0] * 3)),
+        ("gray_three", ([(1 - 0.369) / 0.321] * 3, [0.0] * 3)),
         ("temporal", ([1.0] * 3, [1.0] * 3)),
         ("cmx", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),
         ("cmx_released", ([2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778])),

@@ -1,0 +1,77 @@
+"""A network against a critic: what verdicts cost, and which map is judged."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.checks import check_choice, check_shape
+from rgbt.losses.dice import single
+
+Judged = Literal["probabilities", "logits", "self_information"]
+"""What a critic sees of a prediction."""
+
+JUDGED: tuple[Judged, ...] = ("probabilities", "logits", "self_information")
+
+
+def least_squares(verdicts: Tensor, value: float) -> Tensor:
+    """Mean of ``(value - D)^2``.
+
+    Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
+
+    Args:
+        verdicts: of the critic, any shape and float dtype.
+        value: that they should have.
+
+    Returns:
+        () float32 for half precision too.
+    """
+    return (value - single(verdicts)).square().mean()
+
+
+def cross_entropy(verdicts: Tensor, value: float) -> Tensor:
+    """Mean of ``-value log s(D) - (1 - value) log (1 - s(D))`` with the logistic function s.
+
+    Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
+
+    Args:
+        verdicts: of the critic, not squashed; any shape and float dtype.
+        value: that s(D) should have, in [0, 1].
+
+    Returns:
+        () float32 for half precision too; finite for every finite verdict.
+    """
+    verdicts = single(verdicts)
+    return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
+
+
+def judged(logits: Tensor, how: Judged) -> Tensor:
+    """The map that a critic is shown.
+
+        probabilities       p = softmax of the class scores    AdaptSegNet, thesis (J. Sun)
+        logits              the class scores                   HeatNet
+        self_information    -p log p / log K                   ADVENT, Sec. 3.2
+
+    Args:
+        logits: (B, K, H, W) class scores; any float dtype.
+        how: see above.
+
+    Returns:
+        (B, K, H, W), float32 for half precision too.
+
+    Raises:
+        InputError: no such map.
+    """
+    check_choice("judged", how, JUDGED)
+    sizes = check_shape("logits", logits, "B K H W")
+    logits = single(logits)
+    if how == "logits":
+        return logits
+    if how == "probabilities":
+        return logits.softmax(1)
+    log_p = logits.log_softmax(1)  # finite where p is too small to be told from 0
+    return -log_p.exp() * log_p / math.log(max(sizes["K"], 2))  # of one class: 0

@@ -1,0 +1,117 @@
+"""What predictions cost where there is no label: to be sure is cheap."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rgbt.checks import check_choice, check_range
+from rgbt.losses.dice import single
+
+Normalisation = Literal["pixels", "entries"]
+
+LEAST = 1e-30
+"""Smallest probability that a logarithm is taken of (ADVENT release)."""
+
+
+class MaxSquares:
+    """Negative sum of squared probabilities.
+
+        pixels     -1 / (2 N)   sum_n sum_k p_nk^2
+        entries    -1 / (2 N K) sum_n sum_k p_nk^2
+
+    over the N pixels of a batch. With an image-wise ratio r, 1 / N becomes w_n / B, where pixel n
+    of an image of H pixels is predicted to be of a class that h of them are predicted to be of:
+
+        w_n = 1 / max(h^r H^(1 - r), 1)
+
+    so that small classes count for more; with "entries", the 1/2 is then left out, as released.
+
+    Source: MaxSquareLoss; thesis (J. Sun), Eq. 2: "pixels".   Released: "entries", by both. The
+    released weights belong to it: 0.1 (both), and 0.09 with r = 0.2 (MaxSquareLoss, K = 19).
+
+    Args:
+        weight: factor of the loss, >= 0.
+        normalisation: see above.
+        image_wise_ratio: r in [0, 1]; null weighs all pixels alike.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    def __init__(
+        self, *, weight: float, normalisation: Normalisation, image_wise_ratio: float | None
+    ) -> None:
+        check_range("max_squares.weight", weight, 0.0, 1e6)
+        check_choice("max_squares.normalisation", normalisation, ("pixels", "entries"))
+        if image_wise_ratio is not None:
+            check_range("max_squares.image_wise_ratio", image_wise_ratio, 0.0, 1.0)
+        self.weight = weight
+        self.normalisation = normalisation
+        self.image_wise_ratio = image_wise_ratio
+
+    def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
+        """The part "max_squares".
+
+        Args:
+            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype.
+
+        Returns:
+            () times `weight`, <= 0, float32 for half precision too.
+        """
+        probabilities = single(probabilities)
+        squares = probabilities.square().sum(1)
+        entries = self.normalisation == "entries"
+        if self.image_wise_ratio is None:
+            value = squares.mean() / 2
+        else:
+            weights = _image_wise(probabilities.detach(), self.image_wise_ratio)
+            value = (weights * squares).sum((1, 2)).mean() / (1 if entries else 2)
+        return {"max_squares": -self.weight * value / (probabilities.shape[1] if entries else 1)}
+
+
+class Entropy:
+    """Mean over pixels of ``-sum_k p_k log p_k / log K``, in [0, 1].
+
+    Source: ADVENT, Eqs. 2 and 3; thesis (J. Sun), Eq. 1, which does not print the mean.
+    Released: ADVENT, with weight 0.001.
+
+    Args:
+        weight: factor of the loss, >= 0.
+
+    Raises:
+        InputError: a weight out of range.
+    """
+
+    def __init__(self, *, weight: float) -> None:
+        check_range("entropy.weight", weight, 0.0, 1e6)
+        self.weight = weight
+
+    def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
+        """The part "entropy".
+
+        Args:
+            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype. Its
+                gradient is finite at 0 too.
+
+        Returns:
+            () times `weight`, float32 for half precision too.
+        """
+        probabilities = single(probabilities)
+        surprise = -probabilities * probabilities.clamp(min=LEAST).log()
+        highest = math.log(max(probabilities.shape[1], 2))  # of one class, the entropy is 0
+        return {"entropy": self.weight * surprise.sum(1).mean() / highest}
+
+
+def _image_wise(probabilities: Tensor, ratio: float) -> Tensor:
+    """(B, H, W): the w of `MaxSquares`."""
+    classes = probabilities.argmax(1).flatten(1)
+    sizes = probabilities.new_zeros(probabilities.shape[:2])
+    sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
+    total = classes.shape[1]
+    weights = 1 / (sizes**ratio * total ** (1 - ratio)).clamp(min=1)
+    shape = (len(probabilities), *probabilities.shape[2:])
+    return torch.gather(weights, 1, classes).view(shape)

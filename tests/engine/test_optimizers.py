@@ -1,0 +1,173 @@
+"""Builders: rates and parts, updates against the written rule, two heads on one backbone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from rgbt.checks import InputError
+from rgbt.config import build
+from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
+from rgbt.models.critic import Critic
+from tests.models.golden import compose, network
+
+ADAMW: dict[str, Any] = {
+    "lr": 0.1,
+    "backbone_multiplier": 0.5,
+    "weight_decay": 0.0,
+    "decay_biases": True,
+    "betas": (0.9, 0.999),
+    "eps": 1e-8,
+}
+BUILDERS = (
+    AdamW(**ADAMW),
+    SGD(lr=0.1, backbone_multiplier=0.5, momentum=0.9, weight_decay=0.0),
+    RMSprop(lr=0.1, alpha=0.99, eps=1e-8),
+    Adam(lr=0.1, betas=(0.9, 0.99), weight_decay=0.0, eps=1e-8),
+)
+
+
+class TwoHeads(nn.Module):
+    """A backbone and two heads."""
+
+    pretrained_parts = ("backbone.",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone = nn.Linear(2, 2)
+        self.heads = nn.ModuleDict({"source": nn.Linear(2, 1), "target": nn.Linear(2, 1)})
+
+
+def names_in(model: nn.Module, optimizer: torch.optim.Optimizer) -> list[set[str]]:
+    """Names of the parameters of every group."""
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    return [{names[id(each)] for each in group["params"]} for group in optimizer.param_groups]
+
+
+def linear(prefix: str) -> set[str]:
+    return {f"{prefix}.weight", f"{prefix}.bias"}
+
+
+@pytest.mark.parametrize("builder", BUILDERS, ids=lambda builder: type(builder).__name__)
+def test_what_is_left_out_is_not_stepped(builder: Any) -> None:
+    model = TwoHeads()
+    optimizer = builder(model, without=("heads.target.",))
+    found = set().union(*names_in(model, optimizer))
+    assert found == linear("backbone") | linear("heads.source")
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    for parameter in model.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]) == name.startswith("heads.target."), name
+
+
+@pytest.mark.parametrize("builder", BUILDERS, ids=lambda builder: type(builder).__name__)
+def test_every_group_says_its_base_rate_and_without_nothing_is_left_out(builder: Any) -> None:
+    model = TwoHeads()
+    optimizer = builder(model)
+    assert set().union(*names_in(model, optimizer)) == {n for n, _ in model.named_parameters()}
+    assert all(group["lr"] == group["base_lr"] for group in optimizer.param_groups)
+    with pytest.raises(ValueError, match="no parameter's name begins with 'heads.night'"):
+        builder(model, without=("heads.night",))
+
+
+def test_heads_learn_ten_times_as_fast_as_the_backbone_that_they_share() -> None:
+    """Thesis: heads 2.5e-3, backbone 2.5e-4; one optimizer per head, momenta of their own."""
+    builder = SGD(lr=2.5e-3, backbone_multiplier=0.1, momentum=0.9, weight_decay=5e-4)
+    model = TwoHeads()
+    for head, other in (("source", "target"), ("target", "source")):
+        optimizer = builder(model, without=(f"heads.{other}.",))
+        rates = [group["base_lr"] for group in optimizer.param_groups]
+        assert rates == pytest.approx([2.5e-4, 2.5e-3])
+        assert names_in(model, optimizer) == [linear("backbone"), linear(f"heads.{head}")]
+
+
+def test_two_heads_of_the_network_itself() -> None:
+    model = network("deeplabv2_two_heads_tiny", 14)
+    names = {name for name, _ in model.named_parameters()}
+    optimizer = BUILDERS[1](model, without=("heads.source.",))
+    found = set().union(*names_in(model, optimizer))
+    assert names - found == {name for name in names if name.startswith("heads.source.")}
+
+
+def test_frozen_and_shared_parameters_come_never_and_once() -> None:
+    model = TwoHeads()
+    model.heads["target"].weight = model.heads["source"].weight
+    model.backbone.bias.requires_grad_(False)
+    assert sum(p.numel() for p in trainable(model)) == 4 + 2 + 1 + 1
+    groups = parameter_groups(model, (), ("backbone.",))
+    assert sum(len(group) for group in groups.values()) == 3
+
+
+def one(value: float) -> tuple[nn.Module, Tensor]:
+    model = nn.Linear(1, 1, bias=False)
+    with torch.no_grad():
+        model.weight.fill_(value)
+    return model, model.weight
+
+
+def test_rmsprop_steps_as_written() -> None:
+    """v = 0.9 v + 0.1 g^2; w -= lr g / (sqrt(v) + eps), nothing decayed, no momentum."""
+    model, weight = one(1.0)
+    optimizer = RMSprop(lr=0.1, alpha=0.9, eps=0.5)(model)
+    value, square = 1.0, 0.0
+    for gradient in (2.0, -1.0, 0.5):
+        weight.grad = torch.full_like(weight, gradient)
+        optimizer.step()
+        square = 0.9 * square + 0.1 * gradient**2
+        value -= 0.1 * gradient / (square**0.5 + 0.5)
+        assert weight.item() == pytest.approx(value, rel=1e-6)
+
+
+def test_adam_steps_as_written() -> None:
+    """The decay is part of the gradient; both moments are corrected for their start."""
+    model, weight = one(1.0)
+    optimizer = Adam(lr=0.1, betas=(0.5, 0.75), weight_decay=0.25, eps=0.5)(model)
+    value, first, second = 1.0, 0.0, 0.0
+    for step, gradient in enumerate((2.0, -1.0, 0.5), 1):
+        weight.grad = torch.full_like(weight, gradient)
+        optimizer.step()
+        whole = gradient + 0.25 * value
+        first, second = 0.5 * first + 0.5 * whole, 0.75 * second + 0.25 * whole**2
+        corrected = first / (1 - 0.5**step), (second / (1 - 0.75**step)) ** 0.5
+        value -= 0.1 * corrected[0] / (corrected[1] + 0.5)
+        assert weight.item() == pytest.approx(value, rel=1e-5)
+
+
+def test_a_critic_has_one_group() -> None:
+    critic = Critic(in_channels=3, base_width=2, upsample=False, align_corners=False)
+    for builder in BUILDERS[2:]:
+        optimizer = builder(critic)
+        assert names_in(critic, optimizer) == [{name for name, _ in critic.named_parameters()}]
+
+
+@pytest.mark.parametrize(
+    ("make", "change"),
+    [
+        (RMSprop, {"lr": 0.0}),
+        (RMSprop, {"alpha": 1.0}),
+        (Adam, {"lr": -1.0}),
+        (Adam, {"betas": (0.9, 1.0)}),
+        (Adam, {"weight_decay": -0.1}),
+    ],
+)
+def test_values_out_of_range_are_refused(make: Any, change: dict[str, Any]) -> None:
+    good: dict[Any, dict[str, Any]] = {
+        RMSprop: {"lr": 0.1, "alpha": 0.99, "eps": 1e-8},
+        Adam: {"lr": 0.1, "betas": (0.9, 0.99), "weight_decay": 0.0, "eps": 1e-8},
+    }
+    with pytest.raises(InputError, match=f"optimizer.{next(iter(change))} must"):
+        make(**{**good[make], **change})
+
+
+def test_configurations_hold_the_published_numbers() -> None:
+    rates = ("scale.lr=2.5e-3", "scale.backbone_multiplier=0.1")
+    sgd = build(compose("optimizer=sgd_thesis", *rates).optimizer)
+    assert sgd == SGD(lr=2.5e-3, backbone_multiplier=0.1, momentum=0.9, weight_decay=5e-4)
+    node = compose("optimizer=rmsprop_heatnet", "scale.lr=1e-4").optimizer
+    defaults = torch.optim.RMSprop(nn.Linear(1, 1).parameters()).defaults
+    assert build(node) == RMSprop(lr=1e-4, alpha=defaults["alpha"], eps=defaults["eps"])

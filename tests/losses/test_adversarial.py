@@ -1,0 +1,103 @@
+"""Verdicts and what is judged: values by hand, gradients, edges of the range."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.losses.adversarial import JUDGED, Judged, cross_entropy, judged, least_squares
+from rgbt.losses.unlabelled import Entropy
+
+
+def test_a_critic_that_says_half_everywhere() -> None:
+    """Thesis, Eqs. 5 and 6: source 0, target 1; the network wants its target called source."""
+    verdicts = torch.full((2, 1, 10, 20), 0.5)
+    critic = least_squares(verdicts, 0) + least_squares(verdicts, 1)
+    assert critic.item() == 0.5
+    assert least_squares(verdicts, 0).item() == 0.25
+    assert 0.01 * least_squares(verdicts, 0).item() == pytest.approx(0.0025)
+
+
+def test_least_squares_by_hand() -> None:
+    verdicts = torch.tensor([[[[2.0, -1.0], [0.0, 1.0]]]])
+    assert least_squares(verdicts, 1).item() == (1 + 4 + 1 + 0) / 4
+    assert least_squares(verdicts, 0).item() == (4 + 1 + 0 + 1) / 4
+    assert least_squares(verdicts, 1).shape == ()
+
+
+def test_cross_entropy_by_hand() -> None:
+    verdicts = torch.tensor([[[[0.0, math.log(3)]]]])  # logistic function: 1/2 and 3/4
+    assert cross_entropy(verdicts, 1).item() == pytest.approx((math.log(2) + math.log(4 / 3)) / 2)
+    assert cross_entropy(verdicts, 0).item() == pytest.approx((math.log(2) + math.log(4)) / 2)
+    assert cross_entropy(verdicts, 0.5).item() == pytest.approx(
+        (math.log(2) + math.log(4) / 2 + math.log(4 / 3) / 2) / 2
+    )
+
+
+@pytest.mark.parametrize("loss", [least_squares, cross_entropy])
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_gradients_of_verdicts(loss, value: float) -> None:  # noqa: ANN001
+    generator = torch.Generator().manual_seed(0)
+    verdicts = torch.randn(2, 1, 3, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda d: loss(d, value), (verdicts,))
+
+
+def test_large_verdicts_cost_finite_values() -> None:
+    verdicts = torch.tensor([3e4, -3e4]).half().requires_grad_()
+    for loss in (least_squares, cross_entropy):
+        for value in (0, 1):
+            found = loss(verdicts, value)
+            assert found.dtype == torch.float32
+            assert found.isfinite()
+    assert cross_entropy(torch.tensor([1e4]), 0).item() == 1e4
+    assert cross_entropy(torch.tensor([1e4]), 1).item() == 0
+
+
+def test_what_is_judged_by_hand() -> None:
+    logits = torch.tensor([0.7, 0.2, 0.1]).log().view(1, 3, 1, 1) + 5
+    assert torch.equal(judged(logits, "logits"), logits)
+    assert judged(logits, "probabilities").flatten().tolist() == pytest.approx([0.7, 0.2, 0.1])
+    found = judged(logits, "self_information").flatten().tolist()
+    expected = [-p * math.log2(p) / math.log2(3) for p in (0.7, 0.2, 0.1)]
+    assert found == pytest.approx(expected, rel=1e-5)
+    assert sum(found) == pytest.approx(0.729847, abs=1e-6)
+
+
+def test_self_information_sums_to_the_entropy() -> None:
+    generator = torch.Generator().manual_seed(1)
+    logits = 3 * torch.randn(2, 14, 4, 5, generator=generator)
+    total = judged(logits, "self_information").sum(1).mean()
+    entropy = Entropy(weight=1.0)(logits.softmax(1))["entropy"]
+    torch.testing.assert_close(total, entropy)
+
+
+@pytest.mark.parametrize("how", JUDGED)
+def test_gradients_of_what_is_judged(how: Judged) -> None:
+    generator = torch.Generator().manual_seed(2)
+    logits = torch.randn(2, 3, 2, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: judged(s, how), (logits,))
+
+
+@pytest.mark.parametrize("how", JUDGED)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_large_scores_are_judged_with_finite_gradients(how: Judged, dtype: torch.dtype) -> None:
+    logits = torch.tensor([1e5, -1e5, 0.0]).to(dtype).view(1, 3, 1, 1).requires_grad_()
+    found = judged(logits, how)
+    assert found.dtype == torch.float32
+    assert found.isfinite().all()
+    least_squares(found, 0.5).backward()
+    assert logits.grad is not None
+    assert logits.grad.isfinite().all()
+    if how != "logits":
+        assert found.min() >= 0
+        assert found.max() <= 1
+
+
+def test_raises() -> None:
+    with pytest.raises(InputError, match="judged: 'logit' is not a choice; did you mean 'logits'"):
+        judged(torch.zeros(1, 3, 2, 2), "logit")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="logits: expected shape"):
+        judged(torch.zeros(3, 2, 2), "logits")

@@ -1,0 +1,66 @@
+"""The loss of both score maps of a network with an auxiliary head."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.config import build
+from rgbt.losses.auxiliary import WithAuxiliary
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.types import Output
+from tests.models.golden import compose
+
+NOTHING = torch.Generator()
+
+
+def with_auxiliary(weight: float = 0.1) -> WithAuxiliary:
+    return WithAuxiliary(loss=CrossEntropy(class_weights=None), weight=weight)
+
+
+def test_value_by_hand(make_batch: Any) -> None:
+    """Scores for class 1 of (0, 0) and (0, log 3): log 2, and a tenth of log 4/3."""
+    output = Output(
+        torch.zeros(1, 2, 1, 1),
+        {"aux_logits": torch.tensor([0.0, math.log(3)]).view(1, 2, 1, 1), "other": torch.ones(1)},
+    )
+    batch = make_batch(torch.ones(1, 1, 1, dtype=torch.long))
+    parts = with_auxiliary()(output, batch, NOTHING)
+    assert list(parts) == ["cross_entropy", "cross_entropy_aux"]
+    assert parts["cross_entropy"].item() == pytest.approx(math.log(2))
+    assert parts["cross_entropy_aux"].item() == pytest.approx(0.1 * math.log(4 / 3))
+    assert all(part.shape == (1,) for part in parts.values())
+
+
+def test_both_heads_get_a_gradient(make_batch: Any) -> None:
+    main, aux = (torch.zeros(1, 3, 2, 2, requires_grad=True) for _ in range(2))
+    batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
+    parts = with_auxiliary(0.25)(Output(main, {"aux_logits": aux}), batch, NOTHING)
+    torch.stack(list(parts.values())).sum().backward()
+    assert main.grad is not None
+    assert aux.grad is not None
+    assert torch.allclose(aux.grad, 0.25 * main.grad)
+    assert main.grad.abs().sum() > 0
+
+
+def test_it_says_what_it_reads() -> None:
+    assert with_auxiliary().reads == "scores"
+
+
+def test_raises(make_batch: Any) -> None:
+    batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
+    with pytest.raises(InputError, match="choose model=deeplabv2_auxiliary"):
+        with_auxiliary()(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
+    with pytest.raises(InputError, match="loss.weight must lie in"):
+        with_auxiliary(-0.1)
+
+
+def test_configuration() -> None:
+    loss = build(compose("loss=cross_entropy_auxiliary").loss)
+    assert isinstance(loss, WithAuxiliary)
+    assert isinstance(loss.loss, CrossEntropy)
+    assert loss.weight == 0.1

@@ -1,0 +1,155 @@
+"""Maximum squares and entropy: values by hand, gradients, edges of the range."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.losses.unlabelled import Entropy, MaxSquares
+
+
+def squares(
+    p: Tensor, normalisation: str = "pixels", ratio: float | None = None, weight: float = 1.0
+) -> Tensor:
+    values: Any = {"normalisation": normalisation, "image_wise_ratio": ratio, "weight": weight}
+    return MaxSquares(**values)(p)["max_squares"]
+
+
+def entropy(p: Tensor, weight: float = 1.0) -> Tensor:
+    return Entropy(weight=weight)(p)["entropy"]
+
+
+def constant(values: tuple[float, ...]) -> Tensor:
+    """(2, K, 3, 5) with the same probabilities everywhere."""
+    return torch.tensor(values).view(1, -1, 1, 1).expand(2, len(values), 3, 5)
+
+
+UNIFORM = (1 / 14,) * 14
+ONE_HOT = (0.0,) * 3 + (1.0,) + (0.0,) * 10
+SURE = (0.7, 0.2, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "pixels", "entries", "surprise"),
+    [
+        (UNIFORM, -0.0357143, -0.00255102, 1.0),  # 14 / 14^2 / 2; 1 / 14 of that
+        (ONE_HOT, -0.5, -0.0357143, 0.0),
+        (SURE, -0.27, -0.09, 0.729847),  # 0.54 / 2; 0.8018186 nats of 1.0986123
+    ],
+)
+def test_values_by_hand(
+    values: tuple[float, ...], pixels: float, entries: float, surprise: float
+) -> None:
+    p = constant(values)
+    assert squares(p).item() == pytest.approx(pixels, abs=1e-7)
+    assert squares(p, "entries").item() == pytest.approx(entries, abs=1e-7)
+    assert entropy(p).item() == pytest.approx(surprise, abs=1e-6)
+    assert squares(p, weight=0.1).item() == pytest.approx(0.1 * pixels, abs=1e-7)
+    assert entropy(p, weight=0.25).item() == pytest.approx(0.25 * surprise, abs=1e-6)
+    assert squares(p).shape == entropy(p).shape == ()
+
+
+def by_loops(p: Tensor, ratio: float) -> float:
+    """-sum of w p^2 over pixels and classes and images."""
+    total = 0.0
+    for image in p.tolist():
+        pixels = list(zip(*(sum(rows, []) for rows in image), strict=True))
+        predicted = [max(range(len(pixel)), key=pixel.__getitem__) for pixel in pixels]
+        for pixel, k in zip(pixels, predicted, strict=True):
+            size = predicted.count(k) ** ratio * len(pixels) ** (1 - ratio)
+            total -= sum(value**2 for value in pixel) / max(size, 1)
+    return total
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 0.7, 1.0])
+def test_image_wise_weights_against_loops(ratio: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    p = (2 * torch.randn(3, 4, 5, 6, generator=generator, dtype=torch.float64)).softmax(1)
+    total = by_loops(p, ratio)
+    assert squares(p, "pixels", ratio).item() == pytest.approx(total / (2 * 3), rel=1e-9)
+    assert squares(p, "entries", ratio).item() == pytest.approx(total / (3 * 4), rel=1e-9)
+
+
+def test_image_wise_weights_by_hand() -> None:
+    """Four pixels, three of class 0: with r = 1/2 they weigh 1 / sqrt(12), the other 1 / 2."""
+    p = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]]).T.reshape(1, 2, 2, 2)
+    expected = 3 / math.sqrt(12) + 1 / 2
+    assert squares(p, "entries", 0.5).item() == pytest.approx(-expected / 2)
+    # Without any class: every pixel 1 / H, as without the ratio.
+    assert squares(p, "pixels", 0.0).item() == pytest.approx(squares(p).item()) == -0.5
+
+
+def test_what_is_sure_costs_less() -> None:
+    sharper = [torch.softmax(scale * torch.tensor(SURE).log(), 0) for scale in (0.5, 1, 2, 8)]
+    ps = [each.view(1, 3, 1, 1) for each in sharper]
+    for loss in (squares, entropy):
+        values = [loss(p).item() for p in ps]
+        assert values == sorted(values, reverse=True)
+
+
+@pytest.mark.parametrize("ratio", [None, 0.2])
+@pytest.mark.parametrize("normalisation", ["pixels", "entries"])
+def test_gradient_of_max_squares(normalisation: str, ratio: float | None) -> None:
+    generator = torch.Generator().manual_seed(1)
+    scores = torch.randn(2, 3, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda s: squares(s.softmax(1), normalisation, ratio, 0.1), (scores,)
+    )
+
+
+def test_gradient_of_entropy() -> None:
+    generator = torch.Generator().manual_seed(2)
+    scores = torch.randn(2, 3, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: entropy(s.softmax(1)), (scores,))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_large_scores_give_finite_values_and_gradients(dtype: torch.dtype) -> None:
+    scores = torch.tensor([1e4, -1e4, 0.0, 1e4]).to(dtype).view(1, 4, 1, 1).repeat(1, 1, 2, 2)
+    for loss in (
+        squares,
+        entropy,
+        lambda p: squares(p, "entries", 0.2),
+        lambda p: squares(p, "pixels", 1.0),
+    ):
+        leaf = scores.clone().requires_grad_()
+        p = leaf.softmax(1)
+        assert (p == 0).any()
+        value = loss(p)
+        assert value.dtype == torch.float32
+        assert value.isfinite()
+        value.backward()
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all()
+
+
+def test_a_probability_of_zero_has_a_finite_gradient() -> None:
+    p = constant(ONE_HOT).clone().requires_grad_()
+    entropy(p).backward()
+    assert p.grad is not None
+    assert p.grad.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"weight": -1.0}, "max_squares.weight"),
+        ({"weight": math.nan}, "max_squares.weight"),
+        ({"image_wise_ratio": 1.5}, "max_squares.image_wise_ratio"),
+        ({"normalisation": "pixel"}, "max_squares.normalisation.*did you mean 'pixels'"),
+    ],
+)
+def test_values_out_of_range_are_refused(changes: dict[str, Any], key: str) -> None:
+    good: dict[str, Any] = {"weight": 1.0, "normalisation": "pixels", "image_wise_ratio": None}
+    with pytest.raises(InputError, match=key):
+        MaxSquares(**{**good, **changes})
+
+
+def test_a_negative_weight_of_entropy_is_refused() -> None:
+    with pytest.raises(InputError, match=r"entropy.weight must lie in"):
+        Entropy(weight=-0.1)
