@@ -12,7 +12,7 @@ from rgbt.command import built
 
 if TYPE_CHECKING:
     from analysis.uncertainty.settings import NamedBlocks
-    from rgbt.data.mfnet import MFNet
+    from rgbt.data.dataset import LabelledDataset
 
 MOST = 1_000_000
 """What a count may be, where nothing else limits it."""
@@ -82,11 +82,11 @@ def refuse_others(overrides: Sequence[str], known: Sequence[str], own: Sequence[
             raise InputError(f"'{key}' has no effect here; {nearest(key, [*own, *known])}.")
 
 
-def dataset_of(overrides: Sequence[str]) -> MFNet:
+def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
     """The data set that overrides choose.
 
     Raises:
-        InputError: none is chosen, wrong settings, or a data set in another layout than MFNet's.
+        InputError: none is chosen, or wrong settings.
     """
     # Without this the images of another data set would be scored against the embedded one.
     if not any(word.startswith("dataset=") for word in overrides):
@@ -94,12 +94,5 @@ def dataset_of(overrides: Sequence[str]) -> MFNet:
             "the data set has to be named: dataset=mfnet dataset.root=/data/MFNet, or "
             "dataset=synth, the embedded one."
         )
-    from rgbt.data.mfnet import MFNet
-
-    dataset = built("dataset", overrides)
-    if not isinstance(dataset, MFNet):
-        raise InputError(
-            f"dataset: expected a data set in MFNet's layout, got {type(dataset).__name__}; choose "
-            "dataset=mfnet or dataset=synth."
-        )
+    dataset: LabelledDataset = built("dataset", overrides)
     return dataset

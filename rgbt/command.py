@@ -92,7 +92,7 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-PATHS = ("model.weights", "dataset.root", "runs_dir", "out")
+PATHS = ("model.weights", "pretrained", "dataset.root", "runs_dir", "out")
 
 
 def readable_paths(words: list[str]) -> list[str]:

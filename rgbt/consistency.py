@@ -62,7 +62,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     runs_dir = Path(arguments["runs_dir"])
     stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
     session, split = stored.session, arguments["split"]
-    view = view_of(session.model, arguments["modality"])
+    view = view_of(session, arguments["modality"])
     frames = cast(Frames, arguments["frames"])
     folder = Path(arguments["out"] or stored.folder)
     beside = [arguments["modality"]] if arguments["modality"] != "default" else []

@@ -6,8 +6,11 @@ Counts are written, and the tables that follow from them are shown.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast, get_args
 
+from rgbt.checks import check_choice
 from rgbt.command import plain_command
+from rgbt.data.domains import TestedHead
 
 OWN = {
     "run": "",
@@ -15,6 +18,7 @@ OWN = {
     "split": "test",
     "modality": "default",
     "regions": "as trained",
+    "head": "as trained",
     "checkpoint": "best",
     "out": "",
 }
@@ -28,6 +32,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     split     split of the data set
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
+    head      of a network with a head per domain: own, source or target
     checkpoint  best (by validation mIoU) or last
     out       file of the counts; default: evaluations/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1
@@ -41,20 +46,29 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     runs_dir = Path(arguments["runs_dir"])
     stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
     session = stored.session
-    view = view_of(session.model, arguments["modality"])
-    found = evaluate(session, session.model, arguments["split"], view=view)
+    view = view_of(session, arguments["modality"])
+    head = _head(arguments["head"])
+    found = evaluate(session, session.model, arguments["split"], view=view, head=head)
     counts = found.counts
     stem = "_".join(
         [session.dataset.name, counts.split, view, counts.partition]
+        + ([] if head is None else [f"{head}-head"])
         + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
     )
     path = Path(arguments["out"] or stored.folder / f"{stem}.npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)
-    label = f"{stored.label} {session.dataset.name} {view}"
+    label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
     tables = result_tables(counts, session.regions, label, stored.step)
     show(result_view(tables, path.parent, [("counts", str(path))]))
     return 0
+
+
+def _head(asked: str) -> TestedHead | None:
+    if asked == OWN["head"]:
+        return None
+    check_choice("head", asked, get_args(TestedHead))
+    return cast(TestedHead, asked)
 
 
 if __name__ == "__main__":

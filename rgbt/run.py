@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 @command(sweeper="study")
 def main(config: DictConfig) -> int:
-    """Train, evaluate the best checkpoint on the test split, show the tables."""
-    from rgbt.training import train  # torch and mlflow load here, after --help has been answered
+    """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
+    from rgbt.earlier import finish_earlier  # torch and mlflow load here, after --help
+    from rgbt.training import train
 
+    finish_earlier(config, train)
     train(config, task_overrides())
     return 0
 

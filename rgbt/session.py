@@ -15,10 +15,12 @@ from torch import nn
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build
+from rgbt.data.domains import Domains, TestedHead
+from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
-from rgbt.data.mfnet import MFNet
+from rgbt.data.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
-from rgbt.engine.evaluate import predictions
+from rgbt.engine.evaluate import HeadsOf, predictions
 from rgbt.engine.progress import progress
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics import scores
@@ -44,6 +46,7 @@ class Session:
     Attributes:
         config: the composed configuration, checked.
         dataset: where samples come from.
+        domains: which of them are trained on, and which head predicts an image.
         transform: makes examples of them.
         loading: batch sizes, workers, what to do about unreadable files.
         regions: partition of the image and the rule for absent classes.
@@ -55,7 +58,8 @@ class Session:
     """
 
     config: DictConfig
-    dataset: MFNet
+    dataset: LabelledDataset
+    domains: Domains
     transform: Any
     loading: LoaderSettings
     regions: Regions
@@ -66,11 +70,15 @@ class Session:
     weights: Report | None
 
 
-def open_session(config: DictConfig) -> Session:
+def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
     Weights are drawn from (seed, "weights") without touching the global generator; those that
     `model.weights` names replace them.
+
+    Args:
+        config: composed and checked.
+        label_map: from the classes of the network to those of the data set, where they differ.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the file of weights.
@@ -83,16 +91,13 @@ def open_session(config: DictConfig) -> Session:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(config.seed, "weights"))
         model: nn.Module = build(config.model)
-    dataset: MFNet = build(config.dataset)
-    if config.model.get("num_classes", dataset.num_classes) != dataset.num_classes:
-        raise InputError(
-            f"model.num_classes is {config.model.num_classes} but {dataset.name} has "
-            f"{dataset.num_classes} classes; leave it to the data set."
-        )
+    dataset: LabelledDataset = build(config.dataset)
+    _check_classes(config, dataset, label_map)
     weights = start(model, config)
     return Session(
         config=config,
         dataset=dataset,
+        domains=build(config.domains),
         transform=build(config.transform),
         loading=build(config.data),
         regions=build(config.metric),
@@ -102,6 +107,20 @@ def open_session(config: DictConfig) -> Session:
         model=model.to(fabric.device),
         weights=weights,
     )
+
+
+def _check_classes(
+    config: DictConfig, dataset: LabelledDataset, label_map: LabelMap | None
+) -> None:
+    num_classes = config.model.get("num_classes", dataset.num_classes)
+    if label_map is not None:
+        label_map.check(num_classes, tuple(dataset.classes), dataset.name)
+    elif num_classes != dataset.num_classes:
+        raise InputError(
+            f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
+            "classes; leave it to the data set, or let rgbt.predict map the classes of a network "
+            "that was trained on others with label_map=..."
+        )
 
 
 def _fabric(trainer: TrainerSettings) -> Fabric:
@@ -116,17 +135,37 @@ def _fabric(trainer: TrainerSettings) -> Fabric:
         ) from error
 
 
-def view_of(model: nn.Module, modality: str) -> View:
-    """What `modality` asks of a network: one of its views; the first for "default".
+def view_of(session: Session, modality: str = "default") -> View:
+    """What `modality` asks of a session's network: one of its views.
+
+    "default" is what its source domain is seen as; where that does not say, the network's first.
 
     Raises:
         InputError: the network does not predict from it.
     """
-    known: tuple[View, ...] = getattr(model, "views", VIEWS)
+    known: tuple[View, ...] = getattr(session.model, "views", VIEWS)
     if modality == "default":
-        return known[0]
+        return session.domains.source.view or known[0]
     check_choice("modality", modality, known)
     return cast(View, modality)
+
+
+def heads_of(session: Session, view: View, head: TestedHead | None = None) -> HeadsOf:
+    """Which head predicts an image: by its domain, or as asked.
+
+    Args:
+        session: see `open_session`.
+        view: what is predicted from.
+        head: None: as the run's configuration says (`domains.tested_head`).
+    """
+    asked = session.domains.tested_head if head is None else head
+
+    def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
+        nights = session.dataset.nights(names) if session.domains.target_is == "night" else None
+        dark = nights or (None,) * len(names)
+        return tuple(session.domains.head_of(view, night, asked) for night in dark)
+
+    return choose
 
 
 @dataclass(frozen=True)
@@ -150,6 +189,7 @@ def evaluate(
     split: str,
     *,
     view: View | None = None,
+    head: TestedHead | None = None,
     keep: Collection[str] = (),
 ) -> Evaluation:
     """Predict a split and count, with a progress bar.
@@ -158,7 +198,8 @@ def evaluate(
         session: see `open_session`.
         model: the network to evaluate; left in evaluation mode.
         split: name of the split.
-        view: what is predicted from; None takes the network's first.
+        view: what is predicted from; None: see `view_of`.
+        head: which of two heads predicts an image; None: as the run's configuration says.
         keep: names of the images to return for pictures.
 
     Raises:
@@ -169,9 +210,11 @@ def evaluate(
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: dict[str, np.ndarray] = {}
     kept: list[Example] = []
+    view = view or view_of(session)
+    heads = heads_of(session, view, head)
     with progress() as display:
         task = display.add_task(split, total=len(dataset.names(split)), note="images")
-        for found in predictions(model, batches, session.fabric, view):
+        for found in predictions(model, batches, session.fabric, view, heads):
             triples = zip(found.batch.name, found.batch.label, found.classes, strict=True)
             for name, label, classes in triples:
                 counted[name] = counter(label, classes)
@@ -187,6 +230,7 @@ def evaluate(
         partition=session.regions.name,
         dataset=dataset.fingerprint(),
         split=split,
+        unscored=dataset.unscored,
     )
     return Evaluation(counts, tuple(kept), tuple(batches.skipped))
 
@@ -206,10 +250,10 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
         label: what the row stands for, e.g. "grbm".
         step: optimiser steps done.
     """
-    absent = regions.absent
+    absent, scored = regions.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
-    region_ious = scores.miou(by_region, absent)
-    parts = {part: scores.miou(sub.whole(), absent) for part, sub in counts.parts().items()}
+    region_ious = scores.miou(by_region, absent, scored)
+    parts = {part: scores.miou(sub.whole(), absent, scored) for part, sub in counts.parts().items()}
     return ResultTables(
         split=counts.split,
         step=step,
@@ -217,7 +261,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
         regions=RegionTable(
             row_label=label,
             region_ious=tuple(map(float, region_ious)),
-            miou=float(scores.miou(whole, absent)),
+            miou=float(scores.miou(whole, absent, scored)),
             variance=float(scores.variance(region_ious)),
         ),
         classes=ClassTable(
@@ -226,16 +270,17 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             accuracies=tuple(map(float, scores.recall(whole, absent))),
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
             subset_mious={part: float(value) for part, value in parts.items()},
+            unscored=counts.unscored,
         ),
     )
 
 
-def legend_of(dataset: MFNet) -> Legend:
+def legend_of(dataset: LabelledDataset) -> Legend:
     """Classes of a data set and their colours."""
     return Legend(dataset.classes, np.array(dataset.palette, np.uint8))
 
 
-def panel_names(dataset: MFNet, split: str) -> tuple[str, ...]:
+def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
     """The first images of a split, half by day and half by night where it holds both."""
     names = dataset.names(split)
     at_night = dataset.nights(names) or (False,) * len(names)

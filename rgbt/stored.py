@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config import check, compose, flatten, register_resolvers, run_key, weights_file
+from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
@@ -42,7 +43,11 @@ class Stored:
 
 
 def open_trained(
-    run: str, runs_dir: Path, overrides: list[str], checkpoint: str = "best"
+    run: str,
+    runs_dir: Path,
+    overrides: list[str],
+    checkpoint: str = "best",
+    label_map: LabelMap | None = None,
 ) -> Stored:
     """What ``run=`` names; without, the network of `overrides` with `model.weights`.
 
@@ -52,12 +57,13 @@ def open_trained(
         overrides: of the stored configuration, or (without a run) of the configuration at
             scale=paper, such as model=mfnet model.weights=final.pth dataset.root=/data/MFNet.
         checkpoint: "best" or "last" of a run.
+        label_map: from the classes of the network to those of the data set, where they differ.
 
     Raises:
         InputError: no such run; no weights; settings that do not fit.
     """
     if run:
-        return open_run(find_run(run, runs_dir), overrides, checkpoint)
+        return open_run(find_run(run, runs_dir), overrides, checkpoint, label_map)
     config = compose(["scale=paper", f"runs_dir={runs_dir}", *overrides])
     source = weights_file(config)
     if source is None:
@@ -68,7 +74,7 @@ def open_trained(
     check(config)
     if checkpoint != "best":
         raise InputError(f"checkpoint={checkpoint} is one of a run; name that with run=...")
-    session = open_session(config)
+    session = open_session(config, label_map)
     if session.weights is not None and session.weights.fresh:
         raise InputError(
             f"{source} does not hold the whole network, the rest would be random: "
@@ -79,7 +85,12 @@ def open_trained(
     return Stored(session, 0, runs_dir / "evaluations" / place, source.name)
 
 
-def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> Stored:
+def open_run(
+    folder: Path,
+    overrides: list[str],
+    checkpoint: str = "best",
+    label_map: LabelMap | None = None,
+) -> Stored:
     """Session of a stored run with its weights.
 
     Args:
@@ -87,6 +98,7 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
         overrides: of the stored configuration (`CHANGEABLE`). ``dataset=mfnet`` replaces the whole
             node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
         checkpoint: "best" by the selection split, or "last".
+        label_map: from the classes it was trained with to those of the data set, where they differ.
 
     Raises:
         InputError: overrides that do not fit, no checkpoint, other classes than trained.
@@ -94,21 +106,26 @@ def open_run(folder: Path, overrides: list[str], checkpoint: str = "best") -> St
     register_resolvers()
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"
-    if "consistency" not in config:  # a run of before there was any
-        config.consistency = OmegaConf.to_container(compose([]).consistency, resolve=True)
+    defaults = compose([])
+    for key in defaults:
+        if key not in config:  # a run of before there was any
+            value = defaults[key]
+            plain = OmegaConf.is_config(value)
+            config[key] = OmegaConf.to_container(value, resolve=True) if plain else value
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
     check(config)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     weights = folder / f"{checkpoint}.pt"
     payload = load_checkpoint(weights)
-    session = open_session(config)
+    session = open_session(config, label_map)
     for path in sorted(folder.glob("counts_*.npz"))[:1]:
         trained = Counts.load(path).classes
-        if trained != tuple(session.dataset.classes):
+        if label_map is None and trained != tuple(session.dataset.classes):
             raise InputError(
                 f"{folder} was trained with the classes {', '.join(trained)}, but "
-                f"{session.dataset.name} has {', '.join(session.dataset.classes)}."
+                f"{session.dataset.name} has {', '.join(session.dataset.classes)}; rgbt.predict "
+                "can map them with label_map=..."
             )
     restore_weights(session.model, payload["model"], weights)
     step = payload["step"] if checkpoint == "best" else payload["state"]["step"]

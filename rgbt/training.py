@@ -11,26 +11,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, run_key
-from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.data.loaders import Batches
+from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
-from rgbt.engine.schedules import Schedule
-from rgbt.engine.trainer import Scheme, Trainer
-from rgbt.losses.distillation import sdc, sdn
+from rgbt.engine.trainer import StepData, Trainer
 from rgbt.metrics import names, scores
 from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe
-from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.prepared import Prepared, prepare
 from rgbt.session import (
     Session,
     evaluate,
     legend_of,
-    open_session,
     panel_names,
     result_tables,
 )
@@ -43,9 +39,7 @@ from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.transforms.view_sets import ViewSets
-from rgbt.transforms.virtual_view import VirtualView
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
-from rgbt.types import Batch, Masker, Sample
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
@@ -100,105 +94,6 @@ def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
             "its consistency on these views and splits has not been measured; to add it: "
             f"python -m rgbt.consistency run={folder.path} split=..."
         )
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """The objects of a training, before anything is written.
-
-    Attributes:
-        session: data, transform, network.
-        model: the network as Fabric wrapped it.
-        optimizer: of the network; schemes call it "main".
-        scheme: yields the phases of a step.
-        schedule: learning rate factor per step.
-    """
-
-    session: Session
-    model: nn.Module
-    optimizer: torch.optim.Optimizer
-    scheme: Scheme
-    schedule: Schedule
-
-
-def prepare(config: DictConfig) -> Prepared:
-    """Build everything and look at all lists that the run will read, so that errors come first."""
-    session = open_session(config)
-    for split in ("train", session.trainer.selection_split, "test"):
-        session.dataset.names(split)
-    steps_per_epoch(session.dataset, session.loading)
-    masker: Masker = build(config.masker)
-    if session.transform.crop_hw is not None and not masker.hides_nothing:
-        # One draw for nothing: cells that do not fit the crop are told before the run is begun.
-        centre = torch.zeros(1, 2, dtype=torch.int64)
-        masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
-    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
-    if expected and session.weights is None:
-        tell(
-            "the published recipe starts from ImageNet weights, this run from random ones; name a "
-            "file with model.weights=..., or expect less than published."
-        )
-    loss = build(config.loss)
-    _check_loss(loss, session.model)
-    builder = build(config.optimizer)
-    model, optimizer = session.fabric.setup(session.model, builder(session.model))
-    scheme: Scheme = build(config.scheme, model=model, loss=loss, masker=masker, sdc=sdc, sdn=sdn)
-    _check_views(scheme, loss, session)
-    return Prepared(session, model, optimizer, scheme, build(config.schedule))
-
-
-def _check_loss(loss: object, model: nn.Module) -> None:
-    """Refuse a loss that reads what the network does not return, where both say it."""
-    reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
-    if None in (reads, predicts) or reads == predicts:
-        return
-    key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
-    advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
-    raise InputError(
-        f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts {predicts}; "
-        f"choose {advice[str(predicts)]}, or another network."
-    )
-
-
-def _check_views(scheme: object, loss: object, session: Session) -> None:
-    """Refuse a loss of two frames without a second one, and cameras of other images."""
-    views = getattr(scheme, "view", None)
-    if views is None and hasattr(loss, "reads_warped"):
-        raise InputError(
-            f"{type(loss).__name__} is a loss of two frames, but {type(scheme).__name__} shows the "
-            "network one; choose scheme=temporal_paper or temporal_released, or "
-            "loss=cross_entropy."
-        )
-    if isinstance(views, VirtualView):
-        # One example for nothing: a camera of other images is told before the run is begun.
-        sample = _first_readable(session, "train")
-        example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
-        _check_camera("scheme", views, example.rgb.shape[:2])
-    if session.consistency.sets:
-        shown = session.transform.test(_first_readable(session, "test"))
-        for image in (shown.rgb, shown.label):
-            _check_camera("consistency", session.consistency.view, image.shape[:2])
-
-
-def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> None:
-    try:
-        view.camera.matrix(image_hw)
-    except InputError as error:
-        raise InputError(f"{node}.view.{error}") from error
-
-
-def _first_readable(session: Session, split: str) -> Sample:
-    """The first sample of a split; unreadable ones are passed over where the run does so too."""
-    refused: InputError | None = None
-    for name in session.dataset.names(split):
-        try:
-            return session.dataset.read(name)
-        except InputError as error:
-            if session.loading.on_error == "raise":
-                raise
-            refused = refused or error
-    assert refused is not None, "a split holds a name"
-    raise refused
 
 
 @dataclass(frozen=True)
@@ -266,7 +161,8 @@ class Run:
         """Write what identifies the run; refuse a folder that was begun on other images."""
         marker = self.folder.path / "dataset.json"
         dataset = session.dataset
-        lists = {split: dataset.names(split) for split in ("train", "test")}
+        splits = (*self.prepared.splits().values(), "test")
+        lists = {split: dataset.names(split) for split in splits}
         names_key = hashlib.sha256(json.dumps(lists).encode()).hexdigest()
         found = {"names": names_key, "files": dataset.fingerprint()}
         begun = json.loads(marker.read_text()) if marker.exists() else found
@@ -291,22 +187,20 @@ class Run:
         self.folder.truncate_after(state.step)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
-        batches = train_batches(
-            session.dataset, "train", session.transform, session.loading, state.seed, steps
-        )
+        batches = self.prepared.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
         return state
 
     def _trainer(self, session: Session, state: State) -> Trainer:
         split = session.trainer.selection_split
-        per_epoch = steps_per_epoch(session.dataset, session.loading)
+        per_epoch = self.prepared.steps_per_epoch()
 
         def validate(step: int) -> float:
             found = evaluate(session, self.prepared.model, split)
             values = scores.summary(found.counts, session.regions.absent)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
-            if values[names.MIOU] > state.best_score:
+            if values[names.MIOU] > state.best_score or session.trainer.tested == "last":
                 found.counts.save(self.folder.counts_path(split))
             self.tracking.update()
             return values[names.MIOU]
@@ -316,7 +210,8 @@ class Run:
             settings=session.trainer,
             scheme=self.prepared.scheme,
             model=self.prepared.model,
-            optimizers={"main": self.prepared.optimizer},
+            others=self.prepared.others,
+            optimizers=self.prepared.optimizers,
             schedule=self.prepared.schedule,
             steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
             folder=self.folder.path,
@@ -376,7 +271,7 @@ class Run:
         draw_region_heat(heat, self.folder.figure_path("regions"))
 
 
-def _noting_skipped(batches: Batches, state: State) -> Iterator[Batch]:
+def _noting_skipped(batches: Batches | PairedBatches, state: State) -> Iterator[StepData]:
     """The batches, with unreadable files noted in `state` before a checkpoint is written."""
     for batch in batches:
         state.skip(batches.skipped)

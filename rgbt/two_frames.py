@@ -5,7 +5,7 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Literal, NamedTuple
@@ -27,10 +27,13 @@ from rgbt.metrics.named import OF_PAIRS
 from rgbt.metrics.names import CA, TC, consistency
 from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
 from rgbt.metrics.scores import class_mean
-from rgbt.session import Session
+from rgbt.session import Session, heads_of, view_of
 from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
 from rgbt.types import IGNORE, Batch, View
+
+Predict = Callable[[Batch], Tensor]
+"""A batch on the device -> its class maps (B, H', W') uint8."""
 
 Frames = Literal["virtual", "next"]
 PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
@@ -119,7 +122,7 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
         model: the network to evaluate; left in evaluation mode.
         split: name of the split.
         frames: what the second frames are.
-        view: what is predicted from; None takes the network's first.
+        view: what is predicted from; None: see `rgbt.session.view_of`.
         keep: names of scenes to return for pictures.
 
     Raises:
@@ -129,12 +132,18 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
     model.eval()
     found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
+    view = view or view_of(session)
+    heads = heads_of(session, view)
+
+    def predict(batch: Batch) -> Tensor:
+        return class_maps(model, batch, session.fabric, view, heads(batch.name))
+
     scenes_of = _virtual if frames == "virtual" else _next
     num_classes = len(session.dataset.classes)
     with progress() as display:
         total = len(session.dataset.names(split))
         task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(session, model, split, view):
+        for scenes in scenes_of(session, predict, split):
             for protocol, maps in scenes.compared.items():
                 found[protocol].add(scenes, maps, num_classes)
             wanted = [name for name in scenes.names if name in keep and name not in kept]
@@ -155,7 +164,7 @@ def _check_second_frames(session: Session, frames: Frames) -> None:
         )
 
 
-def _virtual(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
+def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
     sets = session.consistency
     names = session.dataset.names(split)
@@ -163,19 +172,14 @@ def _virtual(session: Session, model: nn.Module, split: str, view: View | None) 
     place = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
-        first = class_maps(model, moved, session.fabric, view)
+        first = predict(moved)
         indices = [place[name] for name in batch.name]
         for number in range(len(sets.sets)):
-            yield _turned(session, model, moved, first, (number, indices), view)
+            yield _turned(session, predict, moved, first, (number, indices))
 
 
-def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the second one
-    session: Session,
-    model: nn.Module,
-    batch: Batch,
-    first: Tensor,
-    turn: tuple[int, list[int]],
-    view: View | None,
+def _turned(
+    session: Session, predict: Predict, batch: Batch, first: Tensor, turn: tuple[int, list[int]]
 ) -> Scenes:
     views, angles = session.consistency.view, session.consistency.angles(*turn)
     try:
@@ -183,7 +187,7 @@ def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the secon
     except InputError as error:
         raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
     turned = views.batch(batch, warp)
-    second = class_maps(model, turned, session.fabric, view)
+    second = predict(turned)
     at_label = warp.resized((first.shape[1], first.shape[2]))
     aligned = Compared(
         at_label.nearest(first, 0),
@@ -197,7 +201,7 @@ def _turned(  # noqa: PLR0913 - a batch, its prediction, and who makes the secon
     return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first, turn[0])
 
 
-def _next(session: Session, model: nn.Module, split: str, view: View | None) -> Iterator[Scenes]:
+def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
     after = NextFrames(session.dataset)
     settings, transform = session.loading, session.transform
     pairs = zip_longest(
@@ -220,7 +224,7 @@ def _next(session: Session, model: nn.Module, split: str, view: View | None) -> 
                 f"{after.dataset.root}."
             )
         moved = [each.to(session.fabric.device) for each in (batch, later)]
-        first, second = (class_maps(model, each, session.fabric, view).cpu() for each in moved)
+        first, second = (predict(each).cpu() for each in moved)
         followed, seen = _followed(after, batch.name, first)
         valid = seen & (later.label != IGNORE)
         compared: dict[Protocol, Compared] = {
@@ -290,6 +294,7 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
         partition=partition_name(protocol, sets, views_of(session, protocol)),
         dataset=dataset.fingerprint(),
         split=split,
+        unscored=dataset.unscored,
     )
 
 
@@ -304,7 +309,7 @@ def views_of(session: Session, protocol: Protocol) -> str:
 
 
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
-    """TC and CA of every class and protocol.
+    """TC and CA of every class and protocol; means over the scored classes.
 
     Args:
         found: counts by protocol, see `count_pairs`.
@@ -317,12 +322,14 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         }
         for place in (0, 1)
     )
+    like = next(iter(found.values()))
     return ConsistencyTable(
-        names=next(iter(found.values())).classes,
+        names=like.classes,
         tc={protocol: tuple(map(float, values)) for protocol, values in scores.items()},
         ca={protocol: tuple(map(float, values)) for protocol, values in right.items()},
-        mean_tc={protocol: float(class_mean(values)) for protocol, values in scores.items()},
-        mean_ca={protocol: float(class_mean(values)) for protocol, values in right.items()},
+        mean_tc={each: float(class_mean(values, like.scored)) for each, values in scores.items()},
+        mean_ca={each: float(class_mean(values, like.scored)) for each, values in right.items()},
+        unscored=like.unscored,
     )
 
 

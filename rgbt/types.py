@@ -41,12 +41,15 @@ class Sample:
         thermal: (H, W) uint8.
         label: (H, W) uint8, class index or 255 = ignore; None where the pair is unlabelled.
         name: name in the split list, without extension.
+        confidence: (H, W) float32 in [0, 1], how sure the teacher was whose labels these are; None
+            where labels carry none.
     """
 
     rgb: NDArray[np.uint8]
     thermal: NDArray[np.uint8]
     label: NDArray[np.uint8] | None
     name: str
+    confidence: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Batch:
         position: (B, 2, H, W) float32, (row, column) in the original image of every crop pixel;
             None where the transform was asked not to track it.
         original_hw: (B, 2) int64, height and width of the original image.
-        domain: "source" or "target", for domain adaptation.
+        confidence: (B, H', W') float32 in [0, 1], of the labels; None where they carry none.
     """
 
     rgb: Tensor
@@ -75,7 +78,7 @@ class Batch:
     centre_yx: Tensor
     position: Tensor | None
     original_hw: Tensor
-    domain: str = "source"
+    confidence: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Batch:
         """The batch on `device`, with images as float32 in [0, 1]."""
@@ -91,7 +94,32 @@ class Batch:
             centre_yx=moved(self.centre_yx),
             position=None if self.position is None else moved(self.position),
             original_hw=moved(self.original_hw),
+            confidence=None if self.confidence is None else moved(self.confidence),
         )
+
+
+@dataclass(frozen=True)
+class TwoDomains:
+    """What a step of domain adaptation gets: a batch of each domain, drawn independently.
+
+    Attributes:
+        source: with labels.
+        target: with or without labels (all pixels 255), as the configuration says.
+        number: of the pair of batches, counted from the start of the run.
+    """
+
+    source: Batch
+    target: Batch
+    number: int
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """Names of all samples, those of the source first."""
+        return self.source.name + self.target.name
+
+    def to(self, device: torch.device | str) -> TwoDomains:
+        """Both batches on `device` (see `Batch.to`)."""
+        return replace(self, source=self.source.to(device), target=self.target.to(device))
 
 
 class MaskPair(NamedTuple):
@@ -130,10 +158,17 @@ class Frame(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """One backward pass and optimiser step: optimiser name and named, weighted loss parts."""
+    """One backward pass, and the optimisers that step after it.
 
-    optimizer: str
+    Attributes:
+        optimizers: their names; parameters that two of them share are stepped by each.
+        parts: named, weighted loss parts.
+        clear: whether all gradients are cleared before; False adds to those of the phase before.
+    """
+
+    optimizers: tuple[str, ...]
     parts: dict[str, Tensor]
+    clear: bool = True
 
 
 class Network(Protocol):

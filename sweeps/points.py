@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from rgbt.metrics.pairs import Protocol, file_name
 
 Value = str | int | float | bool | None
+
+Head = Literal["as trained", "own", "source", "target"]
+"""Which head of a network predicts: that of an image's own domain, or one domain's for all."""
 
 
 @dataclass(frozen=True)
@@ -18,18 +22,21 @@ class Evaluation:
         modality: "rgbt", "rgb" or "thermal"; "default": what the network is made for.
         regions: a file of ``conf/metric``, or "as trained".
         frames: protocol of pairs of frames, see `rgbt.metrics.pairs`; None: single frames.
+        head: see `Head`; of single frames alone.
     """
 
     modality: str = "default"
     regions: str = "as trained"
     frames: Protocol | None = None
+    head: Head = "as trained"
 
     @property
     def label(self) -> str:
-        """For people: "thermal, ring9" or "consistency, aligned"."""
-        if self.frames is None:
-            return f"{self.modality}, {self.regions}"
-        return f"consistency, {self.frames}"
+        """For people: "thermal, ring9", "rgb, ring5, source head" or "consistency, aligned"."""
+        if self.frames is not None:
+            return f"consistency, {self.frames}"
+        head = "" if self.head == "as trained" else f", {self.head} head"
+        return f"{self.modality}, {self.regions}{head}"
 
     @property
     def command(self) -> tuple[str, ...]:
@@ -37,16 +44,18 @@ class Evaluation:
 
         One call makes both protocols of virtual views, aligned and released.
         """
-        if self.frames is None:
-            return ("rgbt.evaluate", f"modality={self.modality}", f"regions={self.regions}")
-        return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
+        if self.frames is not None:
+            return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
+        head = () if self.head == "as trained" else (f"head={self.head}",)
+        return ("rgbt.evaluate", f"modality={self.modality}", f"regions={self.regions}", *head)
 
     @property
     def path(self) -> str:
         """Path of its counts inside the run folder, and among the run's files in MLflow."""
         if self.frames is not None:
             return file_name(self.frames, "test")
-        return f"evaluations/table_{self.modality}_{self.regions.replace(' ', '-')}.npz"
+        head = "" if self.head == "as trained" else f"_{self.head}-head"
+        return f"evaluations/table_{self.modality}_{self.regions.replace(' ', '-')}{head}.npz"
 
 
 @dataclass(frozen=True)

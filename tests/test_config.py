@@ -40,7 +40,10 @@ def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: 
     ("group", "option"), [(g, o) for g in NODES if (conf_dir() / g).is_dir() for o in options(g)]
 )
 def test_every_option_of_every_group_passes_the_check(group: str, option: str) -> None:
-    rooted = (group, option) in (("dataset", "mfnet"), ("scale", "paper"))
+    rooted = (group, option) in (
+        *(("dataset", name) for name in ("mfnet", "freiburg", "freiburg_paper")),
+        ("scale", "paper"),
+    )
     check(compose(f"{group}={option}", *(["dataset.root=unused"] if rooted else [])))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,3 +42,13 @@ def test_tables_pool_the_image_and_keep_regions_apart() -> None:
     assert tables.classes.subset_mious["day"] == pytest.approx((16 / 18 + 2 / 4) / 2)
     assert tables.classes.subset_mious["night"] == pytest.approx((12 / 16 + 4 / 8) / 2)
     assert (tables.region_names, tables.step) == (("ring_1", "ring_2"), 7)
+
+    # Without the car every mean is what the road alone has; the classes stay as they are.
+    road = result_tables(replace(counts, unscored=("car",)), regions, "mine", step=7)
+    assert road.regions.miou == pytest.approx(28 / 34)
+    assert road.regions.region_ious == pytest.approx((10 / 14, 18 / 20))
+    assert road.regions.variance == pytest.approx((100 * (18 / 20 - 10 / 14) / 2) ** 2)
+    assert road.classes.subset_mious == pytest.approx({"day": 16 / 18, "night": 12 / 16})
+    assert road.classes == replace(
+        tables.classes, unscored=("car",), subset_mious=road.classes.subset_mious
+    )

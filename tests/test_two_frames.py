@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from math import cos, radians, sin
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from rgbt.config import check, compose
 from rgbt.data.next_frames import NextFrames
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, ca, tc
-from rgbt.session import Session, open_session
+from rgbt.session import Session, evaluate, open_session
 from rgbt.transforms.view_sets import read_angles
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 from rgbt.types import Output
@@ -265,6 +266,21 @@ def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
     for protocol in asked:
         assert table.tc[protocol] == pytest.approx((4 / 7, 3 / 6))
     assert table.names == ("road", "car")
+
+    left_out = {each: replace(counts(f"{each}1"), unscored=("car",)) for each in asked}
+    fewer = consistency_table(left_out, "exclude")
+    assert (fewer.names, fewer.unscored) == (("road", "car"), ("car",))
+    assert (fewer.tc, fewer.ca) == (table.tc, table.ca)
+    assert fewer.mean_tc["next"] == pytest.approx(4 / 7)
+    assert fewer.mean_ca["released"] == pytest.approx(released[0])
+
+
+def test_counts_say_which_classes_the_data_set_leaves_out_of_means(data: Path) -> None:
+    session = on_mfnet(data)
+    session.dataset.unscored = ("bump", "unlabeled")
+    for counts in count_pairs(session, Decoder(), "test", "virtual").counts.values():
+        assert counts.unscored == ("bump", "unlabeled")
+    assert evaluate(session, Decoder(), "test").counts.unscored == ("bump", "unlabeled")
 
 
 # ---- true frames ----------------------------------------------------------------------------

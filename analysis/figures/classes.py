@@ -66,7 +66,7 @@ def class_regions(
         statistics: of a data set; the paper cuts it into nine rings.
         part: "all", "day" or "night", of the shares and of the mIoU.
         method: label and counts of a method over the same regions; None: no mIoU is drawn. The
-            mean is over all classes with the background, which the paper does not state.
+            mean is over all scored classes with the background, which the paper does not state.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
@@ -81,7 +81,8 @@ def class_regions(
                 f"methods: '{label}' was counted over {counts.partition} but the statistics over "
                 f"{statistics.partition}; score or measure with one partition."
             )
-        scores = 100 * miou(_of_part(label, counts, part).by_region(), absent)
+        by_region = _of_part(label, counts, part).by_region()
+        scores = 100 * miou(by_region, absent, counts.scored)
     return ClassRegions(
         classes=tuple(statistics.classes[1:]),
         partition=statistics.partition,

@@ -21,11 +21,12 @@ from analysis.figures.style import (
 )
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, check_same_means, scored_classes
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
 from rgbt.metrics.scores import class_mean
+from rgbt.tracking.tables import class_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,6 +46,7 @@ class ClassConsistency:
         protocol: how the frames were compared.
         classes: C names.
         variants: V names, e.g. "(G) Ours-dice".
+        unscored: names of the classes that are left out of the means.
         tc: (V, C) percent, temporal consistency, mean over seeds; NaN: nothing to score.
         ca: (V, C) percent, consistent accuracy by the union of the protocol; never above `tc`,
             whose numerator holds its own and whose denominator its own holds (Temporal, Fig. 4).
@@ -53,12 +55,15 @@ class ClassConsistency:
     protocol: Protocol
     classes: tuple[str, ...]
     variants: tuple[str, ...]
+    unscored: tuple[str, ...]
     tc: NDArray[np.float64]
     ca: NDArray[np.float64]
 
     def means(self) -> dict[str, tuple[float, float]]:
-        """Variant -> mean TC and CA over classes: the cells of the paper's Table I."""
-        rows = zip(self.variants, class_mean(self.tc), class_mean(self.ca), strict=True)
+        """Variant -> mean TC and CA over scored classes: the cells of the paper's Table I."""
+        scored = scored_classes(self.classes, self.unscored)
+        tcs, cas = (class_mean(values, scored) for values in (self.tc, self.ca))
+        rows = zip(self.variants, tcs, cas, strict=True)
         return {name: (float(tc), float(ca)) for name, tc, ca in rows}
 
 
@@ -70,7 +75,7 @@ def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: counts of single frames, or of different protocols or classes.
+        InputError: counts of single frames, or of different protocols, classes or scored classes.
     """
     every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
     (first, reference), *others = every
@@ -81,6 +86,7 @@ def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -
                 f"{', '.join(reference.classes)}, but '{label}' by {counts.partition} over "
                 f"{', '.join(counts.classes)}; give counts of one protocol and data set."
             )
+        check_same_means(reference, counts)
     protocol = protocol_of(reference.partition)
     if protocol is None:
         raise InputError(
@@ -91,7 +97,7 @@ def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -
         np.array([_by_class(seeds, score, absent) for seeds in methods.values()])
         for score in HEADLINES[protocol]
     )
-    return ClassConsistency(protocol, reference.classes, tuple(methods), tc, ca)
+    return ClassConsistency(protocol, reference.classes, tuple(methods), reference.unscored, tc, ca)
 
 
 def _by_class(seeds: Sequence[Counts], score: str, absent: Absent) -> NDArray[np.float64]:
@@ -120,7 +126,8 @@ def draw(data: ClassConsistency) -> Figure:
         label = f"{variant} (TC {tc:.1f}, CA {ca:.1f})"
         axes.plot(x, data.tc[index], label=label, clip_on=False, **mark)
         axes.plot(x, data.ca[index], markerfacecolor="white", clip_on=False, **mark)
-    axes.set_xticks(places, [readable(name) for name in data.classes])
+    labels = class_labels(data.classes, data.unscored)
+    axes.set_xticks(places, [readable(label).replace(" (", "\n(") for label in labels])
     axes.grid(visible=False, axis="x")
     axes.set_ylim(bottom=0)
     axes.set_ylabel(f"percent: TC full,\nCA{union} open")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.predictions.maps import PixelMaps
     from analysis.results import Frames
     from analysis.statistics.data import SpatialStatistics
-    from rgbt.data.mfnet import MFNet
+    from rgbt.data.dataset import LabelledDataset
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Regions
 
@@ -111,7 +111,7 @@ class Given:
             return compose(words)
 
     @cached_property
-    def dataset(self) -> MFNet:
+    def dataset(self) -> LabelledDataset:
         """The data set.
 
         Raises:
@@ -122,7 +122,7 @@ class Given:
                 f"figure={self.figure} needs dataset=..., for example dataset=mfnet "
                 "dataset.root=/data/MFNet."
             )
-        made: MFNet = self._built("dataset")
+        made: LabelledDataset = self._built("dataset")
         return made
 
     @cached_property
@@ -264,7 +264,8 @@ class Given:
 
 
 def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
-    """Refuse a figure that would show methods on different images side by side.
+    """Refuse a figure that would show methods on different images, or with means over different
+    classes, side by side.
 
     Args:
         methods: label -> counts of its seeds.
@@ -272,6 +273,8 @@ def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
     Raises:
         InputError: naming the two.
     """
+    from rgbt.metrics.counts import check_same_means
+
     every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
     (first, reference), *others = every
     for label, counts in others:
@@ -282,6 +285,7 @@ def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
                 f"{len(counts.names)} of '{counts.split}', such as '{counts.names[0]}'; a figure "
                 "shows methods on the same images of one data set."
             )
+        check_same_means(reference, counts)
 
 
 def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:

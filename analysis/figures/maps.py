@@ -106,7 +106,7 @@ def iou_heat(maps: PixelMaps, regions: Regions, *, beside_part: bool = False) ->
         either = maps.union[:, chosen].sum(1, dtype=np.int64)
         nothing = 0.0 if regions.absent == "released" else np.nan
         ious = np.where(either > 0, right / np.maximum(either, 1), nothing)
-        return float(class_mean(ious))
+        return float(class_mean(ious, maps.scored))
 
     return HeatMap(
         what="IoU",

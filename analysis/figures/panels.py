@@ -26,7 +26,7 @@ from analysis.figures.style import (
 )
 from rgbt.checks import InputError
 from rgbt.metrics.confusion import RegionCounter
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import ring_rectangle
 from rgbt.metrics.scores import miou
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from rgbt.data.mfnet import MFNet
+    from rgbt.data.dataset import LabelledDataset
     from rgbt.types import Sample
 
 Labels = NDArray[np.uint8]
@@ -62,7 +62,7 @@ class Row:
         thermal: (H, W) uint8.
         label: (H, W) class indices or 255.
         predictions: (H, W) class indices of each method.
-        mious: of this image alone, percent, one per method; over the classes that label or
+        mious: of this image alone, percent, one per method; over the scored classes that label or
             prediction hold, because a single image lacks most classes.
     """
 
@@ -94,13 +94,16 @@ class Panel:
 
 
 def image_mious(counts: Counts) -> dict[str, float]:
-    """Name -> mIoU of that image alone, percent, over the classes that occur in it (else NaN)."""
-    scores = 100 * miou(counts.counts.sum(1), "exclude")
+    """Name -> mIoU of that image alone, percent, over the scored classes in it (else NaN)."""
+    scores = 100 * miou(counts.counts.sum(1), "exclude", counts.scored)
     return dict(zip(counts.names, scores.tolist(), strict=True))
 
 
 def panel(
-    dataset: MFNet, methods: Mapping[str, ReadPrediction], names: Sequence[str], regions: Regions
+    dataset: LabelledDataset,
+    methods: Mapping[str, ReadPrediction],
+    names: Sequence[str],
+    regions: Regions,
 ) -> Panel:
     """The pictures of a panel.
 
@@ -123,21 +126,23 @@ def panel(
             "example metric=ring5."
         )
     height, width = samples[0].thermal.shape
+    scored = scored_classes(dataset.classes, dataset.unscored)
     return Panel(
         methods=tuple(methods),
-        rows=tuple(_row(sample, methods, dataset.num_classes) for sample in samples),
+        rows=tuple(_row(sample, methods, scored) for sample in samples),
         classes=tuple(dataset.classes),
         palette=np.array(dataset.palette, np.uint8),
         box=ring_rectangle((height, width), regions.regions, 1, regions.aspect),
     )
 
 
-def _row(sample: Sample, methods: Mapping[str, ReadPrediction], num_classes: int) -> Row:
-    assert sample.label is not None, "data sets in MFNet's layout have labels"
+def _row(sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[np.bool_]) -> Row:
+    if sample.label is None:
+        raise InputError(f"names: '{sample.name}' has no label; choose images that are labelled.")
     predictions = {label: read(sample.name) for label, read in methods.items()}
     for label, prediction in predictions.items():
         check_size(sample.name, label, sample.label, prediction)
-    whole = RegionCounter(num_classes, WHOLE)
+    whole = RegionCounter(len(scored), WHOLE)
     matrices = [whole(sample.label, each).sum(0) for each in predictions.values()]
     return Row(
         name=sample.name,
@@ -145,7 +150,7 @@ def _row(sample: Sample, methods: Mapping[str, ReadPrediction], num_classes: int
         thermal=sample.thermal,
         label=sample.label,
         predictions=tuple(predictions.values()),
-        mious=tuple(float(100 * miou(each, "exclude")) for each in matrices),
+        mious=tuple(float(100 * miou(each, "exclude", scored)) for each in matrices),
     )
 
 

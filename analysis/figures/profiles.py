@@ -20,7 +20,7 @@ from analysis.figures.style import (
 )
 from analysis.uncertainty import Estimate, Interval, Resampling, estimate
 from rgbt.checks import InputError
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, check_same_means
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
 
@@ -115,7 +115,7 @@ def means_only(label: str, seeds: Sequence[Counts], absent: Absent) -> Profile:
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: seeds over other regions.
+        InputError: seeds over other regions or with other scored classes.
     """
     for each in seeds:
         if each.partition != seeds[0].partition:
@@ -123,12 +123,13 @@ def means_only(label: str, seeds: Sequence[Counts], absent: Absent) -> Profile:
                 f"runs: seeds of '{label}' were counted over {seeds[0].partition} and "
                 f"{each.partition}; give counts with one partition."
             )
-    by_region = [each.by_region() for each in seeds]
+        check_same_means(seeds[0], each)
+    by_region, scored = [each.by_region() for each in seeds], seeds[0].scored
     return Profile(
         label=label,
         partition=seeds[0].partition,
-        means=100 * np.mean([miou(each, absent) for each in by_region], axis=0),
-        miou=float(100 * np.mean([miou(each.sum(0), absent) for each in by_region])),
+        means=100 * np.mean([miou(each, absent, scored) for each in by_region], axis=0),
+        miou=float(100 * np.mean([miou(each.sum(0), absent, scored) for each in by_region])),
         low=None,
         high=None,
         covers="",

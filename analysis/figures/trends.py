@@ -68,8 +68,8 @@ def trend(
 ) -> Trend:
     """IoU and accuracy of methods beside the sample occupancy, over the regions of a partition.
 
-    IoU and accuracy of a region are means over all classes, of the pixels of all images. Whether
-    the paper counts the background is not stated; here it counts, as in its tables.
+    IoU and accuracy of a region are means over the scored classes, of the pixels of all images.
+    Whether the paper counts the background is not stated; here it counts, as in its tables.
 
     Args:
         partition: "vertical", "horizontal" or "ring".
@@ -87,13 +87,14 @@ def trend(
                 f"methods: '{label}' was counted over {counts.partition}, expected {expected}; "
                 "score it again with that partition."
             )
-    summed = {label: counts.by_region() for label, counts in methods.items()}
+    summed = {label: (counts.by_region(), counts.scored) for label, counts in methods.items()}
     return Trend(
         partition=partition,
         occupancy=100 * np.asarray(occupancy, np.float64),
-        ious={label: 100 * miou(each, absent) for label, each in summed.items()},
+        ious={label: 100 * miou(each, absent, scored) for label, (each, scored) in summed.items()},
         accuracies={
-            label: 100 * class_mean(recall(each, absent)) for label, each in summed.items()
+            label: 100 * class_mean(recall(each, absent), scored)
+            for label, (each, scored) in summed.items()
         },
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.mfnet import MFNet
+from rgbt.data.dataset import LabelledDataset
 
 Missing = Literal["refuse", "leave_out"]
 
@@ -34,7 +34,9 @@ class Found:
     extra: tuple[str, ...]
 
 
-def find(folder: Path, dataset: MFNet, split: str, suffix: str, missing: Missing) -> Found:
+def find(
+    folder: Path, dataset: LabelledDataset, split: str, suffix: str, missing: Missing
+) -> Found:
     """The predictions of a split: files NAME + `suffix` + ".png".
 
     Args:
@@ -85,10 +87,10 @@ def _stems(folder: Path) -> set[str]:
     return stems
 
 
-def _hint(stems: set[str], dataset: MFNet, suffix: str) -> str:
+def _hint(stems: set[str], dataset: LabelledDataset, suffix: str) -> str:
     """What else the names could mean: a suffix, or another split."""
     for split in dataset.splits:
-        if not dataset.list_path(split).is_file():
+        if not dataset.has(split):
             continue
         names = dataset.names(split)
         number = sum(f"{name}{suffix}" in stems for name in names)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.metrics.archive import Archive
+from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Absent
 
 ARCHIVE = Archive(
@@ -36,9 +37,10 @@ class PixelMaps:
         dataset: fingerprint of the data set.
         split: split that the images come from.
         name: of the method.
+        unscored: names of the classes that are left out of means over classes.
 
     Raises:
-        ValueError: the shapes do not agree.
+        ValueError: the shapes do not agree, or `unscored` names no class or all of them.
     """
 
     intersection: NDArray[np.int32]
@@ -49,6 +51,7 @@ class PixelMaps:
     dataset: str
     split: str
     name: str
+    unscored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape, classes = self.intersection.shape, len(self.classes)
@@ -57,14 +60,21 @@ class PixelMaps:
                 f"pixel maps: expected intersection and union K={classes} x H x W, got {shape} and "
                 f"{self.union.shape}."
             )
+        scored_classes(self.classes, self.unscored)
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """(K,): which classes take part in means over classes."""
+        return scored_classes(self.classes, self.unscored)
 
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
-        ARCHIVE.save(path, {field.name: getattr(self, field.name) for field in fields(self)})
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        ARCHIVE.save(path, {**values, "unscored": np.array(self.unscored, dtype=str)})
 
     @classmethod
     def load(cls, path: Path) -> PixelMaps:
-        """Read what `save` wrote.
+        """Read what `save` wrote; files from before `unscored` was stored score every class.
 
         Raises:
             InputError: no such file, or not a file of pixel maps.
@@ -79,6 +89,7 @@ class PixelMaps:
             dataset=str(values["dataset"]),
             split=str(values["split"]),
             name=str(values["name"]),
+            unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
         )
 
 
@@ -132,13 +143,15 @@ def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
 
     Args:
         maps: see `PixelMaps`.
-        absent: "exclude": C are the classes with U > 0 at the pixel; "released": all K, 0 without.
+        absent: "exclude": C are the scored classes with U > 0 at the pixel; "released": all scored
+            classes, 0 without.
 
     Returns:
-        (H, W) fractions 0..1; NaN where no image has a label (under "exclude").
+        (H, W) fractions 0..1; NaN where there is nothing to score (under "exclude").
     """
-    ratio = maps.intersection / np.maximum(maps.union, 1)
-    there = (maps.union > 0).sum(0) if absent == "exclude" else np.full(ratio.shape[1:], len(ratio))
+    union = maps.union[maps.scored]
+    ratio = maps.intersection[maps.scored] / np.maximum(union, 1)
+    there = (union > 0).sum(0) if absent == "exclude" else np.full(ratio.shape[1:], len(ratio))
     heat: Heat = np.full(ratio.shape[1:], np.nan)
     np.divide(ratio.sum(0), there, out=heat, where=there > 0)
     return heat

@@ -18,8 +18,7 @@ from analysis.predictions.folder import Found, Missing, find
 from analysis.predictions.images import Array, Format, Reader, check_one_kind
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
-from rgbt.data.files import read_label
-from rgbt.data.mfnet import MFNet
+from rgbt.data.dataset import LabelledDataset
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
@@ -86,7 +85,7 @@ class Scored:
 
 def score_folder(
     folder: Path,
-    dataset: MFNet,
+    dataset: LabelledDataset,
     split: str,
     options: Options = Options(),  # noqa: B008 - frozen
     advance: Callable[[], None] = lambda: None,
@@ -132,6 +131,7 @@ def score_folder(
                 partition=counter.regions.name,
                 dataset=fingerprint,
                 split=split,
+                unscored=dataset.unscored,
             )
             for by_image, counter in zip(counts, counting.counters, strict=True)
         ),
@@ -144,7 +144,7 @@ def score_folder(
 class _Counting:
     """The state of one pass, shared by its threads."""
 
-    def __init__(self, dataset: MFNet, options: Options) -> None:
+    def __init__(self, dataset: LabelledDataset, options: Options) -> None:
         self.dataset = dataset
         self.options = options
         self.reader = Reader(dataset.classes, dataset.palette, options.form)
@@ -180,10 +180,16 @@ class _Counting:
             dataset=fingerprint,
             split=split,
             name=name,
+            unscored=self.dataset.unscored,
         )
 
     def _one(self, name: str, path: Path) -> tuple[NDArray[np.int64], bool]:
-        label = read_label(self.dataset.label_path(name), self.dataset.num_classes)
+        label = self.dataset.label(name)
+        if label is None:
+            raise InputError(
+                f"'{name}' of {self.dataset.name} has no label to count predictions against; "
+                "choose a labelled split."
+            )
         prediction = self.reader.read(path)
         differs = prediction.shape != label.shape
         if differs:

@@ -82,6 +82,7 @@ class ScoreTable:
         num_images: number of images by "all" and, where both are there, "day" and "night".
         scores: of every cell, under both conventions for absent classes.
         intervals: what the intervals are, in a sentence; "" without them.
+        unscored: names of the classes that are left out of means.
     """
 
     name: str
@@ -92,6 +93,7 @@ class ScoreTable:
     num_images: Mapping[str, int]
     scores: Mapping[Cell, Score]
     intervals: str = ""
+    unscored: tuple[str, ...] = ()
 
     def conventions(self, metric: Metric | None = None) -> tuple[Absent, ...]:
         """Both where a mean differs between them, else "released" alone.
@@ -108,12 +110,13 @@ class ScoreTable:
         return CONVENTIONS[:1] if same else CONVENTIONS
 
     def absent_classes(self) -> tuple[str, ...]:
-        """Classes without a pixel to count in a region, by day or by night."""
+        """Scored classes without a pixel to count in a region, by day or by night."""
         gone = {
             cell.class_name
             for cell, score in self.scores.items()
             if cell.absent == "exclude" and np.isnan(score.value)
         }
+        gone -= set(self.unscored)
         return tuple(name for name in self.classes if name in gone)
 
 
@@ -125,8 +128,9 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
         name: of the method.
 
     Returns:
-        mIoU, mAcc, IoU and accuracy of each class, for each region and the whole image; variance
-        over regions; all images, and day and night where the data set tells them apart.
+        mIoU and mAcc of the scored classes, IoU and accuracy of each class, for each region and the
+        whole image; variance over regions; all images, and day and night where the data set tells
+        them apart.
     """
     parts = {ALL: counts, **counts.parts()}
     scores = {
@@ -143,6 +147,7 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
         classes=counts.classes,
         num_images={images: len(subset.names) for images, subset in parts.items()},
         scores=scores,
+        unscored=counts.unscored,
     )
 
 
@@ -178,7 +183,7 @@ def with_intervals(
 
 
 def _scores(counts: Counts, base: Cell) -> Iterator[tuple[Cell, float]]:
-    by_region = counts.by_region()
+    by_region, scored = counts.by_region(), counts.scored
     matrices = np.concatenate([by_region, by_region.sum(0, keepdims=True)])
     regions: list[int | None] = [*range(1, len(by_region) + 1), None]
     ratios: dict[Metric, NDArray[np.float64]] = {
@@ -186,9 +191,10 @@ def _scores(counts: Counts, base: Cell) -> Iterator[tuple[Cell, float]]:
         "Acc": recall(matrices, base.absent),
     }
     for metric, ratio in ratios.items():
-        for region, by_class, mean in zip(regions, ratio, class_mean(ratio), strict=True):
+        means = class_mean(ratio, scored)
+        for region, by_class, mean in zip(regions, ratio, means, strict=True):
             cell = replace(base, metric=metric, region=region)
             yield cell, 100.0 * float(mean)
             for name, value in zip(counts.classes, by_class, strict=True):
                 yield replace(cell, class_name=name), 100.0 * float(value)
-    yield replace(base, metric="Var"), float(variance(miou(by_region, base.absent)))
+    yield replace(base, metric="Var"), float(variance(miou(by_region, base.absent, scored)))

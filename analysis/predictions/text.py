@@ -13,7 +13,7 @@ from analysis.predictions.scoring import Scored
 from analysis.predictions.table import ALL, Cell, Metric, Score, ScoreTable
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
-from rgbt.tracking.tables import ABSENT, Grid, number
+from rgbt.tracking.tables import ABSENT, Grid, class_labels, number
 
 COLUMNS = (
     *("method", "split", "partition", "images", "num_images", "region", "class", "metric"),
@@ -75,8 +75,9 @@ def convention_line(table: ScoreTable) -> str:
     """One line: whether the conventions for absent classes differ, and what "-" stands for."""
     absent = ", ".join(table.absent_classes())
     if not absent:
+        every = "every class of the means" if table.unscored else "every class"
         return (
-            f"{table.partition}: every class has pixels in every region, so that both conventions "
+            f"{table.partition}: {every} has pixels in every region, so that both conventions "
             "for absent classes (released: 0, exclude: left out) give the same numbers."
         )
     differ = len(table.conventions()) > 1
@@ -158,8 +159,9 @@ def _header(table: ScoreTable) -> tuple[str, ...]:
 def _class_rows(table: ScoreTable, metric: Metric) -> tuple[tuple[str, ...], ...]:
     """Absent classes as "-"; `convention_line` says how they count."""
     cell = Cell(metric=metric, absent="exclude")
+    labelled = zip(class_labels(table.classes, table.unscored), table.classes, strict=True)
     return tuple(
-        (name, *_by_region(table, replace(cell, class_name=name))) for name in table.classes
+        (label, *_by_region(table, replace(cell, class_name=name))) for label, name in labelled
     )
 
 

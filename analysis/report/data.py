@@ -34,6 +34,7 @@ class RunEntry:
         split: that the scores are of.
         partition: e.g. "ring5".
         classes: K names.
+        unscored: those that are left out of means.
         scores: metric name -> percent (`rgbt.metrics.names`).
         region_ious: R percents, region 1 first.
         class_region_ious: K rows of R percents.
@@ -61,6 +62,7 @@ class RunEntry:
     split: str
     partition: str
     classes: tuple[str, ...]
+    unscored: tuple[str, ...] = ()
     scores: Mapping[str, float]
     region_ious: tuple[float, ...]
     class_region_ious: tuple[tuple[float, ...], ...]

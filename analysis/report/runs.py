@@ -99,8 +99,9 @@ def open_run(stored: StoredRun, remarks: list[str]) -> Run:
         split=SPLIT if counts is None else counts.split,
         partition="" if counts is None else counts.partition,
         classes=() if counts is None else counts.classes,
+        unscored=() if counts is None else counts.unscored,
         scores=scores,
-        region_ious=() if counts is None else _percents(miou(counts.by_region(), absent)),
+        region_ious=() if counts is None else _by_region(counts, absent),
         class_region_ious=() if counts is None else _by_class(counts, absent),
         images=0 if counts is None else len(counts.names),
         commit=commit_of(first) or stored.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
@@ -203,6 +204,11 @@ def _after(tags: Mapping[str, str], beginning: str) -> dict[str, str]:
     """Tags that begin so, by what follows."""
     found = {n.removeprefix(beginning): v for n, v in tags.items() if n.startswith(beginning)}
     return dict(sorted(found.items()))
+
+
+def _by_region(counts: Counts, absent: Absent) -> tuple[float, ...]:
+    """R percents."""
+    return _percents(miou(counts.by_region(), absent, counts.scored))
 
 
 def _by_class(counts: Counts, absent: Absent) -> tuple[tuple[float, ...], ...]:

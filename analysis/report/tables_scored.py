@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,15 @@ from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from sweeps.points import Evaluation
-from sweeps.table.cells import evaluation_of, metric_of
+from sweeps.table.cells import (
+    Cell,
+    Place,
+    derived,
+    evaluation_of,
+    is_counted,
+    is_of_runs,
+    metric_of,
+)
 from sweeps.table.scoring import Scored, score
 from sweeps.table.table import Column, Row, Table
 
@@ -66,7 +75,19 @@ def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> Sc
             continue
         outcomes = _by_seed(keys, recorded.seeds, runs)
         places |= {(label, seed): outcome for seed, outcome in outcomes.items()}
-    return score(recorded.name, table, places, scale=recorded.scale)
+    sizes = _sizes(recorded, table)
+    return score(recorded.name, table, places, scale=recorded.scale, sizes=sizes)
+
+
+def _sizes(recorded: Recorded, table: Table) -> dict[Place, Cell]:
+    """Columns of parameters as recorded: a network is not known here."""
+    names = {column.name for column in table.columns if column.parameters}
+    labels = {row.label for row in table.rows}
+    return {
+        place: Cell(math.nan if line.mean is None else line.mean, math.nan, 0, line.reason)
+        for place, line in recorded.lines.items()
+        if place[0] in labels and place[1] in names and (line.mean is not None or line.reason)
+    }
 
 
 def _by_seed(
@@ -92,11 +113,10 @@ def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | Non
     cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NOTHING)
     if cell is None or not cell.seeds or cell.seeds < line.seeds:
         return None
-    names = (column.name,) if column.minus is None else column.minus
-    columns = [each for name in names for each in table.columns if each.name == name]
+    columns = _sides(table, column) if column.sources else [column]
     metrics = {metric_of(each, row) for each in columns if each.metric is not None}
-    if len(metrics) != 1 or len(columns) != len(names):
-        return None  # the difference of two different scores
+    if len(metrics) != 1 or not all(map(is_counted, columns)) or column.mean is not None:
+        return None  # a mean, or the difference of two different scores
     asked = (evaluation_of(each, table) for each in columns)
     paths = tuple(OWN if each is None else each.path for each in asked)
     # Of the runs of the row those that the value is a mean of: all of them, see the check above.
@@ -109,7 +129,7 @@ def values_of(
 ) -> tuple[float | None, ...]:
     """The score of each run of a cell, in the order of its keys; None: it has none."""
     keys = draft.recorded.lines.get((row.label, column.name), NOTHING).keys
-    if column.needs is not None:
+    if not is_of_runs(column):
         return ()
     return tuple(_value(draft.scored.table, row, column, runs.get(key)) for key in keys)
 
@@ -117,16 +137,21 @@ def values_of(
 def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | None:
     if run is None:
         return None
-    if column.minus is not None:
-        sides = [each for name in column.minus for each in table.columns if each.name == name]
-        first, second = (_value(table, row, side, run) for side in sides)
-        return None if first is None or second is None else first - second
+    if column.sources:
+        each = [_value(table, row, side, run) for side in _sides(table, column)]
+        found = derived(column, ["" if value is None else value for value in each])
+        return None if isinstance(found, str) else found
     evaluation = evaluation_of(column, table)
     path = OWN if evaluation is None else evaluation.path
     try:
         return value(metric_of(column, row), counts_of(run, path), table.absent)
     except InputError:  # the reason stands in the cell
         return None
+
+
+def _sides(table: Table, column: Column) -> list[Column]:
+    """The columns that a difference or mean is computed from, in their order."""
+    return [each for name in column.sources for each in table.columns if each.name == name]
 
 
 def changed(draft: Draft) -> list[str]:

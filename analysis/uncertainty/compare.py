@@ -109,8 +109,8 @@ def compare(
             holds the true difference in at least `level` of all cases.
 
     Raises:
-        InputError: other images, classes, regions or labels; fewer than `FEWEST` blocks; no such
-            metric.
+        InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
+            blocks; no such metric.
         ValueError: paired, but not as many.
     """
     if paired and len(a) != len(b):

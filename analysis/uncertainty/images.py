@@ -13,7 +13,7 @@ from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts
+from rgbt.metrics.counts import Counts, check_same_means
 from rgbt.metrics.named import Asked, images_of, parse, values
 from rgbt.metrics.pairs import protocol_of
 from rgbt.randomness import numpy_generator
@@ -51,8 +51,7 @@ class Images:
         methods: per method (S, B, R K K) float64: counts of every seed, summed inside each block;
             whole numbers below 2^53, so that sums are exact.
         shape: (R, K, K).
-        classes: K names.
-        partition: of the regions, or of pairs of frames.
+        like: counts of the same classes, scored ones and partition.
         images: N.
         blocks: how the images are drawn.
         settings: of the resampling.
@@ -60,8 +59,7 @@ class Images:
 
     methods: tuple[NDArray[np.float64], ...]
     shape: tuple[int, int, int]
-    classes: tuple[str, ...]
-    partition: str
+    like: Counts
     images: int
     blocks: Blocks
     settings: Resampling
@@ -122,7 +120,7 @@ class Images:
     def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
         """(metrics, ...) percent of summed counts (..., R K K)."""
         by_region = summed.reshape(*summed.shape[:-1], *self.shape)
-        given = (by_region, self.classes, self.partition, self.settings.absent)
+        given = (by_region, self.like, self.settings.absent)
         return np.stack([values(each, *given) for each in asked])
 
 
@@ -135,8 +133,8 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         settings: of the resampling.
 
     Raises:
-        InputError: counts of other images, classes, regions or data; no images of that part;
-            blocks that cannot be made.
+        InputError: counts of other images, classes, scored classes, regions or data; no images of
+            that part; blocks that cannot be made.
     """
     alike = _alike(methods)
     parts = [[images_of(asked, counts) for counts in seeds] for seeds in alike]
@@ -149,8 +147,7 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
     single = Images(
         methods=tuple(each.astype(np.float64) for each in flat),
         shape=(regions, classes, classes),
-        classes=first.classes,
-        partition=first.partition,
+        like=first,
         images=len(first.names),
         blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
@@ -176,7 +173,9 @@ def _influence(single: Images) -> Scores:
     """(L, N) how much each image moves the scores of every method, and their difference."""
     if single.settings.blocks != "auto":
         return np.empty((0, single.images))
-    moved = single.without_each(WATCHED if protocol_of(single.partition) is None else WATCHED_PAIRS)
+    moved = single.without_each(
+        WATCHED if protocol_of(single.like.partition) is None else WATCHED_PAIRS
+    )
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
     return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
 
@@ -200,6 +199,7 @@ def _like(first: Counts, other: Counts) -> Counts:
             f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
             f"{', '.join(other.classes)}; score both on one data set."
         )
+    check_same_means(first, other)
     if other.partition != first.partition:
         of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
         how = "rgbt.evaluate regions=..., analysis.score partition=..."

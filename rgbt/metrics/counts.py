@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -30,9 +30,12 @@ class Counts:
             of frames protocol and number of sets, e.g. "aligned3".
         dataset: fingerprint of the data set.
         split: split that the images come from.
+        unscored: names of the classes that are left out of every mean over classes. Their pixels
+            count as all others do: what is labelled so and predicted as another class is a false
+            positive of that class, and the other way round a miss.
 
     Raises:
-        ValueError: the lengths do not agree.
+        ValueError: the lengths do not agree, or `unscored` names no class or all of them.
     """
 
     counts: NDArray[np.integer]
@@ -42,6 +45,7 @@ class Counts:
     partition: str
     dataset: str
     split: str
+    unscored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape = self.counts.shape
@@ -55,6 +59,12 @@ class Counts:
             raise ValueError(
                 f"night: expected {len(self.names)} values, one per image, got {len(self.night)}."
             )
+        scored_classes(self.classes, self.unscored)
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """(K,): which classes take part in means over classes."""
+        return scored_classes(self.classes, self.unscored)
 
     def by_region(self) -> NDArray[np.int64]:
         """(R, K, K): all images together."""
@@ -95,11 +105,12 @@ class Counts:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.array(self.night if self.night is not None else (), dtype=bool)
+        values["unscored"] = np.array(self.unscored, dtype=str)
         ARCHIVE.save(path, values)
 
     @classmethod
     def load(cls, path: Path) -> Counts:
-        """Read what `save` wrote.
+        """Read what `save` wrote; files from before `unscored` was stored score every class.
 
         Raises:
             InputError: no such file, or not a file of counts.
@@ -113,9 +124,48 @@ class Counts:
             partition=str(values["partition"]),
             dataset=str(values["dataset"]),
             split=str(values["split"]),
+            unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
         )
 
     def _take(self, indices: list[int]) -> Counts:
         night = None if self.night is None else tuple(self.night[index] for index in indices)
         names = tuple(self.names[index] for index in indices)
         return replace(self, counts=self.counts[indices], names=names, night=night)
+
+
+def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray[np.bool_]:
+    """Which classes take part in means over classes.
+
+    Args:
+        classes: K names.
+        unscored: those that are left out.
+
+    Returns:
+        (K,), True for at least one.
+
+    Raises:
+        ValueError: `unscored` names what is no class, or every class.
+    """
+    unknown = [name for name in unscored if name not in classes]
+    scored = np.array([name not in unscored for name in classes], bool)
+    if unknown or not scored.any():
+        raise ValueError(
+            f"unscored: expected some of the classes {', '.join(classes)}, but not all of them, "
+            f"got {', '.join(unscored)}."
+        )
+    return scored
+
+
+def check_same_means(first: Counts, other: Counts) -> None:
+    """Refuse to compare counts whose means are over different classes.
+
+    Raises:
+        InputError: they leave different classes out.
+    """
+    if set(first.unscored) == set(other.unscored):
+        return
+    left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
+    raise InputError(
+        f"counts that leave {left_out[0]} out of means cannot be compared with counts that leave "
+        f"out {left_out[1]}; count both with the same dataset.unscored."
+    )

@@ -3,6 +3,7 @@
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
 (mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
 counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.
+Means are over the scored classes (`Counts.scored`); every class can be asked for by its name.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import (
     Matrices,
+    Scored,
     Scores,
     class_mean,
     f1,
@@ -30,14 +32,14 @@ from rgbt.metrics.scores import (
     variance,
 )
 
-MEANS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
     names.MIOU: miou,
-    names.MACC: lambda counts, absent: class_mean(recall(counts, absent)),
-    names.MPRECISION: lambda counts, absent: class_mean(precision(counts, absent)),
-    names.MF1: lambda counts, absent: class_mean(f1(counts, absent)),
-    names.PIXEL_ACCURACY: lambda counts, _: pixel_accuracy(counts),
+    names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
+    names.MPRECISION: lambda counts, absent, scored: class_mean(precision(counts, absent), scored),
+    names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
+    names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
 }
-"""Scores of (..., K, K) matrices as fractions (...)."""
+"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
 
 OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
     names.TC: pairs.tc,
@@ -115,19 +117,16 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
     """
     asked = parse(metric)
     by_region = images_of(asked, counts).by_region()
-    return float(values(asked, by_region, counts.classes, counts.partition, absent))
+    return float(values(asked, by_region, counts, absent))
 
 
-def values(
-    asked: Asked, by_region: Matrices, classes: tuple[str, ...], partition: str, absent: Absent
-) -> NDArray[np.float64]:
+def values(asked: Asked, by_region: Matrices, like: Counts, absent: Absent) -> NDArray[np.float64]:
     """The score of many summed counts at once, e.g. one per resample.
 
     Args:
         asked: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images.
-        classes: K names.
-        partition: of the counts, which tells those of pairs of frames.
+        like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Returns:
@@ -136,13 +135,14 @@ def values(
     Raises:
         InputError: no such class or region, or a metric that such counts do not have.
     """
-    check_kind(asked, partition)
+    check_kind(asked, like.partition)
     if asked.score in OF_PAIRS:
         by_class = 100.0 * OF_PAIRS[asked.score](by_region, absent)
-        has_class = asked.class_name is not None
-        return _of_class(asked, by_class, classes) if has_class else class_mean(by_class)
+        if asked.class_name is None:
+            return class_mean(by_class, like.scored)
+        return _of_class(asked, by_class, like.classes)
     if asked.score == names.VAR:
-        return variance(miou(by_region, absent))
+        return variance(miou(by_region, absent, like.scored))
     if asked.region is None:
         matrices = by_region.sum(-3)
     elif 1 <= asked.region <= by_region.shape[-3]:
@@ -153,9 +153,9 @@ def values(
             "of more regions (another file of conf/metric)."
         )
     if asked.class_name is None:
-        return 100.0 * MEANS[asked.score](matrices, absent)
+        return 100.0 * MEANS[asked.score](matrices, absent, like.scored)
     score = recall if asked.score == "acc" else iou
-    return _of_class(asked, 100.0 * score(matrices, absent), classes)
+    return _of_class(asked, 100.0 * score(matrices, absent), like.classes)
 
 
 def check_kind(asked: Asked, partition: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MIOU = "mIoU"
-"""Mean IoU over classes, pixels of the whole image pooled (not the mean of the regions)."""
+"""Mean IoU over scored classes, pixels of the whole image pooled (not the mean of the regions)."""
 
 VAR = "Var"
 """Population variance of the mIoU of the regions in percent, as printed (SpatialSeg, Eq. 19)."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
+from rgbt.metrics.scores import Matrices, Scores, iou, known_mean, ratio
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -188,7 +188,7 @@ def _by_set(pairs: Matrices) -> Scores:
 
 def _over_sets(scores: Scores) -> Scores:
     """(..., S, K) -> (..., K)."""
-    return class_mean(np.swapaxes(scores, -1, -2))
+    return known_mean(np.swapaxes(scores, -1, -2))
 
 
 def _diagonal(matrices: Scores) -> Scores:

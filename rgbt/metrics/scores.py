@@ -9,6 +9,8 @@ A class without a pixel to count (0 / 0) scores, by `absent`:
                 NaN for the class; the scalars that Temporal sends to TensorBoard are plain means,
                 NaN where a class is.)
     "exclude":  NaN and is left out of means, as in the CMX release.
+Means are over the scored classes alone (`rgbt.metrics.counts.Counts.scored`): a class that is left
+out counts in none of them, whether it has pixels or not and whatever `absent` says.
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ from rgbt.metrics.metric import Absent
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
 ClassScore = Callable[[Matrices, Absent], Scores]
+Scored = NDArray[np.bool_] | None
+"""(K,): which classes means are over; None: all."""
 
 
 def iou(counts: Matrices, absent: Absent) -> Scores:
@@ -65,33 +69,46 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
     return ratio(2 * right, labelled + predicted, absent)
 
 
-def class_mean(scores: Scores) -> Scores:
+def known_mean(scores: Scores) -> Scores:
     """Mean over the last dimension without NaN; NaN where nothing is left.
 
     Args:
+        scores: (..., X), of anything but classes.
+
+    Returns:
+        (...).
+    """
+    return _mean(scores, ~np.isnan(scores))
+
+
+def class_mean(scores: Scores, scored: Scored) -> Scores:
+    """Mean over the scored classes without NaN; NaN where nothing is left.
+
+    Args:
         scores: (..., K).
+        scored: (K,), which classes it is over; None: all.
 
     Returns:
         (...).
     """
     known = ~np.isnan(scores)
-    total = np.where(known, scores, 0.0).sum(-1)
-    return _divide(total, known.sum(-1), np.nan)
+    return _mean(scores, known if scored is None else known & scored)
 
 
-def miou(counts: Matrices, absent: Absent) -> Scores:
-    """Mean over all classes, background included, of `iou`.
+def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
+    """Mean over the scored classes of `iou`; the background is one unless it is left out.
 
     For the mIoU of the tables pass the counts of the whole image, regions summed.
 
     Args:
         counts: (..., K, K).
         absent: see the module docstring.
+        scored: (K,), which classes it is over; None: all.
 
     Returns:
         (...).
     """
-    return class_mean(iou(counts, absent))
+    return class_mean(iou(counts, absent), scored)
 
 
 def variance(region_scores: ArrayLike) -> Scores:
@@ -108,12 +125,12 @@ def variance(region_scores: ArrayLike) -> Scores:
         (...) >= 0; NaN where every region is NaN.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
-    distances = percents - class_mean(percents)[..., None]
-    return class_mean(distances**2)
+    distances = percents - known_mean(percents)[..., None]
+    return known_mean(distances**2)
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
-    """Share of the valid pixels that are right; NaN without any.
+    """Share of the valid pixels, of unscored classes too, that are right; NaN without any.
 
     Args:
         counts: (..., K, K).
@@ -128,8 +145,9 @@ def pixel_accuracy(counts: Matrices) -> Scores:
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
 
-    Over all images: means over classes, variance over regions, mIoU of each region, IoU of each
-    class; mIoU and variance again for day and for night where the data set tells them apart.
+    Over all images: means over the scored classes, variance over regions, mIoU of each region, IoU
+    of each class (unscored ones too); mIoU and variance again for day and for night where the data
+    set tells them apart.
 
     Args:
         counts: of one split, one image or more.
@@ -138,16 +156,16 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     Returns:
         name -> fraction, or squared percent points for the variance. NaN: nothing to score.
     """
-    whole = counts.whole()
+    whole, scored = counts.whole(), counts.scored
     by_class = iou(whole, absent)
     result = _mean_and_variance(counts, absent)
     result |= {
-        names.MACC: float(class_mean(recall(whole, absent))),
-        names.MPRECISION: float(class_mean(precision(whole, absent))),
-        names.MF1: float(class_mean(f1(whole, absent))),
+        names.MACC: float(class_mean(recall(whole, absent), scored)),
+        names.MPRECISION: float(class_mean(precision(whole, absent), scored)),
+        names.MF1: float(class_mean(f1(whole, absent), scored)),
         names.PIXEL_ACCURACY: float(pixel_accuracy(whole)),
     }
-    for number, score in enumerate(miou(counts.by_region(), absent), start=1):
+    for number, score in enumerate(miou(counts.by_region(), absent, scored), start=1):
         result[names.region(number)] = float(score)
     for name, score in zip(counts.classes, by_class, strict=True):
         result[names.class_iou(name)] = float(score)
@@ -159,8 +177,8 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
 
 def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
     return {
-        names.MIOU: float(miou(counts.whole(), absent)),
-        names.VAR: float(variance(miou(counts.by_region(), absent))),
+        names.MIOU: float(miou(counts.whole(), absent, counts.scored)),
+        names.VAR: float(variance(miou(counts.by_region(), absent, counts.scored))),
     }
 
 
@@ -175,6 +193,12 @@ def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
     """``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
     return _divide(part, whole, 0.0 if absent == "released" else np.nan)
+
+
+def _mean(scores: Scores, chosen: NDArray[np.bool_]) -> Scores:
+    """Mean over the last dimension of what is chosen; NaN where nothing is."""
+    total = np.where(chosen, scores, 0.0).sum(-1)
+    return _divide(total, chosen.sum(-1), np.nan)
 
 
 def _divide(part: Scores, whole: NDArray[np.generic], undefined: float) -> Scores:

@@ -91,7 +91,7 @@ class CRM:
         weighted = {name: (values * weights).sum() for name, values in parts.items()}
         if passes == 2:
             weighted |= self._distil(output.aux["class_logits"][-1])
-        yield Phase("main", weighted)
+        yield Phase(("main",), weighted)
 
     def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:
         height, width = batch.rgb.shape[-2:]

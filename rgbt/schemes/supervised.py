@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from torch import nn
 
+from rgbt.checks import InputError
+from rgbt.schemes.domains import Domains
 from rgbt.types import Batch, GeneratorOf, Loss, Masker, Phase
 
 
 class Supervised:
-    """Train on the labels with one pass; a masker that hides something masks that pass."""
+    """Train on the labels with one pass; a masker that hides something masks that pass.
 
-    def __init__(self, *, model: nn.Module, loss: Loss, masker: Masker) -> None:
+    Args:
+        model: the network.
+        loss: of its output and the labels.
+        masker: what it does not see.
+        domains: how the source is seen, and by which head; a target is refused.
+
+    Raises:
+        InputError: two domains.
+    """
+
+    def __init__(self, *, model: nn.Module, loss: Loss, masker: Masker, domains: Domains) -> None:
+        if domains.target is not None:
+            raise InputError(
+                "scheme=supervised trains on one domain, but domains.target names a second one; "
+                "choose domains=one, or scheme=two_domains."
+            )
         self.model = model
         self.loss = loss
         self.masker = masker
+        self.domains = domains
+        source = domains.source
+        self.asked: dict[str, Any] = {} if source.view is None else {"views": (source.view,)}
+        self.asked |= {} if source.head is None else {"head": source.head}
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of the loss.
@@ -28,8 +50,7 @@ class Supervised:
         masks = None
         if not self.masker.hides_nothing:
             masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
-        output = self.model(
-            batch.rgb, batch.thermal, masks, generator=generator_of("stochastic depth")
-        )
+        generator = generator_of("stochastic depth")
+        output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.asked)
         parts = self.loss(output, batch, generator_of("loss"))
-        yield Phase("main", {name: values.sum() for name, values in parts.items()})
+        yield Phase(("main",), {name: values.sum() for name, values in parts.items()})

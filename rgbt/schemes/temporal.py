@@ -112,7 +112,7 @@ class Temporal:
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
         warped = self._warped(first.logits, warp) if self.loss.reads_warped else None
         parts = self.loss(first, second, warped, self.view.valid(warp), generator_of("loss"))
-        yield Phase("main", parts)
+        yield Phase(("main",), parts)
 
     def _warped(self, logits: Tensor, warp: Warp) -> Tensor:
         """(B, K, H, W) class probabilities of the first frame, as the second should see them."""

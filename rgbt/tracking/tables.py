@@ -6,7 +6,7 @@ Nothing is computed here but percentages; the scores come from `rgbt.metrics.sco
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -41,6 +41,7 @@ class ClassTable:
         accuracies: K fractions (recall), same rule.
         region_ious: K rows of R fractions, IoU of the class inside each region.
         subset_mious: mean IoU of subsets of the images, e.g. {"day": 0.41, "night": 0.38}.
+        unscored: names of the classes that are left out of every mean.
     """
 
     names: tuple[str, ...]
@@ -48,6 +49,7 @@ class ClassTable:
     accuracies: tuple[float, ...]
     region_ious: tuple[tuple[float, ...], ...]
     subset_mious: Mapping[str, float]
+    unscored: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class ConsistencyTable:
         ca: the same of consistent accuracy.
         mean_tc: protocol -> mean over classes.
         mean_ca: protocol -> mean over classes.
+        unscored: names of the classes that are left out of the means.
     """
 
     names: tuple[str, ...]
@@ -67,6 +70,7 @@ class ConsistencyTable:
     ca: Mapping[str, tuple[float, ...]]
     mean_tc: Mapping[str, float]
     mean_ca: Mapping[str, float]
+    unscored: tuple[str, ...] = ()
 
     @classmethod
     def from_json(cls, plain: Mapping[str, Any]) -> ConsistencyTable:
@@ -77,6 +81,7 @@ class ConsistencyTable:
             ca={protocol: _numbers(values) for protocol, values in plain["ca"].items()},
             mean_tc={protocol: _number(value) for protocol, value in plain["mean_tc"].items()},
             mean_ca={protocol: _number(value) for protocol, value in plain["mean_ca"].items()},
+            unscored=tuple(plain.get("unscored", ())),
         )
 
 
@@ -125,6 +130,7 @@ class ResultTables:
                 accuracies=_numbers(classes["accuracies"]),
                 region_ious=tuple(_numbers(row) for row in classes["region_ious"]),
                 subset_mious={k: _number(v) for k, v in classes["subset_mious"].items()},
+                unscored=tuple(classes.get("unscored", ())),
             ),
             consistency=None if consistency is None else ConsistencyTable.from_json(consistency),
         )
@@ -170,13 +176,17 @@ def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> Gr
 
 
 def class_grid(tables: ResultTables) -> Grid:
-    """IoU and accuracy by class over the image, then the class's IoU in every region; percent."""
+    """IoU and accuracy by class over the image, then the class's IoU in every region; percent.
+
+    Classes that are left out of the means say so.
+    """
     classes = tables.classes
+    labels = class_labels(classes.names, classes.unscored)
     header = ("class", "IoU", "Acc", *tables.region_names)
     rows = [
         (name, *map(percent, (iou, accuracy, *by_region)))
         for name, iou, accuracy, by_region in zip(
-            classes.names, classes.ious, classes.accuracies, classes.region_ious, strict=True
+            labels, classes.ious, classes.accuracies, classes.region_ious, strict=True
         )
     ]
     regions = tables.regions
@@ -198,7 +208,8 @@ def consistency_grid(table: ConsistencyTable, title: str) -> Grid:
         values for protocol in table.tc for values in (table.tc[protocol], table.ca[protocol])
     ]
     means = [value for p in table.tc for value in (table.mean_tc[p], table.mean_ca[p])]
-    rows = [(name, *map(percent, row)) for name, *row in zip(table.names, *columns, strict=True)]
+    labels = class_labels(table.names, table.unscored)
+    rows = [(name, *map(percent, row)) for name, *row in zip(labels, *columns, strict=True)]
     return Grid(title, header, (*rows, ("mean", *map(percent, means))))
 
 
@@ -213,6 +224,11 @@ def result_grids(tables: ResultTables) -> tuple[Grid, ...]:
     if tables.consistency is None:
         return grids
     return (*grids, consistency_grid(tables.consistency, "Consistency of two frames"))
+
+
+def class_labels(classes: Sequence[str], unscored: Collection[str]) -> tuple[str, ...]:
+    """What classes are called in tables: "car", or "background (not in means)"."""
+    return tuple(f"{name} (not in means)" if name in unscored else name for name in classes)
 
 
 def percent(fraction: float) -> str:

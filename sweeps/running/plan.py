@@ -98,10 +98,11 @@ class Planner:
         text = json.dumps(_plain(config.dataset), sort_keys=True)
         if text not in self._fingerprints:
             dataset: Any = build(config.dataset)
-            if not any(dataset.list_path(split).is_file() for split in dataset.splits):
+            if not any(dataset.has(split) for split in dataset.splits):
+                places = ", ".join(dict.fromkeys(dataset.splits.values()))
                 raise InputError(
-                    f"{dataset.root} holds none of the lists {', '.join(dataset.splits.values())} "
-                    "of the data set; name its folder with dataset.root=..."
+                    f"{dataset.root} holds none of the lists or files {places} of the data set; "
+                    "name its folder with dataset.root=..."
                 )
             self._fingerprints[text] = dataset.fingerprint()
         return self._fingerprints[text]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from rgbt.metrics import names
 from sweeps.sheet.drawing import OURS, PUBLISHED, Series, draw_pair, title_and_legend
 from sweeps.table.scoring import Scored, published
+from sweeps.table.sizes import SCALE
 from sweeps.table.table import Column, Row
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def figure_of(scored: Scored) -> Figure | None:
 def _has_values(scored: Scored, column: Column) -> bool:
     ours = (scored.cells.get((row.label, column.name)) for row in scored.table.rows)
     theirs = (published(row, column) for row in scored.table.rows)
-    return any(cell is not None and cell.seeds for cell in ours) or any(
+    return any(cell is not None and not math.isnan(cell.mean) for cell in ours) or any(
         value is not None for value in theirs
     )
 
@@ -182,7 +183,8 @@ def _series(
 
 def _title(scored: Scored) -> str:
     if not scored.seeds:
-        return f"{scored.name} (published)"
+        counted = f"ours: counted at scale={SCALE}" if scored.cells else "published"
+        return f"{scored.name} ({counted})"
     seeds = len(scored.seeds)
     spread = f", mean ± sd of {seeds} seeds" if seeds > 1 else f", seed {scored.seeds[0]}"
     return f"{scored.name} (ours: scale={scored.scale}{spread})"

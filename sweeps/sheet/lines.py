@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from rgbt.tracking.tables import number
 from sweeps.sheet.texts import Footnotes, Line, Text
-from sweeps.table.cells import NO_VALUE, Cell, is_counted, metric_of
+from sweeps.table.cells import NO_VALUE, Cell, is_counted, is_of_runs, metric_of
 from sweeps.table.scoring import Scored, published
 from sweeps.table.table import Column, Row
 
@@ -133,11 +133,12 @@ class Builder:
 
     def _keys(self, row: Row) -> tuple[str, ...]:
         cells = (self.scored.cells.get((row.label, column.name)) for column in self.columns)
-        return next((cell.keys for cell in cells if cell is not None), ())
+        return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
 
     def _seeds(self, row: Row) -> Text:
         """How many seeds the row's values are means of."""
-        cells = [self.scored.cells.get((row.label, column.name)) for column in self.columns]
+        columns = filter(is_of_runs, self.columns)
+        cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
         there = [cell.seeds for cell in cells if cell is not None]
         counts = sorted({seeds for seeds in there if seeds} or set(there))
         return Text("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))

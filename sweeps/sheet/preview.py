@@ -11,6 +11,7 @@ from sweeps.running.lists import Outcome, estimated_seconds
 from sweeps.running.live import duration
 from sweeps.running.sources import State
 from sweeps.table.cell_points import Wanted
+from sweeps.table.sizes import SCALE
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
@@ -36,7 +37,7 @@ def tables_grid(surveyed: Sequence[tuple[Wanted, Sequence[Outcome]]], workers: i
     """One line per table: rows, runs by state, estimated time."""
     rows = []
     for wanted, outcomes in surveyed:
-        runnable = sum(wanted.table.runnable(row) for row in wanted.table.rows)
+        runnable = len({label for label, _ in wanted.places()})
         states = Counter(outcome.state for outcome in outcomes)
         counts = (str(states[state]) for state in STATES)
         seconds = estimated_seconds(outcomes, workers)
@@ -66,6 +67,8 @@ def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[s
     for column in wanted.table.columns:
         if column.needs is not None:
             lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
+        if column.parameters:
+            lines.append(f"Column '{column.name}' is counted at scale={SCALE}, without any run.")
     return lines
 
 

@@ -19,6 +19,7 @@ from sweeps.sheet.terminal import terminal
 from sweeps.table.cell_points import Wanted
 from sweeps.table.cells import NO_VALUE
 from sweeps.table.scoring import Scored, score
+from sweeps.table.sizes import parameter_cells
 
 if TYPE_CHECKING:
     from rgbt.tracking.mlflow_store import Tracking
@@ -36,7 +37,8 @@ def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tra
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    scored = score(wanted.name, wanted.table, wanted.runs(outcomes), scale=wanted.scale)
+    runs, sizes = wanted.runs(outcomes), parameter_cells(wanted)
+    scored = score(wanted.name, wanted.table, runs, scale=wanted.scale, sizes=sizes)
     sheet = sheet_of(scored, wanted.typed())
     show(terminal(sheet, plain=not sys.stdout.isatty()))
     failed = _tell_what_is_missing(scored, outcomes)
@@ -102,5 +104,5 @@ def _tell_what_is_missing(scored: Scored, outcomes: Sequence[Outcome]) -> bool:
             "have not begun; the same command later completes the table, wait=true stays for it."
         )
     if empty:
-        tell("some finished runs do not hold what a column asks for, see the footnotes.")
+        tell("some cells have no value although nothing is missing, see the footnotes.")
     return bool(failed) or empty

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from sweeps.sheet.lines import Builder
 from sweeps.sheet.texts import Footnotes, Line, Text
 from sweeps.table.scoring import Scored
+from sweeps.table.sizes import SCALE
 from sweeps.table.table import Column
 
 DEMO = (
@@ -20,6 +21,7 @@ ORDER = (
     "+1: the same order."
 )
 NOT_PRINTED = "Not in the paper."
+PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without critics."
 
 
 @dataclass(frozen=True)
@@ -78,12 +80,15 @@ def _remarks(scored: Scored, extra: Sequence[str]) -> list[str]:
     """Sentences below the table."""
     table = scored.table
     printed = any(row.values for row in table.rows)
+    sizes = [column for column in table.columns if column.parameters]
     remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
     if scored.seeds:
         many = len(scored.seeds) > 1
         seeds = ", ".join(map(str, scored.seeds))
         spread = "mean ± standard deviation (n - 1) over" if many else "of"
         remarks.append(f"Ours: scale={scored.scale}, {spread} seed{'s' * many} {seeds}.")
+    if any((row.label, c.name) in scored.cells for row in table.rows for c in sizes):
+        remarks.append(PARAMETERS)
     if any(order.rows for order in scored.orders.values()):
         remarks.append(ORDER)
     if scored.seeds and scored.scale == "demo" and printed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -55,7 +55,12 @@ class Wanted:
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
     def places(self) -> list[tuple[str, int]]:
-        """(label, seed) of every cell that can be run; all rows of a seed before the next seed."""
+        """(label, seed) of every cell that can be run; all rows of a seed before the next seed.
+
+        None where no column is counted: parameters are, without any run.
+        """
+        if not any(map(is_counted, self.table.columns)):
+            return []
         rows = [row for row in self.table.rows if self.table.runnable(row)]
         return [(row.label, seed) for seed in self.seeds for row in rows]
 
@@ -64,20 +69,26 @@ class Wanted:
         sharing: dict[tuple[str, ...], list[str]] = {}
         for label, seed in self.places():
             sharing.setdefault(self.overrides(label, seed), []).append(label)
-        evaluations = self.evaluations()
         return [
             Point(
                 label=f"{_short(labels)} {overrides[-1]}",
                 overrides=overrides,
                 tags={TAG + self.name: BETWEEN.join(labels)[:TAG_LENGTH]},
-                evaluations=evaluations,
+                evaluations=self.evaluations(labels),
             )
             for overrides, labels in sharing.items()
         ]
 
-    def evaluations(self) -> tuple[Evaluation, ...]:
-        """What every run is evaluated with beside its own evaluation."""
-        counted = filter(is_counted, self.table.columns)
+    def evaluations(self, labels: Collection[str] | None = None) -> tuple[Evaluation, ...]:
+        """What the runs of the rows `labels` are evaluated with beside their own evaluation.
+
+        Args:
+            labels: of the rows; None: of all that are run.
+        """
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        named = [row for row in rows if labels is None or row.label in labels]
+        names = {column.name for row in named for column in self.table.columns_of(row)}
+        counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
         asked = (evaluation_of(column, self.table) for column in counted)
         return tuple(dict.fromkeys(each for each in asked if each is not None))
 

@@ -70,7 +70,7 @@ class Cell:
     Attributes:
         mean: over seeds, percent (Var: squared percent points); NaN without any.
         sd: standard deviation over seeds with n - 1; NaN for fewer than two.
-        seeds: number of seeds that went into it.
+        seeds: number of seeds that went into it; 0 for what is counted without any run.
         reason: why seeds are missing, or "".
         mark: the same in a word, e.g. "failed".
         keys: of the runs.
@@ -93,17 +93,22 @@ def evaluation_of(column: Column, table: Table) -> Evaluation | None:
     """What the column is counted from; None: the evaluation that every run makes itself."""
     if column.frames is not None:
         return Evaluation(frames=column.frames)
-    asked = Evaluation(column.modality, table.regions)
+    asked = Evaluation(column.modality, table.regions, head=column.head)
     return None if asked == Evaluation() else asked
 
 
 def is_counted(column: Column) -> bool:
-    """Whether the column is read from counts: neither the difference of others nor missing."""
+    """Whether the column is read from counts: not computed of others, no size and not missing."""
     return column.metric is not None
 
 
+def is_of_runs(column: Column) -> bool:
+    """Whether the column has a value where there are runs."""
+    return column.needs is None and not column.parameters
+
+
 def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[Place, Cell]:
-    """The cells of one row; columns that cannot be computed have none.
+    """The cells of one row; columns that are not computed of runs or left out have none.
 
     Args:
         table: the table.
@@ -113,9 +118,9 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[P
     by_seed = {seed: _values(table, row, outcome) for seed, outcome in outcomes.items()}
     keys = tuple(run.key for outcome in outcomes.values() for run in outcome.found)
     cells = {}
-    for column in table.columns:
+    for column in filter(is_of_runs, table.columns_of(row)):
         found = {seed: values[column.name] for seed, values in by_seed.items() if values}
-        if column.needs is None and found:
+        if found:
             marks = {seed: _mark(outcomes[seed], value) for seed, value in found.items()}
             cells[row.label, column.name] = _cell(found, marks, keys)
     return cells
@@ -125,16 +130,18 @@ def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
     """Every column's value of one run."""
     counts: dict[Evaluation | None, Counts | str] = {}
     values: dict[str, Value] = {}
-    for column in filter(is_counted, table.columns):
+    columns = table.columns_of(row)
+    for column in filter(is_counted, columns):
         evaluation = evaluation_of(column, table)
         if evaluation not in counts:
             counts[evaluation] = _counts(outcome, evaluation)
         values[column.name] = _value(metric_of(column, row), counts[evaluation], table)
-    for column in table.columns:
-        if column.minus is not None:
-            values[column.name] = _less(*(values.get(name, NO_VALUE) for name in column.minus))
-        elif column.needs is not None:
+    for column in columns:
+        if column.needs is not None:
             values[column.name] = column.needs
+    for column in columns:
+        if column.sources:
+            values[column.name] = derived(column, [values[name] for name in column.sources])
     return values
 
 
@@ -157,11 +164,12 @@ def _value(metric: str, counts: Counts | str, table: Table) -> Value:
     return f"'{metric}' has nothing to score" if math.isnan(found) else found
 
 
-def _less(first: Value, second: Value) -> Value:
-    """`first` less `second`; where one is missing, why."""
-    if isinstance(first, str):
-        return first
-    return second if isinstance(second, str) else first - second
+def derived(column: Column, values: Sequence[Value]) -> Value:
+    """Difference or mean of the values of `column.sources`; where one is missing, why."""
+    known = [each for each in values if not isinstance(each, str)]
+    if len(known) < len(values):
+        return next(each for each in values if isinstance(each, str))
+    return statistics.fmean(known) if column.minus is None else known[0] - known[1]
 
 
 def _mark(outcome: CellRun, found: Value) -> str:

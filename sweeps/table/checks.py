@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, check_choice
@@ -31,8 +31,9 @@ def check_table(table: Table, place: str) -> None:
     if table.regions != "as trained":
         check_choice(f"{place}, regions", table.regions, _files("metric"))
     _check_scales(table.at, place)
-    for column in table.columns:
-        _check_column(column, names, f"{place}, column '{column.name}'")
+    for index, column in enumerate(table.columns):
+        before = table.columns[:index]
+        _check_column(column, table, before, f"{place}, column '{column.name}'")
     for row in table.rows:
         _check_row(row, table, f"{place}, row '{row.label}'")
 
@@ -52,14 +53,46 @@ def _files(group: str) -> list[str]:
     return [file.stem for file in (conf_dir() / group).glob("*.yaml")]
 
 
-def _check_column(column: Column, names: list[str], place: str) -> None:
-    given = [key for key in ("metric", "minus", "needs") if getattr(column, key) is not None]
+KINDS = ("metric", "minus", "mean", "parameters", "needs")
+"""Keys of a column of which one says where its values come from."""
+
+
+def _check_column(column: Column, table: Table, before: Sequence[Column], place: str) -> None:
+    given = [key for key in KINDS if getattr(column, key) not in (None, False)]
     if len(given) != 1:
         got = " and ".join(given) or "none"
-        raise InputError(f"{place}: expected one of metric, minus and needs, got {got}.")
-    for other in column.minus or ():
-        check_choice(f"{place}, minus", other, names)
+        known = f"{', '.join(KINDS[:-1])} and {KINDS[-1]}"
+        raise InputError(f"{place}: expected one of {known}, got {got}.")
+    for other in column.sources:
+        check_choice(f"{place}, {given[0]}", other, [each.name for each in table.columns])
     _check_frames(column, place)
+    _check_head(column, place)
+    _check_sources(column, table, before, f"{place}, {given[0]}")
+
+
+def _check_sources(column: Column, table: Table, before: Sequence[Column], place: str) -> None:
+    """Refuse a difference or mean of what is not known when it is computed, or is no score."""
+    if column.mean is not None and len(set(column.mean)) != max(2, len(column.mean)):
+        got = ", ".join(column.mean) or "none"
+        raise InputError(f"{place}: expected two or more different columns, got {got}.")
+    for other in (each for each in table.columns if each.name in column.sources):
+        if other.sources and other not in before:
+            raise InputError(
+                f"{place}: '{other.name}' is computed from other columns itself; move it in front "
+                f"of '{column.name}', or name the columns that it is computed from."
+            )
+        if other.parameters:
+            raise InputError(
+                f"{place}: '{other.name}' counts parameters and is no score; leave it."
+            )
+
+
+def _check_head(column: Column, place: str) -> None:
+    """Refuse a head for what is not predicted, or not by a head that can be chosen."""
+    if column.head != "as trained" and (column.metric is None or column.frames is not None):
+        raise InputError(
+            f"{place}: 'head' is for scores of single frames alone; remove head: {column.head}."
+        )
 
 
 def _check_frames(column: Column, place: str) -> None:
@@ -86,6 +119,8 @@ def _check_row(row: Row, table: Table, place: str) -> None:
     if row.experiment is not None:
         check_choice(f"{place}, experiment", row.experiment, _files("experiment"))
     _check_scales(row.at, place)
+    for name in row.without:
+        check_choice(f"{place}, without", name, names)
     for name in (*row.values, *row.doubtful):
         check_choice(f"{place}, column", name, names)
         if not table.columns[names.index(name)].printed:

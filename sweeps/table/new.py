@@ -38,13 +38,16 @@ HEAD = """\
 
 COLUMNS = """\
 columns: # or: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
-  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB;
-  # {name: TC, metric: TC, frames: aligned} and CA, of two frames (docs/consistency.md)
+  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB,
+  # head: source with one head of a network of two; {name: both, mean: [day, night]} and
+  # {name: gain, minus: [day, night]} of other columns; {name: TC, metric: TC, frames: aligned} and
+  # CA, of two frames (docs/consistency.md); {name: size, parameters: true} counts the network
 """
 
 ROWS = """\
 # Beside each row may stand: values: {mIoU: 61.79} (printed somewhere, shown beside ours),
-# remarks: [a footnote], settings: {why: said here}, at: {paper: [model=mask2former_swin_s]}
+# remarks: [a footnote], settings: {why: said here}, at: {paper: [model=mask2former_swin_s]},
+# without: [a column that the row's network has no score for]
 rows:
 """
 

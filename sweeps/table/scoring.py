@@ -1,6 +1,7 @@
 """A table computed: mean and spread over seeds, beside the printed values.
 
-Rows that cannot be run, and columns that cannot be computed, have no cells.
+Rows that cannot be run, and columns that cannot be computed, have no cells; of a table that was not
+run, columns of parameters alone have some.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Scored:
         table: the file.
         scale: "demo" or "paper".
         seeds: that were asked for.
-        cells: by place; only rows that were run.
+        cells: by place; only rows that were run, and columns of parameters.
         orders: by name of the column.
         ranks_ours: 1 best, 2 second best of the column among our means.
         ranks_published: the same among the printed values.
@@ -85,7 +86,12 @@ def check_metrics(table: Table, rows: Iterable[Row]) -> None:
 
 
 def score(
-    name: str, table: Table, runs: Mapping[tuple[str, int], CellRun], *, scale: str
+    name: str,
+    table: Table,
+    runs: Mapping[tuple[str, int], CellRun],
+    *,
+    scale: str,
+    sizes: Mapping[Place, Cell] | None = None,
 ) -> Scored:
     """Compute every cell of the rows that were run.
 
@@ -94,6 +100,7 @@ def score(
         table: its file.
         runs: (label of the row, seed) -> what became of the run.
         scale: "demo" or "paper".
+        sizes: cells of the columns of parameters, see `sweeps.table.sizes`.
     """
     seeds = sorted({seed for _, seed in runs})
     ran = {label for label, _ in runs}
@@ -104,6 +111,8 @@ def score(
             cells |= row_cells(table, row, outcomes)
     # A mean over fewer seeds is no fair rival: it is shown, and takes no part in marks and orders.
     whole = {place: cell for place, cell in cells.items() if cell.seeds == len(seeds)}
+    cells |= sizes or {}
+    whole |= sizes or {}
     found = {run.key: run.commit for outcome in runs.values() for run in outcome.found}
     return Scored(
         name=name,

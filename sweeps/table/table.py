@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.pairs import Protocol
+from sweeps.points import Head
 from sweeps.table.checks import check_table
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
@@ -32,17 +33,21 @@ STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column: a score, a difference of two columns, or what cannot be computed yet.
+    """One column: a score, a difference or mean of others, a size, or what cannot be computed yet.
 
     Attributes:
         name: as in the rows' `values`.
         metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>;
             ``{key}`` stands for that entry of the row's settings.
         minus: (a, b): column a minus column b.
+        mean: mean of two or more other columns of the row, e.g. of day and night.
+        parameters: millions of parameters of the row's network, counted without any run and always
+            at scale=paper; critics are not counted.
         needs: the part that must exist before the column can be computed.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: which two predictions it compares, see
             `rgbt.metrics.pairs`.
+        head: of a network with a head per domain which one predicts, see `sweeps.points.Head`.
         printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
     """
@@ -52,11 +57,19 @@ class Column:
     name: str
     metric: str | None = None
     minus: tuple[str, str] | None = None
+    mean: tuple[str, ...] | None = None
+    parameters: bool = False
     needs: str | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
+    head: Head = "as trained"
     printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The columns that it is computed from; () for all but differences and means."""
+        return self.minus or self.mean or ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +101,8 @@ class Row:
         at: further overrides by scale; they win over all others of the row.
         x: where the row lies on the axis of `Table.factor`.
         needs: the part that must exist before the row can be run.
+        without: columns that the row's network has no score for: neither they nor what is computed
+            from them is evaluated.
         values: printed values by column; None where the paper prints a dash.
         doubtful: columns whose printed value carries the row's remarks as a footnote.
         remarks: one sentence each.
@@ -104,6 +119,7 @@ class Row:
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     x: float | None = None
     needs: str | None = None
+    without: tuple[str, ...] = ()
     values: Mapping[str, float | None] = field(default_factory=dict)
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -148,6 +164,14 @@ class Table:
     def runnable(self, row: Row) -> bool:
         """Whether the project can run the row today."""
         return row.experiment is not None and row.needs is None and self.needs is None
+
+    def columns_of(self, row: Row) -> tuple[Column, ...]:
+        """The columns that the row has, in their order: without those that it leaves out."""
+        left_out, last = set(row.without), -1
+        while last < len(left_out):
+            last = len(left_out)
+            left_out |= {each.name for each in self.columns if left_out & set(each.sources)}
+        return tuple(column for column in self.columns if column.name not in left_out)
 
     def overrides(self, row: Row, scale: str) -> tuple[str, ...]:
         """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself.

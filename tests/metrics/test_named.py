@@ -75,7 +75,7 @@ def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     asked, counts = parse(metric), counts_of()
     by_region = images_of(asked, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[::-1]])[:, None]
-    given = (counts.classes, counts.partition, "released")
+    given = (counts, "released")
     found = values(asked, many, *given)
     alone = [values(asked, each[0], *given) for each in many]
     assert found.shape == (3, 1)
@@ -129,7 +129,7 @@ def test_many_sums_of_pairs_at_once_are_each_alone(metric: str) -> None:
     asked, counts = parse(metric), pairs_of()
     by_region = images_of(asked, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
-    given = (counts.classes, counts.partition, "released")
+    given = (counts, "released")
     found = values(asked, many, *given)
     assert found.shape == (3, 1)
     np.testing.assert_allclose(found[:, 0], [values(asked, each[0], *given) for each in many])
@@ -148,7 +148,7 @@ def test_pairs_have_no_scores_of_single_frames(metric: str) -> None:
     with pytest.raises(InputError, match=sentence):
         images_of(asked, counts)
     with pytest.raises(InputError, match=sentence):
-        values(asked, counts.by_region(), counts.classes, counts.partition, "released")
+        values(asked, counts.by_region(), counts, "released")
 
 
 @pytest.mark.parametrize("metric", ["TC", "CA", "night/CA_released", "class/car/TC"])
@@ -160,7 +160,7 @@ def test_single_frames_have_no_scores_of_pairs(metric: str) -> None:
     with pytest.raises(InputError, match=sentence):
         images_of(asked, counts)
     with pytest.raises(InputError, match=sentence):
-        values(asked, counts.by_region(), counts.classes, counts.partition, "released")
+        values(asked, counts.by_region(), counts, "released")
 
 
 def test_classes_and_parts_of_pairs_are_checked_too() -> None:

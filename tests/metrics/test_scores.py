@@ -25,7 +25,7 @@ def test_two_classes_by_hand(absent) -> None:
     assert scores.recall(counts, absent).tolist() == [6 / 8, 3 / 4]
     assert scores.precision(counts, absent).tolist() == [6 / 7, 3 / 5]
     assert scores.f1(counts, absent).tolist() == [12 / 15, 6 / 9]
-    assert float(scores.miou(counts, absent)) == pytest.approx((6 / 9 + 3 / 6) / 2)
+    assert float(scores.miou(counts, absent, None)) == pytest.approx((6 / 9 + 3 / 6) / 2)
     assert float(scores.pixel_accuracy(counts)) == 9 / 12
 
 
@@ -37,14 +37,14 @@ def test_absent_classes_by_hand() -> None:
     np.testing.assert_array_equal(scores.recall(counts, "exclude"), [4 / 5, np.nan, np.nan, 0])
     np.testing.assert_array_equal(scores.precision(counts, "exclude"), [4 / 6, np.nan, 0, np.nan])
     np.testing.assert_array_equal(scores.f1(counts, "exclude"), [8 / 11, np.nan, 0, 0])
-    assert float(scores.miou(counts, "released")) == pytest.approx(4 / 7 / 4)
-    assert float(scores.miou(counts, "exclude")) == pytest.approx(4 / 7 / 3)
+    assert float(scores.miou(counts, "released", None)) == pytest.approx(4 / 7 / 4)
+    assert float(scores.miou(counts, "exclude", None)) == pytest.approx(4 / 7 / 3)
 
 
 def test_nothing_counted() -> None:
     counts = np.zeros((2, 3, 3), int)
-    assert scores.miou(counts, "released").tolist() == [0, 0]
-    assert np.isnan(scores.miou(counts, "exclude")).all()
+    assert scores.miou(counts, "released", None).tolist() == [0, 0]
+    assert np.isnan(scores.miou(counts, "exclude", None)).all()
     assert np.isnan(scores.pixel_accuracy(counts)).all()
     assert np.isnan(scores.variance([np.nan, np.nan]))
 
@@ -135,8 +135,10 @@ def test_summary_is_derived_from_the_counts(absent) -> None:
     counts = example((False, True))
     result = scores.summary(counts, absent)
     pooled = counts.counts.sum((0, 1))
-    assert result[names.MIOU] == pytest.approx(float(scores.miou(pooled, absent)))
-    regions = [float(scores.miou(counts.counts[:, region].sum(0), absent)) for region in range(3)]
+    assert result[names.MIOU] == pytest.approx(float(scores.miou(pooled, absent, None)))
+    regions = [
+        float(scores.miou(counts.counts[:, region].sum(0), absent, None)) for region in range(3)
+    ]
     assert [result[names.region(number)] for number in (1, 2, 3)] == pytest.approx(regions)
     assert result[names.VAR] == pytest.approx(np.var(np.array(regions) * 100))
     assert result[names.class_iou("car")] == pytest.approx(scores.iou(pooled, absent)[1])
@@ -157,6 +159,6 @@ def test_summary_without_day_and_night_has_no_parts() -> None:
 def test_the_pooled_mean_is_not_the_mean_of_the_regions() -> None:
     # Region 1: 90 of 100 pixels right; region 2: 1 of 4.
     counts = np.array([[[90, 10], [0, 0]], [[0, 0], [3, 1]]])
-    pooled = float(scores.miou(counts.sum(0), "released"))
+    pooled = float(scores.miou(counts.sum(0), "released", None))
     assert pooled == pytest.approx((90 / 103 + 1 / 14) / 2)
-    assert pooled != pytest.approx(scores.miou(counts, "released").mean())
+    assert pooled != pytest.approx(scores.miou(counts, "released", None).mean())

@@ -7,10 +7,17 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError
+from rgbt.data.domains import Domain, Domains
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import Batch, MaskPair, Output
 
+ONE = Domains(
+    source=Domain(split="train", view=None, head=None, labels="given"),
+    target=None,
+    target_is=None,
+    tested_head="own",
+)
 B, Q, K = 2, 3, 4
 
 
@@ -122,14 +129,14 @@ def test_distillation_without_masks_is_refused() -> None:
 
 
 def test_supervised_sums_the_parts_of_one_pass() -> None:
-    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Nothing())
+    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Nothing(), domains=ONE)
     (phase,) = supervised.phases(batch(), generator_of)
     assert phase.parts["class"] == 1.0
     assert supervised.model.call["masks"] is None
 
 
 def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:
-    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves())
+    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves(), domains=ONE)
     list(supervised.phases(batch(), generator_of))
     assert supervised.model.call["masks"].rgb.shape == (B, 2, 2)
 

@@ -113,7 +113,7 @@ def scheme(model: Any, **changes: Any) -> Temporal:
 
 def step(temporal: Temporal, given: Batch | None = None) -> dict[str, Tensor]:
     (phase,) = temporal.phases(given or batch(), generator_of)
-    assert phase.optimizer == "main"
+    assert phase.optimizers == ("main",)
     return dict(phase.parts)
 
 

@@ -15,6 +15,16 @@ def test_of_single_frames_every_evaluation_is_a_call_and_a_file() -> None:
     assert {word.partition("=")[0] for word in ring.command[1:]} <= set(OF_EVALUATE)
 
 
+def test_a_head_that_is_asked_for_has_a_file_of_its_own() -> None:
+    day = Evaluation("rgb", "ring9", head="source")
+    assert day.command == ("rgbt.evaluate", "modality=rgb", "regions=ring9", "head=source")
+    assert day.path == "evaluations/table_rgb_ring9_source-head.npz"
+    assert day.label == "rgb, ring9, source head"
+    assert {word.partition("=")[0] for word in day.command[1:]} <= set(OF_EVALUATE)
+    assert Evaluation(head="own").path == "evaluations/table_default_as-trained_own-head.npz"
+    assert Evaluation(head="own").command[-1] == "head=own"
+
+
 def test_of_virtual_views_one_call_makes_two_files() -> None:
     aligned, released = Evaluation(frames="aligned"), Evaluation(frames="released")
     assert aligned.command == released.command == ("rgbt.consistency", "frames=virtual")

@@ -146,10 +146,41 @@ def test_a_table_that_cannot_be_run_shows_what_is_printed(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     asked = driven("finished")
-    code, out, _ = call(entry, "table=multihead/table5", "tracking=none")
+    code, out, _ = call(entry, "table=spatialseg/fps", "tracking=none")
     assert (code, asked) == (0, [])
     assert "Cannot be run yet: " in out
-    assert (place / "runs/tables/multihead/table5_demo/table.md").exists()
+    assert (place / "runs/tables/spatialseg/fps_demo/table.md").exists()
+
+
+def test_a_table_of_sizes_runs_nothing_and_has_values(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    """HeatNet 54,361,105 and the thesis' two heads 44,564,656 parameters at 14 classes."""
+    asked = driven("finished")
+    words = ("table=multihead/table5", "tracking=none", "seeds=3")
+    code, out, err = call(entry, *words)
+    assert (code, asked, err) == (0, [], "")
+    shown = {line.split()[0]: line.split() for line in out.splitlines() if "44.6" in line}
+    assert shown["Multi-head"][-3:] == ["*44.56", "*44.6", "-0.04"]
+    folder = place / "runs/tables/multihead/table5_demo"
+    assert len(list(folder.iterdir())) == 4
+    rows = list(csv.DictReader((folder / "table.csv").open()))
+    assert [row["mean"] for row in rows] == ["54.361105", "44.564656", "44.575498", "198.594658"]
+    assert [row["published"] for row in rows] == ["54.4", "44.6", "", ""]
+    code, out, _ = call(entry, *words, "dry_run=true")
+    assert (code, asked[0][0].points) == (0, ())
+    assert "0 runs: none." in out
+
+
+def test_a_network_that_cannot_be_built_is_told(
+    call: Call, place: Path, driven: Callable[..., Asked]
+) -> None:
+    driven("finished")
+    words = ("table=multihead/table5", "tracking=none", "model.depths=[3]")
+    code, out, err = call(entry, *words)
+    assert code == 1
+    assert "depths" in out
+    assert_one_sentence(err, "no value although nothing is missing")
 
 
 def test_dry_run_lists_the_cells_and_writes_nothing(

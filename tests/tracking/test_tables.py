@@ -12,11 +12,14 @@ import pytest
 from rich.console import Console
 
 from rgbt.tracking import terminal
+from rgbt.tracking.mlflow_fill import artifact_table
 from rgbt.tracking.tables import (
     ClassTable,
+    ConsistencyTable,
     RegionTable,
     ResultTables,
     class_grid,
+    consistency_grid,
     region_grid,
     result_grids,
     subset_grid,
@@ -70,6 +73,30 @@ def test_class_and_subset_grids(tables: ResultTables) -> None:
     assert grid.rows[1] == ("car", "33.33", "66.67", "50.00", "0.00")
     assert grid.rows[-1] == ("mean", "55.56", "", "62.50", "40.00")
     assert [row[0] for row in subset_grid(tables).rows] == ["all images", "day", "night"]
+
+
+def test_classes_that_are_left_out_of_means_say_so(tables: ResultTables) -> None:
+    consistency = ConsistencyTable(
+        ("road", "car"),
+        {"next": (0.5, 0.7)},
+        {"next": (0.4, 0.6)},
+        {"next": 0.5},
+        {"next": 0.4},
+        ("car",),
+    )
+    classes = replace(tables.classes, unscored=("car",))
+    marked = replace(tables, classes=classes, consistency=consistency)
+    shown = ["road", "car (not in means)", "mean"]
+    assert [row[0] for row in class_grid(marked).rows] == shown
+    assert [row[0] for row in consistency_grid(consistency, "").rows] == shown
+    plain = json.loads(json.dumps(marked.to_json()))
+    assert ResultTables.from_json(plain) == marked
+    # Of a file from before they were stored.
+    del plain["classes"]["unscored"], plain["consistency"]["unscored"]
+    older = replace(marked, classes=tables.classes, consistency=replace(consistency, unscored=()))
+    assert ResultTables.from_json(plain) == older
+    # MLflow's table keeps the names that runs are compared by.
+    assert artifact_table(marked) == artifact_table(tables)
 
 
 def test_markdown_has_one_line_per_row(tables: ResultTables) -> None:

@@ -49,6 +49,26 @@ def test_rows_hold_the_images_and_their_scores(dataset: MFNet) -> None:
     assert found.box == (slice(6, 18), slice(8, 24))
 
 
+def test_scores_of_an_image_leave_unscored_classes_out(dataset: MFNet) -> None:
+    label = dataset.read("00001D").label
+    present = sorted(set(np.unique(label).tolist()) - {255})
+    # One class is taken for another everywhere: 0, and of the other what is its own.
+    lost, took = present[:2]
+    own, more = (label == took).sum(), (label == lost).sum()
+
+    def merged(name: str) -> np.ndarray:
+        return np.where(dataset.read(name).label == lost, took, dataset.read(name).label)
+
+    def miou(*left_out: int) -> float:
+        dataset.unscored = tuple(dataset.classes[index] for index in left_out)
+        return made(dataset, names=NAMES[:1], ours=merged).rows[0].mious[0]
+
+    shared, others = own / (own + more), len(present) - 2
+    assert miou() == pytest.approx(100 * (0 + shared + others) / (others + 2))
+    assert miou(lost) == pytest.approx(100 * (shared + others) / (others + 1))
+    assert miou(lost, took) == pytest.approx(100)
+
+
 @pytest.mark.parametrize("layout", ["rows", "columns"])
 def test_draws_titles_names_classes_and_a_box_on_every_picture(
     dataset: MFNet, tmp_path: Path, layout: str

@@ -33,6 +33,17 @@ def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
     assert scored.name == "pred"
 
 
+def test_what_is_counted_says_which_classes_are_left_out_of_means(
+    tiny: MFNet, write: Write
+) -> None:
+    tiny.unscored = ("person",)
+    scored = score_folder(write(PREDICTIONS), tiny, "test", STRIPS)
+    assert [counts.unscored for counts in scored.counts] == [("person",)] * 2
+    # Row 3 as below, without the person 0/1.
+    assert scored.maps is not None
+    np.testing.assert_allclose(iou_map(scored.maps)[3], [1.0, 1.0, 1 / 2, 1.0])
+
+
 def test_the_map_by_hand(tiny: MFNet, write: Write) -> None:
     maps = score_folder(write(PREDICTIONS), tiny, "test", STRIPS).maps
     assert maps is not None

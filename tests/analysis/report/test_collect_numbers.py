@@ -14,6 +14,7 @@ from analysis.report import collect
 from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
 from analysis.report.store import StoredRun
+from analysis.report.tables_cells import cell_of
 from analysis.report.tables_files import Line, Recorded
 from analysis.report.tables_intervals import OWN, Intervals, Source
 from analysis.report.tables_scored import Draft, asked_of, score_again, values_of
@@ -105,6 +106,41 @@ def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
     )
     assert expected < 0
     assert values_of(found, table.rows[0], drop, {"k0": run}) == pytest.approx((expected,))
+
+
+def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
+    run = run_of({}, 0, counts_of(0))
+    run._evaluations["evaluations/table_rgb_as-trained.npz"] = counts_of(0, 0.5)
+    text = TABLE.replace("minus: [rgb, mIoU]", "mean: [rgb, mIoU]")
+    found = draft(tmp_path, 1, {"k0": run}, text)
+    row, column = found.scored.table.rows[0], found.scored.table.columns[3]
+    sides = [value("mIoU", counts_of(0, right), "released") for right in (0.5, 0.7)]
+    assert values_of(found, row, column, {"k0": run}) == pytest.approx((sum(sides) / 2,))
+    assert found.scored.cells["A", "drop"].mean == pytest.approx(sum(sides) / 2)
+    assert asked_of(found, row, column) is None
+    missing = draft(tmp_path, 1, {"k0": run_of({}, 0, counts_of(0))}, text)
+    assert values_of(missing, row, column, {"k0": run_of({}, 0, counts_of(0))}) == (None,)
+
+
+def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> None:
+    path = tmp_path / "t.yaml"
+    path.write_text(TABLE.replace("needs: the consistency metrics", "parameters: true"))
+    lines = {
+        ("A", "TC"): Line(54.36, None, 0, None, "", ()),
+        ("B", "TC"): Line(44.56, None, 0, None, "", ()),
+        ("C", "TC"): Line(None, None, 0, None, "", ()),
+    }
+    recorded = Recorded(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
+    scored = score_again(recorded, load_table(str(path)), {})
+    found = Draft(recorded, scored)
+    assert {place: cell.mean for place, cell in scored.cells.items()} == {
+        ("A", "TC"): 54.36,
+        ("B", "TC"): 44.56,
+    }
+    row, column = scored.table.rows[0], scored.table.columns[-1]
+    cell = cell_of(found, row, column, Intervals({}))
+    assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 1, ())
+    assert asked_of(found, row, column) is None
 
 
 def pairs_of(seed: int) -> Counts:

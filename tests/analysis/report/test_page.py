@@ -163,6 +163,17 @@ def visible(dom: str) -> str:
 
 
 @browser
+def test_classes_that_are_left_out_of_means_say_so(data: ReportData, tmp_path: Path) -> None:
+    runs = tuple(replace(run, unscored=(run.classes[1],)) for run in data.runs)
+    drawn, console = dump(tmp_path, page.page_text(replace(data, runs=runs)))
+    assert console == []
+    first, second = data.runs[0].classes[:2]
+    rows = re.findall(r'<th scope="row">([^<]*)</th>', drawn)
+    assert f"{second} (not in means)" in rows
+    assert first in rows
+
+
+@browser
 def test_browser_draws_every_value(data: ReportData, text: str, tmp_path: Path) -> None:
     dom, console = dump(tmp_path, text)
     assert console == []

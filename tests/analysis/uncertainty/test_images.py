@@ -371,7 +371,7 @@ def test_no_image_common_to_all_of_three():
 
 
 def test_classes_are_those_of_the_population():
-    assert prepare([drawn(12, 1)], ASKED[0], FEW).classes == CLASSES
+    assert prepare([drawn(12, 1)], ASKED[0], FEW).like.classes == CLASSES
 
 
 def test_blocks_are_made_for_accuracy_and_miou_of_both_methods_and_their_difference():

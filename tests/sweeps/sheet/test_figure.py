@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 from sweeps.points import Evaluation
 from sweeps.sheet.drawing import OURS, PUBLISHED, are_far_apart
 from sweeps.sheet.figure import draw_table, figure_of, main_columns
+from sweeps.table.cells import Cell
 from sweeps.table.scoring import score
 from sweeps.table.table import Column, Factor, Row
 from tests.sweeps.tabled import Made, counts_of, outcome, pairs_of, table
@@ -102,6 +104,17 @@ def test_png_holds_both_colours(tmp_path: Path) -> None:
     for colour in (OURS, PUBLISHED):
         rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert (image == rgb).all(1).sum() > 100
+
+
+def test_sizes_are_drawn_without_runs() -> None:
+    column = Column(name="size", parameters=True)
+    made = table((Row(label="a", values={"size": 54.4}), Row(label="b")), (column,))
+    sizes = {(label, "size"): Cell(50.0, math.nan, 0) for label in "ab"}
+    figure = figure_of(score("own/t", made, {}, scale="demo", sizes=sizes))
+    assert figure is not None
+    assert figure.get_suptitle() == "own/t (ours: counted at scale=paper)"
+    assert [line.get_markerfacecolor() == "none" for line in figure.axes[0].lines].count(False)
+    assert figure_of(score("own/t", made, {}, scale="demo")).get_suptitle().endswith("(published)")
 
 
 def test_nothing_to_draw(tmp_path: Path) -> None:

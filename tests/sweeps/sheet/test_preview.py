@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from sweeps.running.lists import Outcome
-from sweeps.sheet.preview import cells_grid, summary
+from sweeps.sheet.preview import cells_grid, summary, tables_grid
 from sweeps.table.cell_points import Wanted
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import table
@@ -49,6 +49,16 @@ def test_a_table_without_further_evaluations_or_without_runs_says_nothing_of_the
     assert len(summary(*asked((Column(name="mIoU", metric="mIoU"),)), 1)) == 2
     wanted, _ = asked(FRAMES)
     assert summary(wanted, [], 1) == ["0 runs: none."]
+
+
+def test_sizes_are_counted_without_a_run() -> None:
+    wanted, outcomes = asked((Column(name="size", parameters=True),))
+    assert outcomes == []
+    assert summary(wanted, [], 1) == [
+        "0 runs: none.",
+        "Column 'size' is counted at scale=paper, without any run.",
+    ]
+    assert tables_grid([(wanted, [])], 1).rows == (("own/t", "0 of 2", *"0000", "-"),)
 
 
 def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> None:

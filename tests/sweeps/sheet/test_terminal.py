@@ -2,14 +2,16 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from typing import Any
 
 from rich.text import Text as RichText
 
 from sweeps.sheet.files import latex, markdown, tidy_csv
-from sweeps.sheet.sheet import DEMO, sheet_of
+from sweeps.sheet.sheet import DEMO, PARAMETERS, sheet_of
 from sweeps.sheet.terminal import terminal
+from sweeps.table.cells import Cell
 from sweeps.table.scoring import Scored, score
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, failed, outcome, right, table
@@ -162,6 +164,39 @@ def test_rows_of_the_same_runs_and_several_commits_are_told() -> None:
     assert sheet.lines[1].label.notes == (1,)
     assert "Runs of ours come from several git commits: aaa (1), bbb (1)." in sheet.remarks
     assert "Every row of ours was run with x=1." in sheet.remarks
+
+
+def sized(columns: tuple[Column, ...], runs: dict[Any, Any]) -> Scored:
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"size": printed})
+        for label, printed in (("a", 54.4), ("b", 44.6))
+    )
+    sizes = {(row.label, "size"): Cell(m, math.nan, 0) for row, m in zip(rows, (54.361, 44.5646))}
+    return score("own/t", table(rows, columns), runs, scale="demo", sizes=sizes)
+
+
+def test_sizes_alone_have_neither_seeds_nor_a_scale_of_runs() -> None:
+    size = Column(name="size", parameters=True, best="lowest")
+    scored = sized((size,), {})
+    shown = lines(scored)
+    assert shown[3].split() == ["a", "_54.36", "_54.4", "-0.04"]
+    assert shown[4].split() == ["b", "*44.56", "*44.6", "-0.04"]
+    assert PARAMETERS in shown
+    assert not any("scale=demo" in line for line in shown)
+    assert r"a &  & \underline{54.36} & \underline{54.4} & -0.04 \\" in latex(sheet_of(scored))
+    assert "| b |  | **44.56** | **44.6** | -0.04 |" in markdown(sheet_of(scored))
+    first, _ = csv.DictReader(io.StringIO(tidy_csv(scored)))
+    assert (first["mean"], first["sd"], first["n"], first["runs"]) == ("54.361", "", "0", "")
+
+
+def test_sizes_beside_scores_do_not_count_as_seeds() -> None:
+    columns = (Column(name="size", parameters=True), Column(name="acc", metric="pixel_accuracy"))
+    run = outcome("k", right(40))
+    shown = lines(sized(columns, {("a", 0): run, ("a", 1): run}))
+    assert shown[3].split()[:3] == ["a", "2", "*54.36"]
+    assert any(line.startswith("Ours: scale=demo") for line in shown)
+    scored = sized(columns, {(label, 0): run for label in "ab"})
+    assert sheet_of(scored).notes == ("At scale=demo the same runs as row 'a'.",)
 
 
 def test_markdown_read_back() -> None:

@@ -78,6 +78,38 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         )
 
 
+def test_a_run_is_evaluated_for_the_columns_that_its_rows_have() -> None:
+    columns = (
+        Column(name="rgb", metric="mIoU"),
+        Column(name="thermal", metric="mIoU", modality="thermal"),
+        Column(name="ring", metric="TC", frames="aligned"),
+    )
+    rows = (
+        Row(label="a", experiment="crm", without=("thermal",)),
+        Row(label="b", experiment="grbm", without=("thermal",)),
+        Row(label="c", experiment="grbm", without=("ring",)),
+        Row(label="later", experiment="crm", needs="flow"),
+    )
+    asked = Wanted("own/t", table(rows, columns), "demo", (0,))
+    thermal, frames = Evaluation("thermal"), Evaluation(frames="aligned")
+    assert [point.evaluations for point in asked.points()] == [(frames,), (thermal, frames)]
+    assert asked.evaluations() == (thermal, frames)
+
+
+def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
+    columns = (
+        Column(name="night", metric="night/mIoU"),
+        Column(name="by day", metric="night/mIoU", head="source"),
+        Column(name="both", mean=("night", "by day")),
+        Column(name="size", parameters=True),
+    )
+    asked = Wanted("own/t", table(ROWS, columns), "demo", (0,))
+    assert asked.points()[0].evaluations == (Evaluation(head="source"),)
+    alone = Wanted("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
+    assert (alone.places(), alone.points(), alone.runs([])) == ([], [], {})
+    assert alone.models() == set()
+
+
 def test_outcomes_go_back_to_their_cells() -> None:
     asked = wanted()
     outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]

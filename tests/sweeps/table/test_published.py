@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sweeps.table.table import load_table, table_names
+from sweeps.table.table import Row, load_table, table_names
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"
@@ -25,6 +25,18 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+def one_row_per_cell(table: dict[str, Any]) -> dict[str, Any]:
+    """The thesis prints both teachers in one row; each is a run and so a row of ours."""
+    words = dict(zip(table["columns"], table["columns_printed"], strict=True))
+    whose = {"Ours": "", "Paper": " (HeatNet paper)"}
+    rows = [
+        {**row, "label": words[column] + whose[row["label"]], "values": {"mIoU": value}}
+        for row in table["rows"]
+        for column, value in row["values"].items()
+    ]
+    return {**table, "rows": rows}
+
+
 @pytest.fixture(scope="module")
 def published() -> dict[str, Any]:
     """Tables that hold numbers, by the name of ours."""
@@ -32,7 +44,15 @@ def published() -> dict[str, Any]:
     for paper in PAPERS:
         tables = yaml.safe_load((FOLDER / f"{paper}.yaml").read_text(encoding="utf-8"))["tables"]
         found |= {f"{paper}/{key}": table for key, table in tables.items() if table["rows"]}
+    found["multihead/table1"] = one_row_per_cell(found["multihead/table1"])
     return found
+
+
+def printed_rows(name: str) -> list[Row]:
+    """Rows of our table that the paper has; those of ours alone hold no printed value."""
+    ours = [row for row in OURS[name].rows if row.origin is None]
+    assert not any(row.values for row in ours), name
+    return [row for row in OURS[name].rows if row.origin is not None]
 
 
 def numbers(value: Any) -> Iterator[float | None]:
@@ -56,9 +76,9 @@ def test_every_table_with_numbers_is_here(published: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", OURS)
 def test_numbers_arrive_unchanged(name: str, published: dict[str, Any]) -> None:
-    ours, theirs = OURS[name], published[name]["rows"]
-    assert [row.label for row in ours.rows] == [row["label"] for row in theirs]
-    for row, other in zip(ours.rows, theirs, strict=True):
+    ours, theirs = printed_rows(name), published[name]["rows"]
+    assert [row.label for row in ours] == [row["label"] for row in theirs]
+    for row, other in zip(ours, theirs, strict=True):
         expected = list(numbers(other["values"]))
         assert count_and_sum(list(row.values.values())) == count_and_sum(expected), row.label
         assert list(row.values.values()) == expected, row.label
@@ -66,11 +86,11 @@ def test_numbers_arrive_unchanged(name: str, published: dict[str, Any]) -> None:
 
 
 def test_the_four_papers_together(published: dict[str, Any]) -> None:
-    """161 rows, 1480 cells, 19 of them without a number."""
-    rows = [row for name in published for row in OURS[name].rows]
+    """161 rows and two more where one is split, 1480 cells, 19 of them without a number."""
+    rows = [row for name in published for row in printed_rows(name)]
     cells, known, total = count_and_sum([v for row in rows for v in row.values.values()])
     theirs = [row["values"] for table in published.values() for row in table["rows"]]
-    assert (len(rows), cells, cells - known) == (161, 1480, 19)
+    assert (len(rows), cells, cells - known) == (163, 1480, 19)
     assert total == pytest.approx(count_and_sum(list(numbers(dict(enumerate(theirs)))))[2])
 
 

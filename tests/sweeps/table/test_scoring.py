@@ -6,6 +6,7 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.points import Evaluation
+from sweeps.table.cells import Cell
 from sweeps.table.scoring import check_metrics, published, score
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
@@ -81,6 +82,71 @@ def test_minus_is_taken_per_seed_and_modalities_have_their_counts() -> None:
     less = scored.cells["a", "less"]
     assert less.mean == -15.0
     assert less.sd == pytest.approx(math.sqrt(50))  # -10 and -20; not from the two columns' sds
+
+
+def test_a_mean_of_columns_is_taken_per_seed_and_says_what_is_missing() -> None:
+    columns = (
+        Column(name="both", mean=("rgb", "acc")),
+        *(ACC, RGB),
+        Column(name="gain", minus=("both", "acc")),
+    )
+    runs = {
+        ("a", seed): outcome(str(seed), {None: right(acc), Evaluation("rgb"): right(rgb)})
+        for seed, (acc, rgb) in enumerate([(50, 40), (70, 50)])
+    }
+    cells = score("t", table((Row(label="a"),), columns), runs, scale="demo").cells
+    assert cells["a", "both"].mean == 52.5
+    assert cells["a", "both"].sd == pytest.approx(math.sqrt(112.5))  # 45 and 60
+    assert cells["a", "gain"].mean == -7.5  # -5 and -10
+    missing = Column(name="both", mean=("acc", "bus"))
+    bus = Column(name="bus", metric="class/bus")
+    found = score("t", table((Row(label="a"),), (ACC, bus, missing)), runs, scale="demo")
+    cell = found.cells["a", "both"]
+    assert (cell.seeds, cell.mark) == (0, "no value")
+    assert "no class 'bus'" in cell.reason
+    later = (ACC, Column(name="TC", needs="flow"), Column(name="both", mean=("acc", "TC")))
+    found = score("t", table((Row(label="a"),), later), runs, scale="demo")
+    assert found.cells["a", "both"].reason == "seeds 0, 1: flow"
+
+
+def test_columns_that_a_row_leaves_out_have_no_cell_and_are_no_failure() -> None:
+    rows = (Row(label="a", without=("rgb",)), Row(label="b"))
+    both = {None: right(50), Evaluation("rgb"): right(30)}
+    runs = {("a", 0): outcome("k", right(40)), ("b", 0): outcome("l", both)}
+    mean = Column(name="both", mean=("acc", "rgb"))
+    cells = score("t", table(rows, (ACC, RGB, LESS, mean)), runs, scale="demo").cells
+    assert {place: cell.mean for place, cell in cells.items()} == {
+        ("a", "acc"): 40.0,
+        **{("b", "acc"): 50.0, ("b", "rgb"): 30.0, ("b", "less"): -20.0, ("b", "both"): 40.0},
+    }
+
+
+def test_each_head_has_its_counts() -> None:
+    column = Column(name="day head", metric="pixel_accuracy", modality="rgb", head="source")
+    made = {None: right(50), Evaluation("rgb", head="source"): right(30)}
+    runs = {("a", 0): outcome("k", made)}
+    scored = score("t", table((Row(label="a"),), (ACC, column)), runs, scale="demo")
+    assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]
+
+
+def test_sizes_stand_beside_what_was_run_and_have_ranks() -> None:
+    size = Column(name="size", parameters=True, best="lowest")
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"size": printed})
+        for label, printed in (("a", 54.4), ("b", 44.6), ("c", 50.0))
+    )
+    runs = {("a", seed): outcome(str(seed), right(40)) for seed in (0, 1)}
+    sizes = {
+        (label, "size"): Cell(millions, math.nan, 0)
+        for label, millions in (("a", 54.36), ("b", 44.56), ("c", 51.0))
+    }
+    scored = score("t", table(rows, (ACC, size)), runs, scale="demo", sizes=sizes)
+    assert scored.cells["a", "acc"].seeds == 2
+    assert scored.cells["b", "size"].mean == 44.56
+    assert scored.ranks_ours == {("b", "size"): 1, ("c", "size"): 2}
+    assert scored.difference(rows[0], size) == pytest.approx(-0.04)
+    assert (scored.orders["size"].rho, scored.orders["size"].rows) == (pytest.approx(1.0), 3)
+    assert set(score("t", table(rows, (size,)), {}, scale="demo").cells) == set()
 
 
 def test_regions_of_the_table_and_placeholders() -> None:

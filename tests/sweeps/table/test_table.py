@@ -14,7 +14,7 @@ import yaml
 from rgbt.checks import InputError
 from rgbt.config import build, check, conf_dir, register_resolvers, run_key
 from rgbt.metrics.named import parse
-from sweeps.table.table import Row, Table, load_table, table_names
+from sweeps.table.table import Column, Row, Table, load_table, table_names
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 ROWS = [
@@ -51,6 +51,12 @@ def row(**keys: Any) -> dict[str, Any]:
 
 def column(**keys: Any) -> dict[str, Any]:
     return {"columns": [{"name": "mIoU", "metric": "mIoU"}, {"name": "b", **keys}], "rows": []}
+
+
+def behind(**keys: Any) -> dict[str, Any]:
+    """A difference of a column that stands behind it."""
+    columns = column(minus=["mIoU", "c"])["columns"]
+    return {"columns": [*columns, {"name": "c", **keys}], "rows": []}
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +111,7 @@ def test_names_list_published_tables_and_ones_own(tmp_path: Path) -> None:
         (row(overides=["a=1"]), "row 'small': 'overides' is not a key; did you mean 'overrides'"),
         (row(origin="own_methode"), "row 'small': 'origin': input should be 'own_method'"),
         (row(values={"mIuO": 1}), "row 'small', column: 'mIuO' is not a choice; did you mean"),
+        (row(without=["Vra"]), "row 'small', without: 'Vra' is not a choice; did you mean 'Var'"),
         (row(doubtful=["IoU"]), "row 'small', column: 'IoU' is not a choice"),
         (row(values={"mIoU": "61"}), "row 'small', values: 'mIoU': input should be a valid number"),
         (row(values={"mIoU": float("nan")}), "'mIoU': input should be a finite number"),
@@ -123,10 +130,24 @@ def test_names_list_published_tables_and_ones_own(tmp_path: Path) -> None:
         ({"absent": "exlude"}, "'absent': input should be 'released' or 'exclude'"),
         (column(metric="Var", name="mIoU"), "columns: 'mIoU' stands twice"),
         (column(metric="Var", best="low"), "column 'b': 'best': input should be 'highest'"),
-        (column(), "column 'b': expected one of metric, minus and needs, got none"),
+        (column(), "expected one of metric, minus, mean, parameters and needs, got none"),
         (column(metric="Var", needs="a part"), "got metric and needs"),
         (column(minus=["mIoU"]), "column 'b': 'minus[1]' has no value"),
         (column(minus=["mIoU", "IoU"]), "column 'b', minus: 'IoU' is not a choice"),
+        (column(mean=["mIoU", "IoU"]), "column 'b', mean: 'IoU' is not a choice"),
+        (column(mean=[]), "column 'b', mean: expected two or more different columns, got none"),
+        (column(mean=["mIoU"]), "expected two or more different columns, got mIoU."),
+        (column(mean=["mIoU", "mIoU"]), "two or more different columns, got mIoU, mIoU."),
+        (column(mean=["mIoU", "b"]), "'b' is computed from other columns itself; move it in front"),
+        (column(mean="mIoU"), "column 'b': 'mean': input should be a list"),
+        (column(metric="Var", parameters=True), "got metric and parameters"),
+        (column(parameters="yes"), "column 'b': 'parameters': input should be a valid bool"),
+        (behind(parameters=True), "minus: 'c' counts parameters and is no score"),
+        (behind(mean=["mIoU", "b"]), "minus: 'c' is computed from other columns itself; move it"),
+        (column(metric="Var", head="target "), "'head': input should be 'as trained', 'own'"),
+        (column(mean=["mIoU", "b"], head="source"), "'head' is for scores of single frames alone"),
+        (column(parameters=True, head="source"), "single frames alone; remove head: source"),
+        (column(metric="TC", frames="aligned", head="target"), "remove head: target"),
         ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
         (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
         (column(metric="class/car/CA"), "class/car/CA compares two frames"),
@@ -214,6 +235,19 @@ def test_a_row_runs_unless_a_part_is_missing() -> None:
     assert not runnable("a part", None, "crm")
     assert not runnable(None, "a part", "crm")
     assert not runnable(None, None, None)
+
+
+def test_a_row_leaves_out_columns_and_what_is_computed_from_them() -> None:
+    row = Row(label="a", experiment="crm", without=("night",))
+    columns = (
+        Column(name="far", mean=("both", "day")),
+        Column(name="day", metric="day/mIoU"),
+        Column(name="night", metric="night/mIoU"),
+        Column(name="both", mean=("day", "night")),
+    )
+    table = Table(paper="", number="", caption="", data="", columns=columns, rows=(row,))
+    assert [column.name for column in table.columns_of(row)] == ["day"]
+    assert table.columns_of(Row(label="b")) == columns
 
 
 @pytest.mark.parametrize(("table", "row"), ROWS)

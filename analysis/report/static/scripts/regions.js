@@ -52,7 +52,7 @@ function groupsOf(runs) {
   const groups = new Map();
   for (const run of runs) {
     const name = run.group || run.experiment || run.name;
-    const id = [name, run.scale, run.split, run.partition, run.dataset].join("|");
+    const id = [name, run.scale, run.split, run.partition, run.dataset, run.unscored].join("|");
     if (!groups.has(id)) groups.set(id, { id, name, runs: [] });
     groups.get(id).runs.push(run);
   }
@@ -97,12 +97,12 @@ function openGroup(group) {
 
 /** Classes by regions as a heat table, mean over the runs. */
 function classTable(runs) {
-  const { classes, partition } = runs[0];
+  const { classes, partition, unscored } = runs[0];
   const cells = classes.map((_, k) => runs[0].class_region_ious[k].map((_, r) => mean(runs.map((run) => run.class_region_ious[k]?.[r]))));
   const range = extent(cells.flat()) || [0, 1];
   const kind = partitionOf(partition)?.kind;
   const heads = cells[0].map((_, r) => el("th", { scope: "col", class: "number" }, `${r + 1} ${placeWord(kind ?? "ring", r, cells[0].length)}`));
-  const rows = classes.map((name, k) => el("tr", {}, el("th", { scope: "row" }, name),
+  const rows = classes.map((name, k) => el("tr", {}, el("th", { scope: "row" }, unscored.includes(name) ? `${name} (not in means)` : name),
     el("td", { class: "number" }, fixed(score(runs, `class/${name}`))), cells[k].map((value) => heatCell(value, range))));
   const head = el("tr", {}, el("th", { scope: "col" }, "class"), el("th", { scope: "col", class: "number" }, "image"), heads);
   return scrollBox("IoU by class and region", el("table", { class: "plain heat" }, el("thead", {}, head), el("tbody", {}, rows)));

@@ -1,0 +1,143 @@
+"""What a run needs of earlier runs: trained here, before it, where it is missing.
+
+A configuration names them by their experiment: ``model.weights=experiment:NAME/last.pt`` starts
+from the end of that run (the stage before, or another task), ``domains.target.labels=
+experiment:NAME/best.pt`` learns from what its network predicts. Seed, scale and data set are those
+of the run that asks (`rgbt.config.SHARED`), so that a run of seed 2 stands on runs of seed 2.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import DOMAINS, earlier_config, earlier_run, run_key
+from rgbt.naming import TAGS
+from rgbt.tracking.files import is_held
+from rgbt.tracking.terminal import tell
+
+LOOK_S = 1.0
+"""Between two looks at a run that another process trains."""
+
+Train = Callable[[DictConfig, Sequence[str]], None]
+"""Brings a run to its end (see `rgbt.training.train`)."""
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """A run that another one needs.
+
+    Attributes:
+        key: dotted key of the configuration that names it.
+        experiment: its experiment.
+        checkpoint: "best.pt" or "last.pt".
+        config: its configuration.
+    """
+
+    key: str
+    experiment: str
+    checkpoint: str
+    config: DictConfig
+
+    @property
+    def folder(self) -> Path:
+        """Its run folder."""
+        return Path(self.config.runs_dir) / run_key(self.config)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has its result."""
+        return (self.folder / "result.json").exists()
+
+
+def earlier_runs(config: DictConfig) -> Iterator[Earlier]:
+    """The runs that a configuration names, in the order in which it does."""
+    for key in ("model.weights", *(f"domains.{name}.labels" for name in DOMAINS)):
+        reference = earlier_run(key, OmegaConf.select(config, key))
+        if reference is not None:
+            yield Earlier(key, *reference, earlier_config(config, reference[0]))
+
+
+def finish_earlier(config: DictConfig, train: Train) -> None:
+    """Train what `config` needs and is not finished, and what that needs, and predict its labels.
+
+    A run that another process trains is waited for.
+    """
+    for earlier in earlier_runs(config):
+        finish_earlier(earlier.config, train)
+        if not earlier.is_finished:
+            tell(
+                f"{config.name} needs a run of {earlier.experiment} ({earlier.key}), which comes "
+                f"first: {earlier.folder}"
+            )
+            _finish(earlier, train)
+        if earlier.key != "model.weights":
+            _write_labels(earlier, config, earlier.key.split(".")[1])
+
+
+def labels_folder(config: DictConfig, name: str) -> Path | None:
+    """The folder of pseudo-labels of a domain; None where it takes no pseudo-labels."""
+    node = config.domains[name]
+    for earlier in earlier_runs(config):
+        if earlier.key == f"domains.{name}.labels":
+            words = [node.split, node.teacher_view or "default"]
+            words += [earlier.checkpoint.removesuffix(".pt")]
+            words += [f"{node.threshold:g}"] if node.threshold else []
+            return earlier.folder / "pseudo_labels" / "_".join(words)
+    return None if node.labels in ("given", "none") else Path(node.labels).expanduser()
+
+
+def _finish(earlier: Earlier, train: Train) -> None:
+    told = False
+    while not earlier.is_finished:
+        if is_held(earlier.folder / "lock"):
+            if not told:
+                tell(f"{earlier.folder} is being trained by another process; waiting for it.")
+            told = True
+            time.sleep(LOOK_S)
+            continue
+        try:
+            with _without_tags():
+                train(earlier.config, [f"+experiment={earlier.experiment}"])
+        except InputError:
+            # Another process may have begun it between the look and the start.
+            if not is_held(earlier.folder / "lock"):
+                raise
+
+
+@contextmanager
+def _without_tags() -> Iterator[None]:
+    """Tags of a table's row or a trial are those of the run that was asked for."""
+    tags = os.environ.pop(TAGS, None)
+    try:
+        yield
+    finally:
+        if tags is not None:
+            os.environ[TAGS] = tags
+
+
+def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
+    from rgbt.pseudo import teacher_of, write_pseudo_labels
+    from rgbt.session import view_of
+    from rgbt.stored import open_run
+
+    folder, node = labels_folder(config, name), config.domains[name]
+    assert folder is not None, "the domain takes labels of an earlier run"
+    if (folder / "pseudo_labels.json").exists():
+        return
+    # The earlier run may have been made where the data lie elsewhere.
+    root = config.dataset.get("root")
+    place = [] if root is None else [f"dataset.root={root}"]
+    session = open_run(earlier.folder, place, earlier.checkpoint.removesuffix(".pt")).session
+    view = view_of(session, node.teacher_view or "default")
+    teacher = teacher_of(earlier.folder.name, session.model)
+    write_pseudo_labels(
+        session, teacher, node.split, view, folder, node.threshold, label_map=None, head=None
+    )

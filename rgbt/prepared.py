@@ -1,0 +1,246 @@
+"""Everything a training needs, built and looked at before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torch import nn
+
+from rgbt.checks import InputError
+from rgbt.config import build
+from rgbt.data.batches import Dataset
+from rgbt.data.domains import NONE, Domain
+from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.data.pairs import PairedBatches
+from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
+from rgbt.earlier import labels_folder
+from rgbt.engine.schedules import Schedule
+from rgbt.engine.trainer import Scheme
+from rgbt.losses.adversarial import cross_entropy, judged, least_squares
+from rgbt.losses.distillation import sdc, sdn
+from rgbt.losses.guidance import guidance
+from rgbt.randomness import derive, numpy_generator, torch_generator
+from rgbt.session import Session, open_session
+from rgbt.tracking.terminal import tell
+from rgbt.transforms.virtual_view import VirtualView
+from rgbt.types import VIEWS, Masker, Sample
+
+FUNCTIONS = {
+    "sdc": sdc,
+    "sdn": sdn,
+    "guide": guidance,
+    "judged_map": judged,
+    "verdict_losses": {"least_squares": least_squares, "cross_entropy": cross_entropy},
+}
+"""What schemes compute with, by the name that they ask for it; they know no losses themselves."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The objects of a training, before anything is written.
+
+    Attributes:
+        session: data, transform, network.
+        datasets: of each domain, with the labels that it is trained with.
+        model: the network as Fabric wrapped it.
+        others: further networks that are trained, wrapped, by name.
+        optimizers: by the names that the scheme's phases use.
+        scheme: yields the phases of a step.
+        schedule: learning rate factor per step.
+    """
+
+    session: Session
+    datasets: dict[str, Dataset]
+    model: nn.Module
+    others: dict[str, nn.Module]
+    optimizers: dict[str, torch.optim.Optimizer]
+    scheme: Scheme
+    schedule: Schedule
+
+    def splits(self) -> dict[str, str]:
+        """Domain -> split that it is trained on."""
+        return {name: domain.split for name, domain in self.session.domains.named.items()}
+
+    def steps_per_epoch(self) -> int:
+        """Batches of one epoch of the source."""
+        return steps_per_epoch(
+            self.datasets["source"], self.session.loading, self.splits()["source"]
+        )
+
+    def batches(self, steps: range) -> Batches | PairedBatches:
+        """Training batches of these steps: of one domain, or a pair of batches of both."""
+        found = [
+            train_batches(
+                self.datasets[name],
+                split,
+                self.session.transform,
+                self.session.loading,
+                # Each domain is shuffled and augmented by draws of its own.
+                self.session.config.seed
+                if name == "source"
+                else derive(self.session.config.seed, "domain", name),
+                steps,
+            )
+            for name, split in self.splits().items()
+        ]
+        return found[0] if len(found) == 1 else PairedBatches(*found, first=steps.start)
+
+
+def prepare(config: DictConfig) -> Prepared:
+    """Build everything and look at all lists that the run will read, so that errors come first."""
+    session = open_session(config)
+    domains = session.domains
+    for split in (
+        *(domain.split for domain in domains.named.values()),
+        *(session.trainer.selection_split, "test"),
+    ):
+        session.dataset.names(split)
+    datasets = {name: _labelled(session, name, domain) for name, domain in domains.named.items()}
+    for name, domain in domains.named.items():
+        steps_per_epoch(datasets[name], session.loading, domain.split)
+    masker: Masker = build(config.masker)
+    if session.transform.crop_hw is not None and not masker.hides_nothing:
+        # One draw for nothing: cells that do not fit the crop are told before the run is begun.
+        centre = torch.zeros(1, 2, dtype=torch.int64)
+        masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
+    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
+    if expected and session.weights is None:
+        tell(
+            "the published recipe starts from ImageNet weights, this run from random ones; name a "
+            "file with pretrained=..., or expect less than published."
+        )
+    loss = build(config.loss)
+    _check_loss(loss, session.model)
+    model = session.fabric.setup_module(session.model)
+    scheme = _scheme(session, model=model, loss=loss, masker=masker)
+    _check_domains(scheme, session)
+    _check_views(scheme, loss, session)
+    others, optimizers = _set_up(session, scheme)
+    return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
+
+
+def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
+    """The data set with the labels that a domain is trained with."""
+    config = session.config
+    folder = labels_folder(config, name)
+    if folder is not None:
+        return PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
+    return Unlabelled(session.dataset) if domain.labels == NONE else session.dataset
+
+
+def _scheme(session: Session, **collaborators: Any) -> Scheme:
+    """The scheme; weights of networks of its own are drawn from (seed, "scheme weights")."""
+    config = session.config
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive(config.seed, "scheme weights"))
+        scheme: Scheme = build(config.scheme, **collaborators, domains=session.domains, **FUNCTIONS)
+    return scheme
+
+
+def _set_up(
+    session: Session, scheme: Any
+) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
+    """Further networks of a scheme, wrapped in place, and all optimisers."""
+    builder = build(session.config.optimizer)
+    fabric = session.fabric
+    parts: dict[str, tuple[str, ...]] = getattr(scheme, "optimizers", {"main": ()})
+    built = {name: builder(session.model, without=without) for name, without in parts.items()}
+    others: dict[str, nn.Module] = getattr(scheme, "others", {})
+    for name, module in others.items():
+        built[name] = scheme.builders[name](module)
+        others[name] = fabric.setup_module(module)
+    return others, {name: fabric.setup_optimizers(each) for name, each in built.items()}
+
+
+def _check_loss(loss: object, model: nn.Module) -> None:
+    """Refuse a loss that reads what the network does not return, where both say it."""
+    reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
+    if None in (reads, predicts) or reads == predicts:
+        return
+    key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
+    advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
+    raise InputError(
+        f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts {predicts}; "
+        f"choose {advice[str(predicts)]}, or another network."
+    )
+
+
+def _check_views(scheme: object, loss: object, session: Session) -> None:
+    """Refuse a loss of two frames without a second one, and cameras of other images."""
+    views = getattr(scheme, "view", None)
+    if views is None and hasattr(loss, "reads_warped"):
+        raise InputError(
+            f"{type(loss).__name__} is a loss of two frames, but {type(scheme).__name__} shows the "
+            "network one; choose scheme=temporal_paper or temporal_released, or "
+            "loss=cross_entropy."
+        )
+    if isinstance(views, VirtualView):
+        # One example for nothing: a camera of other images is told before the run is begun.
+        sample = _first_readable(session, session.domains.source.split)
+        example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
+        _check_camera("scheme", views, example.rgb.shape[:2])
+    if session.consistency.sets:
+        shown = session.transform.test(_first_readable(session, "test"))
+        for image in (shown.rgb, shown.label):
+            _check_camera("consistency", session.consistency.view, image.shape[:2])
+
+
+def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> None:
+    try:
+        view.camera.matrix(image_hw)
+    except InputError as error:
+        raise InputError(f"{node}.view.{error}") from error
+
+
+def _first_readable(session: Session, split: str) -> Sample:
+    """The first sample of a split; unreadable ones are passed over where the run does so too."""
+    refused: InputError | None = None
+    for name in session.dataset.names(split):
+        try:
+            return session.dataset.read(name)
+        except InputError as error:
+            if session.loading.on_error == "raise":
+                raise
+            refused = refused or error
+    assert refused is not None, "a split holds a name"
+    raise refused
+
+
+def _check_domains(scheme: object, session: Session) -> None:
+    """Refuse domains that the scheme does not train on, and heads that the network lacks."""
+    domains, model = session.domains, session.model
+    if not hasattr(scheme, "domains"):
+        source = domains.source
+        if domains.target is not None or source.view is not None or source.head is not None:
+            raise InputError(
+                f"{type(scheme).__name__} trains on one domain as the network sees it by itself; "
+                "choose domains=one, or scheme=two_domains or adversarial_thesis."
+            )
+    if session.domains.source.labels == NONE:
+        raise InputError(
+            "domains.source.labels=none, but every scheme reads labels of the source; set it to "
+            "given, or name a folder of pseudo-labels."
+        )
+    heads = tuple(getattr(model, "heads", ()))
+    for name, domain in domains.named.items():
+        if domain.head is not None and domain.head not in heads:
+            raise InputError(
+                f"domains.{name}.head={domain.head}, but {type(model).__name__} has "
+                + (f"the heads {', '.join(heads)}" if heads else "no heads to choose from")
+                + "; choose one of them, or model=multi_head_demo (or _paper)."
+            )
+        views = getattr(model, "views", VIEWS)
+        if domain.view is not None and domain.view not in views:
+            raise InputError(
+                f"domains.{name}.view={domain.view}, but {type(model).__name__} predicts from "
+                f"{', '.join(views)}; choose one of these, or another network."
+            )
+    if len(heads) > 1 and len(domains.heads) < len(heads):
+        raise InputError(
+            f"{type(model).__name__} has the heads {', '.join(heads)}, of which these domains "
+            f"train {', '.join(domains.heads) or 'only the first'}; choose domains=day_to_night or "
+            "rgb_to_thermal, or a network with one head."
+        )

@@ -1,0 +1,197 @@
+"""A critic tells the domains' predictions apart; the network learns to leave it nothing to tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.schemes.domains import (
+    Domains,
+    Gradients,
+    Passes,
+    check_labels,
+    check_whole,
+    scores,
+    target_of,
+)
+from rgbt.types import GeneratorOf, Loss, Masker, Phase, TwoDomains
+
+Judged = Literal["probabilities", "logits", "self_information"]
+JudgedMap = Callable[[Tensor, Judged], Tensor]
+"""(B, K, H, W) scores -> what the critic sees (see `rgbt.losses.adversarial.judged`)."""
+
+VerdictLoss = Callable[[Tensor, float], Tensor]
+"""Verdicts and the number they should be -> scalar (see `rgbt.losses.adversarial`)."""
+
+CRITIC = "critic"
+
+
+class Adversarial:
+    """A segmentation phase and a critic phase, in every step or in alternating steps.
+
+        segmentation   L_s(source) [+ L_s(target)] + weight w A
+        critic         C = d(D(source), y_s) + d(D(target), y_t), halved on request
+
+    with D the critic, d the verdict loss, y_s and y_t the numbers that stand for the domains, and
+
+        A = d(D(target), y_s) [+ d(D(source), y_t) with `both_ways`]
+
+    w is 1, or the mean over pixels of 1 - c, c being the confidence of the target's labels.
+
+    Source: thesis (J. Sun), Eqs. 4 to 6; HeatNet, Sec. III; AdaptSegNet, Eqs. 1 to 3; ADVENT.
+
+    Args:
+        model: the network.
+        loss: L_s, of one domain.
+        masker: must hide nothing.
+        domains: source and target.
+        critic: D (see `rgbt.models.critic.Critic`).
+        critic_optimizer: builder of its optimiser, which phases call "critic".
+        judged: what the critic sees: class probabilities (thesis, AdaptSegNet), raw scores
+            (HeatNet), or weighted self-information (ADVENT).
+        verdict_loss: d: "least_squares" (thesis, HeatNet), or "cross_entropy" with logits
+            (AdaptSegNet, ADVENT).
+        source_value: y_s. Thesis, AdaptSegNet, ADVENT: 0; HeatNet: 1.
+        target_value: y_t. The other one.
+        weight: of A. Thesis' code and HeatNet's best command: 0.01; AdaptSegNet, ADVENT: 0.001.
+        both_ways: whether the source, too, is to be taken for the other domain (HeatNet).
+        weighed_by_confidence: whether w is not 1 (HeatNet); needs labels with confidence.
+        halved: whether C is halved (AdaptSegNet, ADVENT).
+        supervise_target: whether L_s of the target is computed. Thesis, Eq. 4: no; the code of its
+            basic network and HeatNet: yes.
+        alternates: whether steps alternate between the two phases, the critic's first (HeatNet);
+            false: both in every step.
+        gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "together"; the code of
+            its basic network: "kept".
+        judged_map: makes what the critic sees.
+        verdict_losses: d by its name.
+
+    Raises:
+        InputError: one domain alone, labels of the target that are missing or not read, no
+            confidence where it weighs, equal numbers for both domains.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a way in which the releases differ
+        self,
+        *,
+        model: nn.Module,
+        loss: Loss,
+        masker: Masker,
+        domains: Domains,
+        critic: Any,
+        critic_optimizer: Any,
+        judged: Judged,
+        verdict_loss: Literal["least_squares", "cross_entropy"],
+        source_value: float,
+        target_value: float,
+        weight: float,
+        both_ways: bool,
+        weighed_by_confidence: bool,
+        halved: bool,
+        supervise_target: bool,
+        alternates: bool,
+        gradients: Gradients,
+        judged_map: JudgedMap,
+        verdict_losses: Mapping[str, VerdictLoss],
+    ) -> None:
+        check_whole(masker, "adversarial")
+        target = target_of(domains, "adversarial")
+        check_choice("scheme.verdict_loss", verdict_loss, verdict_losses)
+        check_range("scheme.weight", weight, 0.0, 1e6)
+        if source_value == target_value:
+            raise InputError(
+                f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "
+                "the critic has nothing to tell apart; choose two numbers, such as 0 and 1."
+            )
+        advice = "set domains.target.labels and scheme.supervise_target so that they fit."
+        check_labels(target, "target", wanted=supervise_target, advice=advice)
+        if weighed_by_confidence and not target.confidence:
+            raise InputError(
+                "scheme.weighed_by_confidence=true weighs the adversarial loss by the confidence "
+                "of the target's labels, which are read without; set "
+                "domains.target.confidence=true, or scheme.weighed_by_confidence=false."
+            )
+        self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
+        self.optimizers = self.passes.optimizers
+        self.domains = domains
+        self.others: dict[str, nn.Module] = {CRITIC: critic}
+        self.builders = {CRITIC: critic_optimizer}
+        self.judged = judged
+        self.verdict_loss = verdict_losses[verdict_loss]
+        self.values = {"source": source_value, "target": target_value}
+        self.weight = weight
+        self.both_ways = both_ways
+        self.weighed_by_confidence = weighed_by_confidence
+        self.halved = halved
+        self.supervise_target = supervise_target
+        self.alternates = alternates
+        self.judged_map = judged_map
+
+    def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
+        """The segmentation's phases, then the critic's; or one of both kinds.
+
+        Args:
+            batch: of both domains, images in [0, 1].
+            generator_of: purpose -> generator of this step.
+        """
+        seen: dict[str, Tensor] = {}
+        if self.alternates and batch.number % 2 == 0:
+            with torch.no_grad():
+                for name, each in (("source", batch.source), ("target", batch.target)):
+                    output = self.passes.output(name, each, generator_of)
+                    seen[name] = self.judged_map(scores(output), self.judged)
+            yield self._critic_phase(seen)
+            return
+        self.others[CRITIC].requires_grad_(False)
+        yield from self.passes.phases(
+            lambda: self._source(batch, generator_of, seen),
+            lambda: self._target(batch, generator_of, seen),
+        )
+        self.others[CRITIC].requires_grad_(True)
+        if not self.alternates:
+            yield self._critic_phase({name: each.detach() for name, each in seen.items()})
+
+    def _source(
+        self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        output, parts = self.passes.supervised("source", batch.source, generator_of)
+        seen["source"] = self.judged_map(scores(output), self.judged)
+        if self.both_ways:
+            parts["source/adversarial"] = self._adversarial("source", batch, seen)
+        return parts
+
+    def _target(
+        self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        parts: dict[str, Tensor] = {}
+        if self.supervise_target:
+            output, parts = self.passes.supervised("target", batch.target, generator_of)
+        else:
+            output = self.passes.output("target", batch.target, generator_of)
+        seen["target"] = self.judged_map(scores(output), self.judged)
+        return parts | {"target/adversarial": self._adversarial("target", batch, seen)}
+
+    def _adversarial(self, name: str, batch: TwoDomains, seen: Mapping[str, Tensor]) -> Tensor:
+        """Weighted cost of a domain that the critic recognises."""
+        other = {"source": "target", "target": "source"}[name]
+        cost = self.verdict_loss(self.others[CRITIC](seen[name]), self.values[other])
+        if self.weighed_by_confidence:
+            confidence = batch.target.confidence
+            assert confidence is not None, "the constructor has seen that it is read"
+            cost = cost * (1.0 - confidence).mean()
+        return self.weight * cost
+
+    def _critic_phase(self, seen: Mapping[str, Tensor]) -> Phase:
+        share = 0.5 if self.halved else 1.0
+        critic = self.others[CRITIC]
+        return Phase(
+            (CRITIC,),
+            {
+                f"{CRITIC}/{name}": share * self.verdict_loss(critic(each), self.values[name])
+                for name, each in seen.items()
+            },
+        )

@@ -1,0 +1,174 @@
+"""What the schemes of domain adaptation share: how a domain passes the network, what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Literal, Protocol
+
+from torch import Tensor, nn
+
+from rgbt.checks import InputError
+from rgbt.types import Batch, GeneratorOf, Loss, Masker, Output, Phase, View
+
+Gradients = Literal["apart", "kept", "together"]
+"""What the optimisers of two heads step the parameters with that they share.
+
+    apart      each with the gradient of its own domain
+    kept       the source's with its own, then the target's with both, the source's from before
+               that step (thesis' code, stage with labels on both domains: nothing is cleared)
+    together   both with the sum of both, one after the other (thesis' code, adversarial stage),
+               so that shared parameters are stepped twice
+"""
+
+
+class Domain(Protocol):
+    """How a domain is seen (see `rgbt.data.domains.Domain`)."""
+
+    @property
+    def view(self) -> View | None:
+        """What the network sees; None leaves it to the network."""
+        ...
+
+    @property
+    def head(self) -> str | None:
+        """The head; None where there is one for all."""
+        ...
+
+    @property
+    def labels(self) -> str:
+        """Where labels come from; "none"."""
+        ...
+
+    @property
+    def confidence(self) -> bool:
+        """Whether labels carry a confidence."""
+        ...
+
+
+class Domains(Protocol):
+    """The domains of a run (see `rgbt.data.domains.Domains`)."""
+
+    @property
+    def source(self) -> Domain:
+        """Labelled."""
+        ...
+
+    @property
+    def target(self) -> Domain | None:
+        """To adapt to."""
+        ...
+
+
+class Passes:
+    """The network as each domain passes it, and what that costs.
+
+    Args:
+        model: the network.
+        loss: of one domain's scores and labels.
+        domains: source and target.
+        gradients: see `Gradients`; "apart" where there is one optimiser.
+
+    Attributes:
+        optimizers: name -> beginnings of the names of parameters that it leaves out. With a head
+            for each domain, one optimiser per domain, which share all but the heads (thesis,
+            Sec. III-B); else "main" for everything.
+    """
+
+    def __init__(
+        self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
+    ) -> None:
+        self.model = model
+        self.loss = loss
+        self.source = domains.source
+        self.target = domains.target
+        self.optimizers: dict[str, tuple[str, ...]] = {"main": ()}
+        if self.target is not None and self.source.head != self.target.head:
+            heads = {"source": self.source.head, "target": self.target.head}
+            self.optimizers = {
+                name: tuple(f"heads.{head}." for other, head in heads.items() if other != name)
+                for name in heads
+            }
+        if gradients != "apart" and len(self.optimizers) == 1:
+            raise InputError(
+                f"scheme.gradients={gradients} is about the optimisers of two heads, but this run "
+                "has one head for all images; set it to apart."
+            )
+        self.gradients = gradients
+
+    def output(self, name: str, batch: Batch, generator_of: GeneratorOf) -> Output:
+        """What the network returns for a batch of the domain "source" or "target"."""
+        domain = self.source if name == "source" else self.target
+        assert domain is not None, "a scheme of two domains has a target"
+        asked: dict[str, Any] = {} if domain.view is None else {"views": (domain.view,)}
+        asked |= {} if domain.head is None else {"head": domain.head}
+        generator = generator_of(f"{name} network")
+        output: Output = self.model(batch.rgb, batch.thermal, generator=generator, **asked)
+        return output
+
+    def supervised(
+        self, name: str, batch: Batch, generator_of: GeneratorOf
+    ) -> tuple[Output, dict[str, Tensor]]:
+        """The output, and weighted parts of the loss named ``<domain>/<part>``."""
+        output = self.output(name, batch, generator_of)
+        parts = self.loss(output, batch, generator_of(f"{name} loss"))
+        return output, {f"{name}/{part}": values.sum() for part, values in parts.items()}
+
+    def phases(
+        self, source: Callable[[], dict[str, Tensor]], target: Callable[[], dict[str, Tensor]]
+    ) -> Iterator[Phase]:
+        """A step in which the two domains cost what `source` and then `target` compute.
+
+        With one optimiser both are one backward pass; with two, see `Gradients`.
+        """
+        if len(self.optimizers) == 1 or self.gradients == "together":
+            yield Phase(tuple(self.optimizers), source() | target())
+            return
+        yield Phase(("source",), source())
+        yield Phase(("target",), target(), clear=self.gradients == "apart")
+
+
+def scores(output: Output) -> Tensor:
+    """(B, K, H, W) class scores of an output.
+
+    Raises:
+        InputError: the network returns masks of queries in training.
+    """
+    if output.logits is None:
+        raise InputError(
+            "domain adaptation compares class scores, but the network returns masks of queries in "
+            "training; choose one that returns scores, such as model=deeplab_demo."
+        )
+    return output.logits
+
+
+def check_whole(masker: Masker, scheme: str) -> None:
+    """Refuse a masker that hides something, which these schemes do not apply."""
+    if not masker.hides_nothing:
+        raise InputError(
+            f"the scheme {scheme} shows whole images, but the masker hides cells; choose "
+            "masker=none."
+        )
+
+
+def target_of(domains: Domains, scheme: str) -> Domain:
+    """The target domain.
+
+    Raises:
+        InputError: there is none.
+    """
+    if domains.target is None:
+        raise InputError(
+            f"the scheme {scheme} trains on two domains, but there is one; choose "
+            "domains=day_to_night, rgb_to_thermal or heatnet, or scheme=supervised."
+        )
+    return domains.target
+
+
+def check_labels(domain: Domain, name: str, wanted: bool, advice: str) -> None:
+    """Refuse a domain without labels where they are read, and with labels where they are not."""
+    has = domain.labels != "none"
+    if has != wanted:
+        raise InputError(
+            f"domains.{name}.labels={domain.labels}, but the scheme "
+            f"{'reads' if wanted else 'does not read'} labels of the {name} domain; {advice}"
+        )

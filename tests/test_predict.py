@@ -1,0 +1,132 @@
+"""Predicting as a user does: class maps, pseudo-labels, networks of other classes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbt import predict
+from rgbt.command import plain_command
+from rgbt.config import build, compose
+from rgbt.data.pseudo_labels import PseudoLabels
+from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
+
+PREDICT = plain_command(predict.OWN, predict.main)
+ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
+
+
+def image(path: Path) -> np.ndarray:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.slow
+def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) -> None:
+    folder, out = trained(*ONE), tmp_path / "pseudo"
+    asked = (f"run={folder}", "input=train", f"out={out}", "pseudo_labels=true")
+    code, said, err = call(PREDICT, *asked)
+    assert code == 0, err
+    table = said[said.index("8 images of mfnet train, every pixel") :]
+    assert "unlabeled" in said
+    assert str(out) in said
+    manifest = PseudoLabels(out).manifest
+    assert manifest["teacher"] == folder.name
+    assert (manifest["view"], manifest["kept"], manifest["images"]) == ("rgbt", 1, 8)
+
+    plain = tmp_path / "plain"
+    assert call(PREDICT, f"run={folder}", "input=train", f"out={plain}")[0] == 0
+    for name in SPLITS["train"]:
+        label = image(out / "labels" / f"{name}.png")
+        assert np.array_equal(label, image(plain / f"{name}.png"))
+        confidence = image(out / "confidence" / f"{name}.png")
+        assert confidence.dtype == np.uint16
+        # The largest of nine probabilities is at least a ninth.
+        assert confidence.min() >= 65535 // 9
+
+    before = (out / "pseudo_labels.json").read_bytes()
+    code, again, _ = call(PREDICT, *asked)
+    assert (code, again) == (0, table)
+    assert (out / "pseudo_labels.json").read_bytes() == before
+    code, _, err = call(PREDICT, *asked, "threshold=0.9")
+    assert code == 2
+    assert_one_sentence(err, "was begun with pseudo-labels of another threshold (0.0, now 0.9)")
+
+
+@pytest.mark.slow
+def test_only_sure_pixels_are_labelled(call: Call, trained: Trained, tmp_path: Path) -> None:
+    asked = ("input=val", f"out={tmp_path / 'out'}", "pseudo_labels=true", "threshold=0.2")
+    code, said, err = call(PREDICT, f"run={trained(*ONE)}", *asked)
+    assert code == 0, err
+    assert "confidence of at least 0.2" in said
+    for name in SPLITS["val"]:
+        label = image(tmp_path / "out" / "labels" / f"{name}.png")
+        confidence = image(tmp_path / "out" / "confidence" / f"{name}.png")
+        sure = confidence / 65535
+        clear = np.abs(sure - 0.2) > 1e-4
+        assert np.array_equal((label == 255)[clear], (sure < 0.2)[clear])
+
+
+@pytest.mark.slow
+def test_a_network_of_other_classes_needs_a_label_map(
+    call: Call, data: Path, tmp_path: Path
+) -> None:
+    network = ("model=mfnet_tiny", "model.num_classes=14")
+    model = build(compose([*network, "dataset=mfnet", f"dataset.root={data}"]).model)
+    torch.save(model.state_dict(), tmp_path / "freiburg.pth")
+    named = (
+        *(*network, f"model.weights={tmp_path / 'freiburg.pth'}", f"dataset.root={data}"),
+        *(f"runs_dir={tmp_path}", "data.num_workers=0", "trainer.threads=1", "input=val"),
+        "trainer.accelerator=cpu",
+    )
+    out = tmp_path / "out"
+    code, _, err = call(PREDICT, *named, f"out={out}", "pseudo_labels=true")
+    assert code == 2
+    assert_one_sentence(err, "model.num_classes is 14 but mfnet has 9 classes")
+    assert "label_map=" in err
+
+    for other in ("vistas_to_freiburg", "cityscapes_to_freiburg"):
+        code, _, err = call(PREDICT, *named, f"out={out}", f"label_map={other}")
+        assert code == 2
+        assert_one_sentence(err, "classes, but model.num_classes is 14")
+
+    mapped = (*named, "label_map=freiburg_to_mfnet")
+    code, _, err = call(PREDICT, *mapped, f"out={out}", "pseudo_labels=true")
+    assert code == 0, err
+    manifest = json.loads((out / "pseudo_labels.json").read_text())
+    assert manifest["teacher"] == "freiburg.pth"
+    assert manifest["label_map"]["num_source"] == 14
+    code, _, err = call(PREDICT, *mapped, f"out={tmp_path / 'plain'}")
+    assert code == 0, err
+    for name in SPLITS["val"]:
+        label = image(out / "labels" / f"{name}.png")
+        assert set(np.unique(label)) <= {0, 1, 2, 3, 4}
+        assert np.array_equal(label, image(tmp_path / "plain" / f"{name}.png"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (("threshold=0.5",), "threshold=0.5 is for pseudo_labels=true"),
+        (("pseudo_labels=yes",), "pseudo_labels: 'yes' is not a choice"),
+        (("pseudo_labels=true", "threshold=half"), "threshold=half: expected a number from 0 to 1"),
+        (("pseudo_labels=true", "threshold=2"), "threshold must lie in [0, 1], got 2"),
+        (("pseudo_labels=true", "input=pictures"), "written of a split of mfnet; name one of"),
+        (("pseudo_labels=true", "label_map=x"), "there is no label_map 'x'"),
+        (("pseudo_labels=true", "modality=infrared"), "modality: 'infrared' is not a choice"),
+        (("pseudo_labels=true", "head=target"), "head=target chooses between the heads"),
+        (("pseudo_labels=true", "head=night"), "head: 'night' is not a choice"),
+        (("head=target",), "head=target chooses between the heads"),
+        (("checkpoint=first",), "checkpoint: 'first' is not a choice"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    call: Call, trained: Trained, tmp_path: Path, asked: tuple[str, ...], sentence: str
+) -> None:
+    place = (f"run={trained(*ONE)}", "input=val", f"out={tmp_path / 'out'}")
+    code, _, err = call(PREDICT, *place, *asked)
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
