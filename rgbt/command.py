@@ -99,12 +99,13 @@ def readable_paths(words: list[str]) -> list[str]:
     """Arguments as Hydra reads them: shells keep ~ after "=", and file names hold anything.
 
     A path with "=", spaces or brackets (epoch=299.ckpt) is put in quotes; a comma still makes a
-    grid.
+    grid. Names of earlier runs (experiment:NAME/last.pt) are read as they are.
     """
     found = []
     for word in words:
         key, equals, value = re.sub(r"=~(?=/|$)", f"={Path.home()}", word).partition("=")
-        if key in PATHS and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
+        is_path = key in PATHS and not value.startswith("experiment:")
+        if is_path and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
             value = "'" + value.replace("'", "\\'") + "'"
         found.append(f"{key}{equals}{value}")
     return found

@@ -212,7 +212,7 @@ def _content(key: str, config: DictConfig) -> str:
     reference = earlier_run(key, value)
     if reference is not None:
         experiment, checkpoint = reference
-        return f"{run_key(earlier_config(config, experiment))}/{checkpoint}"
+        return f"{run_key(earlier_config(config, key, experiment))}/{checkpoint}"
     if key == "model.weights":
         source = weights_file(config)
         assert source is not None, "model.weights has a value"
@@ -236,7 +236,13 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
             f"pseudo-labels that is finished, but there is no {path}; write it with "
             "python -m rgbt.predict ... pseudo_labels=true."
         )
-    return dict(json.loads(path.read_text()))
+    try:
+        found = dict(json.loads(path.read_text()))
+    except ValueError as error:
+        raise InputError(f"{path} is damaged ({error}); remove it and predict again.") from error
+    if "digest" not in found:
+        raise InputError(f"{path} does not describe pseudo-labels; predict into another folder.")
+    return found
 
 
 def earlier_run(key: str, value: str | None) -> tuple[str, str] | None:
@@ -258,11 +264,17 @@ def earlier_run(key: str, value: str | None) -> tuple[str, str] | None:
     return name, checkpoint
 
 
-def earlier_config(config: DictConfig, experiment: str) -> DictConfig:
+def earlier_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
     """The configuration of an earlier run: its experiment, with what both runs share.
 
     Shared (`SHARED`) are seed, scale, data set and how it is loaded, durations that were typed,
-    device, regions, tracking, and where runs lie; everything else is the experiment's own.
+    device, regions, tracking, and where runs lie; of a run to start from also the network.
+    Everything else is the experiment's own.
+
+    Args:
+        config: of the run that needs it.
+        key: that names it, such as "model.weights".
+        experiment: its name.
 
     Raises:
         InputError: the experiment needs itself.
@@ -271,13 +283,15 @@ def earlier_config(config: DictConfig, experiment: str) -> DictConfig:
         raise InputError(f"experiment {experiment} names itself as an earlier run.")
     earlier = compose([f"+experiment={experiment}", f"scale={config.scale.name}"])
     # Whether a network has pretrained weights is said by its experiment, all else by the scale.
-    sizes = (f"scale.{key}" for key in config.scale if key != "pretrained")
-    for key in (*SHARED, *sizes):
-        *parents, last = key.split(".")
+    shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
+    if key == "model.weights":
+        shared += [f"model.{each}" for each in config.model if each not in OF_THE_RUN["model"]]
+    for each in shared:
+        *parents, last = each.split(".")
         mine: Any = OmegaConf.select(config, ".".join(parents)) if parents else config
         node = mine._get_node(last)
         value = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
-        OmegaConf.update(earlier, key, value, merge=False)
+        OmegaConf.update(earlier, each, value, merge=False, force_add=True)
     check(earlier)
     return earlier
 
@@ -294,7 +308,11 @@ def weights_file(config: DictConfig) -> Path | None:
     reference = earlier_run("model.weights", named)
     if reference is not None:
         experiment, checkpoint = reference
-        named = Path(config.runs_dir) / run_key(earlier_config(config, experiment)) / checkpoint
+        named = (
+            Path(config.runs_dir)
+            / run_key(earlier_config(config, "model.weights", experiment))
+            / checkpoint
+        )
     path = Path(named).expanduser()
     path = path / "best.pt" if path.is_dir() else path
     if not path.is_file():

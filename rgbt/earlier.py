@@ -29,6 +29,9 @@ LOOK_S = 1.0
 Train = Callable[[DictConfig, Sequence[str]], None]
 """Brings a run to its end (see `rgbt.training.train`)."""
 
+Rehearse = Callable[[DictConfig], None]
+"""Refuses what would go wrong after the earlier runs (see `rgbt.prepared.rehearse`)."""
+
 
 @dataclass(frozen=True)
 class Earlier:
@@ -62,17 +65,24 @@ def earlier_runs(config: DictConfig) -> Iterator[Earlier]:
     for key in ("model.weights", *(f"domains.{name}.labels" for name in DOMAINS)):
         reference = earlier_run(key, OmegaConf.select(config, key))
         if reference is not None:
-            yield Earlier(key, *reference, earlier_config(config, reference[0]))
+            yield Earlier(key, *reference, earlier_config(config, key, reference[0]))
 
 
-def finish_earlier(config: DictConfig, train: Train) -> None:
+def finish_earlier(config: DictConfig, train: Train, rehearse: Rehearse) -> None:
     """Train what `config` needs and is not finished, and what that needs, and predict its labels.
 
     A run that another process trains is waited for.
+
+    Args:
+        config: composed and checked.
+        train: see `Train`.
+        rehearse: see `Rehearse`; called before anything is trained.
     """
+    if not all(earlier.is_finished for earlier in earlier_runs(config)):
+        rehearse(config)
     for earlier in earlier_runs(config):
-        finish_earlier(earlier.config, train)
         if not earlier.is_finished:
+            finish_earlier(earlier.config, train, rehearse)
             tell(
                 f"{config.name} needs a run of {earlier.experiment} ({earlier.key}), which comes "
                 f"first: {earlier.folder}"
@@ -107,8 +117,8 @@ def _finish(earlier: Earlier, train: Train) -> None:
             with _without_tags():
                 train(earlier.config, [f"+experiment={earlier.experiment}"])
         except InputError:
-            # Another process may have begun it between the look and the start.
-            if not is_held(earlier.folder / "lock"):
+            # Another process may have begun it between the look and the start, and even ended it.
+            if not (earlier.is_finished or is_held(earlier.folder / "lock")):
                 raise
 
 

@@ -16,7 +16,7 @@ from rgbt.data.domains import NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
-from rgbt.earlier import labels_folder
+from rgbt.earlier import earlier_runs, labels_folder
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
@@ -72,25 +72,45 @@ class Prepared:
 
     def batches(self, steps: range) -> Batches | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
+        session, seed = self.session, self.session.config.seed
+        # Each domain is shuffled and augmented by draws of its own.
+        seeds = {"source": seed, "target": derive(seed, "target domain")}
         found = [
             train_batches(
-                self.datasets[name],
-                split,
-                self.session.transform,
-                self.session.loading,
-                # Each domain is shuffled and augmented by draws of its own.
-                self.session.config.seed
-                if name == "source"
-                else derive(self.session.config.seed, "domain", name),
-                steps,
+                *(self.datasets[name], split, session.transform, session.loading),
+                *(seeds[name], steps),
             )
             for name, split in self.splits().items()
         ]
-        return found[0] if len(found) == 1 else PairedBatches(*found, first=steps.start)
+        if len(found) == 1:
+            return found[0]
+        return PairedBatches(*found, first=steps.start, per_step=session.trainer.accumulate)
 
 
-def prepare(config: DictConfig) -> Prepared:
-    """Build everything and look at all lists that the run will read, so that errors come first."""
+def rehearse(config: DictConfig) -> None:
+    """Find what is wrong with a run before the earlier ones are trained that it stands on.
+
+    Raises:
+        InputError: as `prepare`, but for the weights and labels that are not there yet.
+    """
+    copy = config.copy()
+    for earlier in earlier_runs(config):
+        if earlier.key == "model.weights":
+            copy.model.weights, copy.model.fresh = None, []
+            copy.scale.pretrained = False
+    prepare(copy, rehearsal=True)
+
+
+def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
+    """Build everything and look at all lists that the run will read, so that errors come first.
+
+    Args:
+        config: composed and checked.
+        rehearsal: pseudo-labels of earlier runs are not there yet and are not looked at.
+
+    Raises:
+        InputError: settings that do not fit each other, the machine or the data.
+    """
     session = open_session(config)
     domains = session.domains
     for split in (
@@ -98,7 +118,13 @@ def prepare(config: DictConfig) -> Prepared:
         *(session.trainer.selection_split, "test"),
     ):
         session.dataset.names(split)
-    datasets = {name: _labelled(session, name, domain) for name, domain in domains.named.items()}
+    awaited = [earlier.key for earlier in earlier_runs(config)] if rehearsal else []
+    datasets = {
+        name: session.dataset
+        if f"domains.{name}.labels" in awaited
+        else _labelled(session, name, domain)
+        for name, domain in domains.named.items()
+    }
     for name, domain in domains.named.items():
         steps_per_epoch(datasets[name], session.loading, domain.split)
     masker: Masker = build(config.masker)
@@ -113,7 +139,7 @@ def prepare(config: DictConfig) -> Prepared:
             "file with pretrained=..., or expect less than published."
         )
     loss = build(config.loss)
-    _check_loss(loss, session.model)
+    _check_loss(loss, session)
     model = session.fabric.setup_module(session.model)
     scheme = _scheme(session, model=model, loss=loss, masker=masker)
     _check_domains(scheme, session)
@@ -144,28 +170,36 @@ def _set_up(
     session: Session, scheme: Any
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
-    builder = build(session.config.optimizer)
-    fabric = session.fabric
+    builder, fabric = build(session.config.optimizer), session.fabric
     parts: dict[str, tuple[str, ...]] = getattr(scheme, "optimizers", {"main": ()})
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     others: dict[str, nn.Module] = getattr(scheme, "others", {})
     for name, module in others.items():
         built[name] = scheme.builders[name](module)
         others[name] = fabric.setup_module(module)
-    return others, {name: fabric.setup_optimizers(each) for name, each in built.items()}
+    optimizers: dict[str, Any] = {
+        name: fabric.setup_optimizers(each) for name, each in built.items()
+    }
+    return others, optimizers
 
 
-def _check_loss(loss: object, model: nn.Module) -> None:
-    """Refuse a loss that reads what the network does not return, where both say it."""
+def _check_loss(loss: object, session: Session) -> None:
+    """Refuse a loss that reads what it does not get, and what no loss reads."""
+    model = session.model
     reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
-    if None in (reads, predicts) or reads == predicts:
-        return
-    key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
-    advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
-    raise InputError(
-        f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts {predicts}; "
-        f"choose {advice[str(predicts)]}, or another network."
-    )
+    if None not in (reads, predicts) and reads != predicts:
+        key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
+        advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
+        raise InputError(
+            f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts "
+            f"{predicts}; choose {advice[str(predicts)]}, or another network."
+        )
+    for name, domain in session.domains.named.items():
+        if domain.confidence and not getattr(loss, "reads_confidence", False):
+            raise InputError(
+                f"domains.{name}.confidence=true, but {type(loss).__name__} does not weigh pixels "
+                "by it; choose loss=cross_entropy, or set it to false."
+            )
 
 
 def _check_views(scheme: object, loss: object, session: Session) -> None:

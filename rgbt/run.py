@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 def main(config: DictConfig) -> int:
     """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
     from rgbt.earlier import finish_earlier  # torch and mlflow load here, after --help
-    from rgbt.training import train
+    from rgbt.prepared import rehearse
+    from rgbt.training import is_finished, train
 
-    finish_earlier(config, train)
+    if not is_finished(config):
+        finish_earlier(config, train, rehearse)
     train(config, task_overrides())
     return 0
 

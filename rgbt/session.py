@@ -15,10 +15,10 @@ from torch import nn
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build
+from rgbt.data.dataset import LabelledDataset
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
-from rgbt.data.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
 from rgbt.engine.evaluate import HeadsOf, predictions
 from rgbt.engine.progress import progress

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, run_key
@@ -29,6 +30,7 @@ from rgbt.session import (
     legend_of,
     panel_names,
     result_tables,
+    view_of,
 )
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
@@ -43,6 +45,11 @@ from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
+
+
+def is_finished(config: DictConfig) -> bool:
+    """Whether the run of a configuration has its result."""
+    return (Path(config.runs_dir) / run_key(config) / "result.json").exists()
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -198,6 +205,7 @@ class Run:
         def validate(step: int) -> float:
             found = evaluate(session, self.prepared.model, split)
             values = scores.summary(found.counts, session.regions.absent)
+            values |= _of_target(session, self.prepared.model, split)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
             if values[names.MIOU] > state.best_score or session.trainer.tested == "last":
@@ -250,11 +258,14 @@ class Run:
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
-        values |= {} if pairs is None else consistency_values(pairs)
+        of_target = _of_target(session, session.model, "test")
+        values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
         tables = result_tables(found.counts, session.regions, label, state.best_step)
-        tables = replace(tables, consistency=pairs)
+        subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
+        classes = replace(tables.classes, subset_mious=subsets)
+        tables = replace(tables, classes=classes, consistency=pairs)
         self.folder.write_tables(tables.to_json())
         if found.kept:
             self._draw(session, tables, found.kept)
@@ -269,6 +280,22 @@ class Run:
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
+
+
+def _of_target(session: Session, model: nn.Module, split: str) -> dict[str, float]:
+    """Where the target is seen in another view than the source: its mIoU, named after that."""
+    target = session.domains.target
+    if target is None or target.view in (None, view_of(session)):
+        return {}
+    counts = evaluate(session, model, split, view=target.view).counts
+    values = scores.summary(counts, session.regions.absent)
+    kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
+    return {names.subset(target.view, name): values[name] for name in kept if name in values}
+
+
+def _parts_of(of_target: Mapping[str, float]) -> dict[str, float]:
+    """The same as rows of the table: "thermal", "thermal, day", "thermal, night"."""
+    return {", ".join(name.split("/")[:-1]): value for name, value in of_target.items()}
 
 
 def _noting_skipped(batches: Batches | PairedBatches, state: State) -> Iterator[StepData]:

@@ -105,12 +105,12 @@ class TwoDomains:
     Attributes:
         source: with labels.
         target: with or without labels (all pixels 255), as the configuration says.
-        number: of the pair of batches, counted from the start of the run.
+        step: optimiser step that it is for, counted from the start of the run.
     """
 
     source: Batch
     target: Batch
-    number: int
+    step: int
 
     @property
     def name(self) -> tuple[str, ...]:

@@ -100,6 +100,12 @@ class Domains:
                 f"domains.target_is={self.target_is or 'null'} with {len(heads)} heads: it says "
                 "which of two heads predicts an image; give it with two, and null otherwise."
             )
+        if self.target_is == "view" and self.named["target"].view in (None, self.source.view):
+            raise InputError(
+                "domains.target_is=view tells the heads' images apart by what the network sees of "
+                f"them, but both domains are seen as {self.source.view or 'null'}; give "
+                "domains.target.view another value, or set domains.target_is=night."
+            )
         if self.tested_head == "source" and len(heads) < 2:
             raise InputError(
                 "domains.tested_head=source chooses between two heads, but there are "

@@ -19,12 +19,14 @@ class PairedBatches(Iterator[TwoDomains]):
         source: of the labelled domain.
         target: of the other one.
         first: number of the first pair, counted from the start of the run.
+        per_step: pairs of one optimiser step, whose number they have.
     """
 
-    def __init__(self, source: Batches, target: Batches, *, first: int) -> None:
+    def __init__(self, source: Batches, target: Batches, *, first: int, per_step: int) -> None:
         self._source = source
         self._target = target
         self._numbers = count(first)
+        self._per_step = per_step
 
     def __next__(self) -> TwoDomains:
         """The next pair; errors as of `Batches`."""
@@ -33,7 +35,7 @@ class PairedBatches(Iterator[TwoDomains]):
         except BaseException:
             self.close()
             raise
-        return TwoDomains(source, target, next(self._numbers))
+        return TwoDomains(source, target, next(self._numbers) // self._per_step)
 
     @property
     def skipped(self) -> dict[str, str]:

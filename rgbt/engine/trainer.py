@@ -108,13 +108,16 @@ class Trainer:
         with progress() as display:
             task = display.add_task("training", total=total, completed=state.step, note="")
             self.model.train()
+            values: dict[str, float] = {}
             for step in range(state.step, total):
-                values = self._step(step, batches, state.seed)
+                # Steps may alternate between phases: a line has the last values of each.
+                values |= self._step(step, batches, state.seed)
                 state.step = step + 1
                 note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
                 display.update(task, completed=state.step, note=note)
                 if state.step % self.settings.log_every == 0 or state.step == total:
                     self.record(state.step, values)
+                    values = {}
                 self._save_when_due(state)
 
     def _save_when_due(self, state: State) -> None:

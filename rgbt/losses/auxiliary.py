@@ -30,6 +30,7 @@ class WithAuxiliary:
         check_range("loss.weight", weight, 0.0, 1e6)
         self.loss = loss
         self.weight = weight
+        self.reads_confidence = getattr(loss, "reads_confidence", False)
         self.reads = getattr(loss, "reads", None)
 
     def __call__(

@@ -26,6 +26,7 @@ class CrossEntropy:
     """
 
     reads: Predicts = "scores"
+    reads_confidence = True
 
     def __init__(self, *, class_weights: tuple[float, ...] | None) -> None:
         if class_weights is not None and min(class_weights, default=-1.0) < 0:

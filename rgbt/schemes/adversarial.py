@@ -139,7 +139,7 @@ class Adversarial:
             generator_of: purpose -> generator of this step.
         """
         seen: dict[str, Tensor] = {}
-        if self.alternates and batch.number % 2 == 0:
+        if self.alternates and batch.step % 2 == 0:
             with torch.no_grad():
                 for name, each in (("source", batch.source), ("target", batch.target)):
                     output = self.passes.output(name, each, generator_of)

@@ -77,6 +77,12 @@ class Passes:
     def __init__(
         self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
     ) -> None:
+        if getattr(model, "predicts", "scores") == "masks":
+            raise InputError(
+                f"domain adaptation compares class scores, but {type(model).__name__} returns "
+                "masks of queries in training; choose one that returns scores, such as "
+                "model=deeplab_demo."
+            )
         self.model = model
         self.loss = loss
         self.source = domains.source
@@ -128,16 +134,8 @@ class Passes:
 
 
 def scores(output: Output) -> Tensor:
-    """(B, K, H, W) class scores of an output.
-
-    Raises:
-        InputError: the network returns masks of queries in training.
-    """
-    if output.logits is None:
-        raise InputError(
-            "domain adaptation compares class scores, but the network returns masks of queries in "
-            "training; choose one that returns scores, such as model=deeplab_demo."
-        )
+    """(B, K, H, W) class scores of an output."""
+    assert output.logits is not None, "networks without scores have been refused"
     return output.logits
 
 

@@ -19,8 +19,12 @@ WRAPPERS = ("state_dict", "model", "module")
 PREFIXES = ("module.", "_orig_mod.")
 """What DataParallel and torch.compile put before every name."""
 
-OURS = ({"model", "optimizers", "state"}, {"model", "step"})
-"""Keys of the last and of the best checkpoint of a run."""
+OURS = (
+    *({"model", "others", "optimizers", "state"}, {"model", "optimizers", "state"}),
+    {"model", "step"},
+)
+"""Keys of the last checkpoint of a run, now and before there were other networks beside the model,
+and of the best one."""
 
 NOTE = "rgbt"
 """Key of what an export says about itself."""

@@ -1,0 +1,113 @@
+"""Memory and time of one training step of the networks of domain adaptation, side by side.
+
+One image of each domain at 320x640, the thesis' input: both passes, both losses, the critic, all
+optimisers, as at scale=paper. HeatNet's phases take turns, so that two of its steps do what one of
+the others does: it is shown per pair. Every network has a process of its own, for its memory.
+
+Run: python -m tests.benchmarks.bench_adaptation [cpu|cuda] [threads] [batch size]
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+CASES = {
+    "one head": ("sh_adversarial", ()),
+    "two heads": ("multi_head_thermal", ()),
+    "two heads, decoder of the text": ("multi_head_thermal", ("model=multi_head_literal_paper",)),
+    "two heads, decoder of the code": ("multi_head_modified_thermal", ()),
+    "two streams (HeatNet)": ("heatnet_no_teacher", ()),
+    "RGB alone (HeatNet's student)": ("heatnet_no_teacher", ("model=heatnet_rgb_only_paper",)),
+}
+ROUNDS = {"cpu": 3, "cuda": 20}
+
+
+def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, float]:
+    """Seconds per step and peak memory in MiB of one case, in this process."""
+    import torch
+
+    from rgbt.config import check, compose
+    from rgbt.engine.trainer import Trainer
+    from rgbt.prepared import prepare
+
+    experiment, changes = CASES[case]
+    config = compose(
+        [
+            *(f"+experiment={experiment}", "scale=paper", "dataset=synth_freiburg", *changes),
+            *("model.weights=null", "tracking=none", f"data.batch_size={batch_size}"),
+            *("data.num_workers=0", f"trainer.accelerator={device}", f"trainer.threads={threads}"),
+        ]
+    )
+    check(config)
+    made = prepare(config)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(
+            fabric=made.session.fabric,
+            settings=made.session.trainer,
+            scheme=made.scheme,
+            model=made.model,
+            others=made.others,
+            optimizers=made.optimizers,
+            schedule=made.schedule,
+            steps_per_epoch=1,
+            folder=Path(folder),
+            record=lambda *_: None,
+            validate=lambda _: 0.0,
+        )
+        per_round = 2 if getattr(made.scheme, "alternates", False) else 1
+        rounds = ROUNDS[device]
+        batches = made.batches(range(per_round * (rounds + 1)))
+        seconds = []
+        for number in range(rounds + 1):
+            started = time.perf_counter()
+            for step in range(per_round):
+                trainer._step(number * per_round + step, batches, 0)
+            seconds.append(time.perf_counter() - started)
+    peak = (
+        torch.cuda.max_memory_allocated() / 2**20
+        if device == "cuda"
+        else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    )
+    parameters = sum(each.numel() for each in made.session.model.parameters()) / 1e6
+    return {"s": statistics.median(seconds[1:]), "mib": peak, "parameters": parameters}
+
+
+def main(device: str = "cpu", threads: str = "2", batch_size: str = "1") -> None:
+    """Measure every case and print a table."""
+    sys.stdout.write(
+        f"{device}, {threads} threads, {batch_size} image(s) of each domain, 320x640\n"
+    )
+    first = None
+    for case in CASES:
+        words = [sys.executable, "-m", "tests.benchmarks.bench_adaptation"]
+        done = subprocess.run(
+            [*words, "--case", case, device, threads, batch_size],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            sys.stdout.write(f"{case}: failed: {done.stderr.strip().splitlines()[-1]}\n")
+            continue
+        found = json.loads(done.stdout.strip().splitlines()[-1])
+        first = first or found["s"]
+        sys.stdout.write(
+            f"{case:32} {found['parameters']:7.1f} M  {found['s']:7.2f} s  "
+            f"{found['s'] / first:5.2f}x  {found['mib']:7.0f} MiB\n"
+        )
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--case"]:
+        result = measure(sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        main(*sys.argv[1:])

@@ -1,0 +1,128 @@
+"""Domains: what cannot be told apart is refused, and which head predicts which image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.data.domains import Domain, Domains
+from rgbt.types import View
+
+
+def domain(**changes: Any) -> Domain:
+    given: dict[str, Any] = {"split": "train", "view": None, "head": None, "labels": "given"}
+    return Domain(**{**given, **changes})
+
+
+def domains(**changes: Any) -> Domains:
+    given: dict[str, Any] = {"source": domain(), "target": None, "target_is": None}
+    return Domains(**{**given, "tested_head": "own", **changes})
+
+
+def two(target_is: str, **changes: Any) -> Domains:
+    return domains(
+        source=domain(view="rgb", head="day"),
+        target=domain(view="thermal" if target_is == "view" else "rgb", head="dark"),
+        **{"target_is": target_is, **changes},
+    )
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.0, 2.0])
+def test_a_threshold_out_of_range_is_refused(threshold: float) -> None:
+    with pytest.raises(InputError, match=r"threshold must lie in \[0, 1\), got"):
+        domain(labels="experiment:x/best.pt", threshold=threshold)
+
+
+@pytest.mark.parametrize("labels", ["given", "none", "/some/folder"])
+@pytest.mark.parametrize("setting", [{"threshold": 0.5}, {"teacher_view": "thermal"}])
+def test_settings_of_a_teacher_without_one_are_refused(labels: str, setting: dict) -> None:
+    with pytest.raises(InputError, match=f"with labels={labels} they have no effect"):
+        domain(labels=labels, **setting)
+    assert domain(labels="experiment:x/best.pt", **setting).labels.startswith("experiment:")
+
+
+@pytest.mark.parametrize("labels", ["given", "none"])
+def test_confidence_needs_pseudo_labels(labels: str) -> None:
+    with pytest.raises(InputError, match=f"confidence=true needs pseudo-labels, but .*={labels}"):
+        domain(labels=labels, confidence=True)
+    for fine in ("/some/folder", "experiment:x/best.pt"):
+        assert domain(labels=fine, confidence=True).confidence
+
+
+@pytest.mark.parametrize(("source", "target"), [("day", None), (None, "dark")])
+def test_one_domain_alone_with_a_head_is_refused(source: str | None, target: str | None) -> None:
+    with pytest.raises(InputError, match=f"got {source or 'null'} and {target or 'null'}"):
+        domains(source=domain(head=source), target=domain(head=target))
+
+
+def test_target_is_goes_with_two_heads_and_only_with_them() -> None:
+    with pytest.raises(InputError, match="domains.target_is=null with 2 heads"):
+        domains(source=domain(head="a"), target=domain(head="b"))
+    for named in ("view", "night"):
+        with pytest.raises(InputError, match=f"domains.target_is={named} with 0 heads"):
+            domains(target=domain(), target_is=named)
+        with pytest.raises(InputError, match=f"domains.target_is={named} with 1 heads"):
+            domains(source=domain(head="a"), target=domain(head="a"), target_is=named)
+
+
+@pytest.mark.parametrize("head", [None, "a"])
+def test_a_choice_of_heads_needs_two(head: str | None) -> None:
+    with pytest.raises(InputError, match="tested_head=source chooses between two heads"):
+        domains(source=domain(head=head), target=domain(head=head), tested_head="source")
+
+
+@pytest.mark.parametrize("view", [None, "rgb"])
+def test_two_domains_of_one_view_are_not_told_apart_by_it(view: View | None) -> None:
+    with pytest.raises(InputError, match="target_is=view"):
+        domains(
+            source=domain(view="rgb", head="a"),
+            target=domain(view=view, head="b"),
+            target_is="view",
+        )
+
+
+def test_names_and_heads() -> None:
+    alone, both = domains(source=domain(head="a")), two("night")
+    assert (list(alone.named), alone.heads) == (["source"], ("a",))
+    assert (list(both.named), both.heads) == (["source", "target"], ("day", "dark"))
+    same = domains(source=domain(head="a"), target=domain(head="a"))
+    assert same.heads == ("a",)
+    assert domains(target=domain()).heads == ()
+
+
+@pytest.mark.parametrize("night", [True, False, None])
+@pytest.mark.parametrize("view", ["rgbt", "rgb", "thermal"])
+def test_the_only_head_predicts_everything(view: View, night: bool | None) -> None:
+    assert domains(target=domain()).head_of(view, night, "own") is None
+    assert domains(source=domain(head="a")).head_of(view, night, "own") == "a"
+    for asked in ("source", "target"):
+        with pytest.raises(InputError, match=f"head={asked} chooses between the heads"):
+            domains(target=domain()).head_of(view, night, asked)
+
+
+def test_the_head_of_a_view() -> None:
+    found = two("view")
+    for night in (True, False, None):
+        assert found.head_of("thermal", night, "own") == "dark"
+        assert found.head_of("rgb", night, "own") == "day"
+        assert found.head_of("rgbt", night, "own") == "day"
+
+
+def test_the_head_of_a_night() -> None:
+    found = two("night")
+    for view in ("rgb", "thermal", "rgbt"):
+        assert found.head_of(view, True, "own") == "dark"
+        assert found.head_of(view, False, "own") == "day"
+        with pytest.raises(InputError, match="does not say which images were taken at night"):
+            found.head_of(view, None, "own")
+
+
+@pytest.mark.parametrize("target_is", ["view", "night"])
+@pytest.mark.parametrize("night", [True, False, None])
+def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> None:
+    found = two(target_is, tested_head="source")
+    for view in ("rgb", "thermal"):
+        assert found.head_of(view, night, "source") == "day"
+        assert found.head_of(view, night, "target") == "dark"

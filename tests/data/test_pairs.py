@@ -1,0 +1,135 @@
+"""Two streams of batches side by side: independent, resumable, numbered."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+from itertools import islice
+
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.data.loaders import LoaderSettings, train_batches
+from rgbt.data.mfnet import MFNet
+from rgbt.data.pairs import PairedBatches
+from rgbt.transforms.thesis import ThesisTransform
+from rgbt.types import Batch, TwoDomains
+
+DAY = [f"{number:05d}D" for number in range(1, 8)]
+NIGHT = [f"{number:05d}N" for number in range(1, 5)]
+TRANSFORM = ThesisTransform(
+    crop_hw=(24, 32),
+    flip_probability=0.5,
+    blur_probability=0.5,
+    blur_kernel=5,
+    label_resize="nearest",
+    test_short_edge=24,
+    track_position=False,
+)
+
+
+@pytest.fixture
+def dataset(write_mfnet) -> MFNet:
+    lists = {"train": DAY, "val": NIGHT, "test": DAY[:1]}
+    return MFNet(str(write_mfnet(lists)))
+
+
+def stream(dataset: MFNet, split: str, seed: int, steps: range, **changes: object):
+    base = LoaderSettings(batch_size=2, eval_batch_size=2, num_workers=0)
+    loading = dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+    return train_batches(dataset, split, TRANSFORM, loading, seed, steps)
+
+
+def pairs(dataset: MFNet, steps: range, **changes: object) -> PairedBatches:
+    return PairedBatches(
+        stream(dataset, "train", 3, steps, **changes),
+        stream(dataset, "val", 4, steps, **changes),
+        first=steps.start,
+    )
+
+
+def assert_equal(one: Batch, other: Batch) -> None:
+    for each in dataclasses.fields(Batch):
+        a, b = getattr(one, each.name), getattr(other, each.name)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
+
+
+def assert_equal_pairs(one: TwoDomains, other: TwoDomains) -> None:
+    assert_equal(one.source, other.source)
+    assert_equal(one.target, other.target)
+    assert one.number == other.number
+
+
+def test_each_stream_is_what_it_is_alone(dataset: MFNet) -> None:
+    both = list(pairs(dataset, range(9)))
+    for split, seed, side in (("train", 3, "source"), ("val", 4, "target")):
+        alone = list(stream(dataset, split, seed, range(9)))
+        assert len(alone) == len(both) == 9
+        for batch, pair in zip(alone, both, strict=True):
+            assert_equal(batch, getattr(pair, side))
+    assert both[0].name == both[0].source.name + both[0].target.name
+
+
+def test_lists_of_different_lengths_are_each_shuffled_anew(dataset: MFNet) -> None:
+    """Three whole batches of seven by day, two of four at night."""
+    both = list(pairs(dataset, range(12)))
+    for start in range(0, 12, 3):
+        names = [name for pair in both[start : start + 3] for name in pair.source.name]
+        assert len(set(names)) == 6
+    orders = []
+    for start in range(0, 12, 2):
+        names = [name for pair in both[start : start + 2] for name in pair.target.name]
+        assert sorted(names) == NIGHT
+        orders.append(tuple(names))
+    assert len(set(orders)) > 1
+
+
+def test_starting_later_continues(dataset: MFNet) -> None:
+    whole = list(pairs(dataset, range(20)))
+    late = list(pairs(dataset, range(10, 20)))
+    for one, other in zip(whole[10:], late, strict=True):
+        assert_equal_pairs(one, other)
+    assert [pair.number for pair in late] == list(range(10, 20))
+
+
+def test_the_same_pairs_whatever_the_workers(dataset: MFNet) -> None:
+    for one, other in zip(
+        pairs(dataset, range(5)), pairs(dataset, range(5), num_workers=2), strict=True
+    ):
+        assert_equal_pairs(one, other)
+
+
+def test_moved_both_are_moved(dataset: MFNet) -> None:
+    pair = next(pairs(dataset, range(7, 8)))
+    moved = pair.to("cpu")
+    assert moved.number == 7
+    for side in ("source", "target"):
+        assert_equal(getattr(moved, side), getattr(pair, side).to("cpu"))
+        assert getattr(moved, side).rgb.max() <= 1
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_unreadable_file_of_either_domain_stops_both(dataset: MFNet, workers: int) -> None:
+    dataset.image_paths(NIGHT[0])[0].write_bytes(b"damaged")
+    found = pairs(dataset, range(4), num_workers=workers)
+    with pytest.raises(InputError, match=f"{NIGHT[0]}.png cannot be decoded"):
+        list(found)
+    assert list(found) == []
+    assert multiprocessing.active_children() == []
+
+
+def test_skipped_files_of_both_are_named(dataset: MFNet) -> None:
+    for name in (DAY[0], NIGHT[0]):
+        dataset.image_paths(name)[0].write_bytes(b"damaged")
+    found = pairs(dataset, range(6), on_error="skip")
+    assert len(list(found)) == 6
+    assert set(found.skipped) == {DAY[0], NIGHT[0]}
+
+
+def test_nothing_comes_after_close(dataset: MFNet) -> None:
+    found = pairs(dataset, range(4), num_workers=2)
+    assert len(list(islice(found, 2))) == 2
+    found.close()
+    assert list(found) == []
+    assert multiprocessing.active_children() == []
