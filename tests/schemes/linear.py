@@ -1,0 +1,244 @@
+"""A network, a critic and a loss that are a few matrices, and SGD written out, to count with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.data.domains import Domain, Domains
+from rgbt.engine.checkpoint import State
+from rgbt.engine.optimizers import SGD
+from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.trainer import Trainer
+from rgbt.randomness import torch_generator
+from rgbt.types import Batch, Output, TwoDomains, View
+
+K = 3
+LR, MOMENTUM = 0.5, 0.9
+Values = dict[str, Tensor]
+
+
+class Linear(nn.Module):
+    """Scores of a pixel: head @ backbone @ its RGB (or thermal, three times); "mixed" adds both."""
+
+    num_classes = K
+    views = ("rgbt", "rgb", "thermal")
+    predicts = "scores"
+    pretrained_parts = ()
+
+    def __init__(self, heads: tuple[str, ...], *, auxiliary: bool = False) -> None:
+        super().__init__()
+        self.heads_named = heads
+        self.backbone = nn.Conv2d(3, K, 1, bias=False)
+        self.heads = nn.ModuleDict({name: nn.Conv2d(K, K, 1, bias=False) for name in heads})
+        self.only = None if heads else nn.Conv2d(K, K, 1, bias=False)
+        self.auxiliary = nn.Conv2d(K, K, 1, bias=False) if auxiliary else None
+        self.calls: list[tuple[Any, ...]] = []
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: None = None,
+        *,
+        views: tuple[View, ...] = (),
+        head: str | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        self.calls.append((views, head, self.training))
+        three = thermal.expand(-1, 3, -1, -1)
+        image = {"rgb": rgb, "thermal": three, "rgbt": rgb + three}[(*views, "rgbt")[0]]
+        features = self.backbone(image)
+        scores = (self.only if head is None else self.heads[head])(features)
+        aux = {} if self.auxiliary is None else {"aux_logits": self.auxiliary(features)}
+        return Output(scores, aux)
+
+
+def cross_entropy(output: Output, batch: Batch, generator: torch.Generator) -> Values:
+    """One part, of one pass."""
+    del generator
+    return {"ce": F.cross_entropy(output.logits, batch.label, ignore_index=255)[None]}
+
+
+class Nothing:
+    hides_nothing = True
+
+
+class Something:
+    hides_nothing = False
+
+
+def domains(heads: bool, **target: Any) -> Domains:
+    given: dict[str, Any] = {"split": "x", "view": "thermal", "labels": "given", **target}
+    return Domains(
+        source=Domain(split="x", view="rgb", head="day" if heads else None, labels="given"),
+        target=Domain(**given, head="dark" if heads else None),
+        target_is="view" if heads else None,
+        tested_head="own",
+    )
+
+
+def network(heads: bool, **others: Any) -> Linear:
+    torch.manual_seed(3)
+    return Linear(("day", "dark") if heads else (), **others)
+
+
+def images(purpose: str, number: int, confidence: bool = False) -> Batch:
+    draw = torch_generator(0, purpose, number)
+    return Batch(
+        rgb=torch.randint(0, 256, (2, 3, 4, 4), generator=draw, dtype=torch.uint8),
+        thermal=torch.randint(0, 256, (2, 1, 4, 4), generator=draw, dtype=torch.uint8),
+        label=torch.randint(0, K, (2, 4, 4), generator=draw),
+        name=("a", "b"),
+        centre_yx=torch.zeros(2, 2, dtype=torch.int64),
+        position=None,
+        original_hw=torch.full((2, 2), 4),
+        confidence=torch.rand(2, 4, 4, generator=draw) if confidence else None,
+    )
+
+
+def pairs(first: int = 0, confidence: bool = False) -> Iterator[TwoDomains]:
+    number = first
+    while True:
+        yield TwoDomains(
+            images("source", number), images("target", number, confidence=confidence), number
+        )
+        number += 1
+
+
+def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: Any) -> Trainer:
+    """The real loop with SGD for every optimiser that the scheme names."""
+    fabric = Fabric(accelerator="cpu", devices=1)
+    builder = SGD(lr=LR, backbone_multiplier=1.0, momentum=MOMENTUM, weight_decay=0.0)
+    built = {name: builder(model, without=parts) for name, parts in scheme.optimizers.items()}
+    others: dict[str, nn.Module] = getattr(scheme, "others", {})
+    built |= {name: scheme.builders[name](module) for name, module in others.items()}
+    settings: dict[str, Any] = {
+        **{"max_steps": steps, "eval_every": 1000, "checkpoint_every": 1000, "log_every": 1},
+        **{"accumulate": 1, "clip_norm": None, "precision": "32-true", "accelerator": "cpu"},
+        **{"threads": None, "selection_split": "val", **changes},
+    }
+    log: list[dict[str, float]] = []
+    made = Trainer(
+        fabric=fabric,
+        settings=TrainerSettings(**settings),
+        scheme=scheme,
+        model=model,
+        others=others,
+        optimizers=built,
+        schedule=lambda step, total, per_epoch: 1.0,
+        steps_per_epoch=1,
+        folder=folder,
+        record=lambda step, values: log.append(values),
+        validate=float,
+    )
+    made.log = log  # type: ignore[attr-defined]
+    return made
+
+
+def trained(
+    scheme: Any, model: nn.Module, folder: Path, steps: int, confidence: bool = False
+) -> list[dict[str, float]]:
+    """The model after these steps, in place; what was recorded of each."""
+    made = trainer(scheme, model, folder, steps)
+    made.fit(pairs(confidence=confidence), State(seed=0))
+    return list(made.log)  # type: ignore[attr-defined]
+
+
+# ---- the same, by matrices in float64 -------------------------------------------------------
+
+
+def values_of(module: nn.Module) -> Values:
+    """Parameters as matrices, float64."""
+    return {name: each.detach().double().flatten(1).clone() if each.dim() > 1
+            else each.detach().double().clone()
+            for name, each in module.named_parameters()}  # fmt: skip
+
+
+def pixels(batch: Batch, view: str) -> tuple[Tensor, Tensor]:
+    """(N, 3) float64 in [0, 1] and (N,) labels."""
+    image = batch.rgb if view == "rgb" else batch.thermal.expand(-1, 3, -1, -1)
+    return image.permute(0, 2, 3, 1).reshape(-1, 3).double() / 255, batch.label.reshape(-1)
+
+
+def scores(values: Values, x: Tensor, head: str) -> Tensor:
+    return x @ values["backbone.weight"].T @ values[head].T
+
+
+def nats(z: Tensor, y: Tensor) -> Tensor:
+    """Mean cross-entropy by its definition."""
+    return (z.exp().sum(1).log() - z[range(len(y)), y]).mean()
+
+
+@dataclass
+class Momentum:
+    """SGD with momentum of some parameters, with buffers of its own."""
+
+    names: tuple[str, ...]
+    rate: float = LR
+    momentum: float = MOMENTUM
+    buffers: Values = field(default_factory=dict)
+
+    def step(self, values: Values, gradient: Values) -> None:
+        for name in self.names:
+            before = self.buffers.get(name, torch.zeros_like(values[name]))
+            self.buffers[name] = self.momentum * before + gradient[name]
+            values[name] = values[name] - self.rate * self.buffers[name]
+
+
+def gradient(cost: Callable[[Values], Tensor], values: Values) -> Values:
+    """Of a cost by every value; 0 where it does not depend on it."""
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    found = torch.autograd.grad(cost(leaves), list(leaves.values()), allow_unused=True)
+    pairs = zip(values.items(), found, strict=True)
+    return {name: torch.zeros_like(v) if g is None else g for (name, v), g in pairs}
+
+
+def total(*gradients: Values) -> Values:
+    return {name: sum((each[name] for each in gradients), torch.zeros(())) for name in gradients[0]}
+
+
+Cost = Callable[[Values], Tensor]
+
+
+def written_out(
+    values: Values,
+    mode: str,
+    day: Momentum,
+    dark: Momentum | None,
+    source: Cost,
+    target: Cost,
+) -> tuple[Values, Values]:
+    """One step of the network, `values` in place; values at which either domain was predicted."""
+    start = dict(values)
+    if dark is None or mode == "together":
+        both = total(gradient(source, values), gradient(target, values))
+        for optimizer in (day, dark):
+            if optimizer is not None:
+                optimizer.step(values, both)
+        return start, start
+    first = gradient(source, values)
+    day.step(values, first)
+    between = dict(values)
+    second = gradient(target, values)
+    dark.step(values, second if mode == "apart" else total(first, second))
+    return start, between
+
+
+def assert_same(model: nn.Module, expected: Values) -> None:
+    found = values_of(model)
+    assert found.keys() == expected.keys()
+    for name in found:
+        torch.testing.assert_close(found[name], expected[name], atol=2e-6, rtol=2e-5)
+
+
+def generator_of(purpose: str) -> torch.Generator:
+    """One step's."""
+    return torch_generator(0, purpose)

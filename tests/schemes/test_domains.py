@@ -1,0 +1,335 @@
+"""Two domains, with labels or without: what a step does to every parameter, to the last digit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.engine.checkpoint import State
+from rgbt.losses.guidance import guidance
+from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.schemes.domains import scores as scores_of
+from rgbt.schemes.supervised import Supervised
+from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
+from rgbt.types import IGNORE, Output
+from tests.schemes.linear import (
+    K,
+    Linear,
+    Momentum,
+    Nothing,
+    Something,
+    Values,
+    assert_same,
+    cross_entropy,
+    domains,
+    generator_of,
+    images,
+    nats,
+    network,
+    pairs,
+    pixels,
+    scores,
+    trained,
+    trainer,
+    values_of,
+    written_out,
+)
+
+DAY, DARK, ONLY = "heads.day.weight", "heads.dark.weight", "only.weight"
+SHARED = "backbone.weight"
+
+
+def labelled(model: Linear, heads: bool, gradients: str, **target: Any) -> LabelledDomains:
+    return LabelledDomains(
+        model=model,
+        loss=cross_entropy,
+        masker=Nothing(),
+        domains=domains(heads, **target),
+        gradients=gradients,
+    )
+
+
+def unlabelled(model: Linear, heads: bool = False, **changes: Any) -> UnlabelledTarget:
+    given: dict[str, Any] = {
+        "loss": cross_entropy,
+        "masker": Nothing(),
+        "domains": domains(heads, labels="none"),
+        "unlabelled": MaxSquares(weight=0.7, normalisation="entries", image_wise_ratio=None),
+        "guidance_weight": 0.0,
+        "guidance_threshold": 0.5,
+        "guide": guidance,
+    }
+    return UnlabelledTarget(model=model, **{**given, **changes})
+
+
+def supervised_costs(pair: Any, heads: bool) -> tuple[Callable, Callable]:
+    def cost(batch: Any, view: str, head: str) -> Callable[[Values], Tensor]:
+        x, y = pixels(batch, view)
+        return lambda values: nats(scores(values, x, head), y)
+
+    names = (DAY, DARK) if heads else (ONLY, ONLY)
+    return cost(pair.source, "rgb", names[0]), cost(pair.target, "thermal", names[1])
+
+
+def expected(model: Linear, heads: bool, mode: str, steps: int) -> Values:
+    values = values_of(model)
+    day = Momentum((SHARED, DAY) if heads else (SHARED, ONLY))
+    dark = Momentum((SHARED, DARK)) if heads else None
+    for pair in islice(pairs(), steps):
+        written_out(values, mode, day, dark, *supervised_costs(pair, heads))
+    return values
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("mode", ["apart", "kept", "together"])
+def test_two_heads_step_as_the_thesis_code(tmp_path: Path, mode: str, steps: int) -> None:
+    """The second step tells whether each optimiser keeps momentum of its own for the backbone."""
+    model = network(True)
+    wanted = expected(model, True, mode, steps)
+    log = trained(labelled(model, True, mode), model, tmp_path, steps)
+    assert_same(model, wanted)
+    assert {"loss/source/ce", "loss/target/ce", "grad_norm/source", "grad_norm/target"} <= set(
+        log[0]
+    )
+    assert {"lr/source_0", "lr/target_0"} <= set(log[0])
+
+
+def test_the_modes_differ_by_more_than_the_tolerance() -> None:
+    found = [expected(network(True), True, mode, 1) for mode in ("apart", "kept", "together")]
+    for one, other in zip(found, [*found[1:], found[0]], strict=True):
+        assert (one[SHARED] - other[SHARED]).abs().max() > 1e-3
+
+
+def test_one_head_is_one_backward_pass(tmp_path: Path) -> None:
+    model = network(False)
+    wanted = expected(model, False, "apart", 2)
+    scheme = labelled(model, False, "apart")
+    (phase,) = scheme.phases(next(pairs()).to("cpu"), generator_of)
+    assert (phase.optimizers, phase.clear) == (("main",), True)
+    log = trained(scheme, model, tmp_path, 2)
+    assert_same(model, wanted)
+    assert "grad_norm" in log[0]
+
+
+def test_which_optimiser_holds_which_parameters(tmp_path: Path) -> None:
+    model = network(True)
+    made = trainer(labelled(model, True, "apart"), model, tmp_path, 1)
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    held = {
+        name: sorted(names[id(p)] for group in each.param_groups for p in group["params"])
+        for name, each in made.optimizers.items()
+    }
+    assert held == {"source": [SHARED, DAY], "target": [SHARED, DARK]}
+
+
+def test_two_domains_of_one_head_have_one_optimiser(tmp_path: Path) -> None:
+    model = network(False)
+    made = trainer(labelled(model, False, "apart"), model, tmp_path, 1)
+    (group,) = made.optimizers["main"].param_groups
+    assert len(group["params"]) == len(list(model.parameters()))
+
+
+def test_momentum_buffers_of_the_backbone_are_two(tmp_path: Path) -> None:
+    model = network(True)
+    made = trainer(labelled(model, True, "apart"), model, tmp_path, 1)
+    made.fit(pairs(), State(seed=0))
+    both = [made.optimizers[name].state[model.backbone.weight] for name in ("source", "target")]
+    one, other = (state["momentum_buffer"] for state in both)
+    assert one.data_ptr() != other.data_ptr()
+    assert not torch.allclose(one, other)
+
+
+def test_accumulated_phases_equal_the_mean_of_both_batches(tmp_path: Path) -> None:
+    """Two batches of a step are one of their mean, phase by phase, with and without clearing."""
+    for mode in ("apart", "kept", "together"):
+        model = network(True)
+        values, both = values_of(model), list(islice(pairs(), 2))
+        day, dark = Momentum((SHARED, DAY)), Momentum((SHARED, DARK))
+        each = [supervised_costs(pair, True) for pair in both]
+
+        def mean(side: int, each: list = each) -> Callable[[Values], Tensor]:
+            return lambda v: (each[0][side](v) + each[1][side](v)) / 2
+
+        written_out(values, mode, day, dark, mean(0), mean(1))
+            made = trainer(labelled(model, True, mode), model, tmp_path / mode, 1, accumulate=2)
+        made.fit(pairs(), State(seed=0))
+        assert_same(model, values)
+
+
+def test_the_network_is_asked_for_view_and_head() -> None:
+    model = network(True)
+    list(labelled(model, True, "apart").phases(next(pairs()).to("cpu"), generator_of))
+    assert model.calls == [(("rgb",), "day", True), (("thermal",), "dark", True)]
+
+
+def test_a_view_that_is_left_to_the_network_is_not_asked_for() -> None:
+    model = network(False)
+    scheme = labelled(model, False, "apart", view=None)
+    list(scheme.phases(next(pairs()).to("cpu"), generator_of))
+    assert model.calls == [(("rgb",), None, True), ((), None, True)]
+
+
+# ---- without labels of the target -----------------------------------------------------------
+
+
+def squares(values: Values, batch: Any, weight: float) -> Tensor:
+    """-weight / 2 times the mean of squared probabilities over all entries."""
+    x, _ = pixels(batch, "thermal")
+    return -weight / 2 * scores(values, x, ONLY).softmax(1).square().mean()
+
+
+def test_maximum_squares_step(tmp_path: Path) -> None:
+    model = network(False)
+    values, day = values_of(model), Momentum((SHARED, ONLY))
+    for pair in islice(pairs(), 2):
+        source = supervised_costs(pair, False)[0]
+        written_out(values, "apart", day, None, source, lambda v, p=pair: squares(v, p.target, 0.7))
+    log = trained(unlabelled(model), model, tmp_path, 2)
+    assert_same(model, values)
+    assert {"loss/source/ce", "loss/target/max_squares"} <= set(log[0])
+
+
+def test_labels_of_an_unlabelled_target_are_not_read(tmp_path: Path) -> None:
+    found = []
+    for label in (0, IGNORE):
+        model = network(False)
+        made = trainer(unlabelled(model), model, tmp_path / str(label), 1)
+        pair = next(pairs())
+        pair.target.label.fill_(label)
+            made.fit(iter([pair]), State(seed=0))
+        found.append(values_of(model))
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+
+
+def test_entropy_of_two_heads_trains_the_targets(tmp_path: Path) -> None:
+    model = network(True)
+    values = values_of(model)
+    day, dark = Momentum((SHARED, DAY)), Momentum((SHARED, DARK))
+    pair = next(pairs())
+
+    def entropy(v: Values) -> Tensor:
+        p = scores(v, pixels(pair.target, "thermal")[0], DARK).softmax(1)
+        return -0.3 * (p * p.log()).sum(1).mean() / torch.tensor(float(K)).log()
+
+    written_out(values, "apart", day, dark, supervised_costs(pair, True)[0], entropy)
+    scheme = unlabelled(model, heads=True, unlabelled=Entropy(weight=0.3))
+    trained(scheme, model, tmp_path, 1)
+    assert_same(model, values)
+
+
+def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below(tmp_path: Path) -> None:
+    """Its label is no function of the scores: the head that gives it gets no gradient."""
+    model = network(False, auxiliary=True)
+    scheme = unlabelled(model, guidance_weight=0.25, guidance_threshold=0.4)
+    pair = next(pairs()).to("cpu")
+    (phase,) = scheme.phases(pair, generator_of)
+    parts = phase.parts
+    assert set(parts) == {"source/ce", "target/max_squares", "target/guidance"}
+    parts["target/guidance"].backward()
+    assert model.only.weight.grad is None
+    assert model.auxiliary.weight.grad is not None
+    assert model.backbone.weight.grad is not None
+
+    values = values_of(model)
+    x = pixels(next(pairs()).target, "thermal")[0]
+    main, aux = (scores(values, x, name).softmax(1) for name in (ONLY, "auxiliary.weight"))
+    sure = (main.amax(1) > 0.4) | (aux.amax(1) > 0.4)
+    assert 0 < sure.sum() < len(x)
+    label = (main + aux).argmax(1)
+    cost = 0.25 * nats(scores(values, x, "auxiliary.weight")[sure], label[sure])
+    assert parts["target/guidance"].item() == pytest.approx(cost.item(), rel=1e-5)
+
+
+def test_guidance_of_nothing_sure_costs_nothing() -> None:
+    model = network(False, auxiliary=True)
+    scheme = unlabelled(model, guidance_weight=1.0, guidance_threshold=0.999)
+    (phase,) = scheme.phases(next(pairs()).to("cpu"), generator_of)
+    assert phase.parts["target/guidance"].item() == 0.0
+    phase.parts["target/guidance"].backward()
+    assert model.auxiliary.weight.grad.abs().sum() == 0
+
+
+# ---- what does not fit ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["kept", "together"])
+def test_gradients_of_one_head_are_refused(mode: str) -> None:
+    with pytest.raises(InputError, match=f"scheme.gradients={mode} is about the optimisers"):
+        labelled(network(False), False, mode)
+
+
+def test_a_masker_that_hides_is_refused() -> None:
+    for made in (
+        lambda: unlabelled(network(False), masker=Something()),
+        lambda: LabelledDomains(
+            model=network(False),
+            loss=cross_entropy,
+            masker=Something(),
+            domains=domains(False),
+            gradients="apart",
+        ),
+    ):
+        with pytest.raises(InputError, match="shows whole images.*masker=none"):
+            made()
+
+
+def test_labels_that_are_missing_or_not_read_are_refused() -> None:
+    with pytest.raises(InputError, match=r"labels=none, but the scheme reads labels.*max_squares"):
+        labelled(network(False), False, "apart", labels="none")
+    for labels in ("given", "/folder"):
+        with pytest.raises(InputError, match=rf"labels={labels}, but the scheme does not read"):
+            unlabelled(network(False), domains=domains(False, labels=labels))
+
+
+def test_one_domain_is_refused_where_there_must_be_two_and_two_where_one() -> None:
+    alone = replace(domains(False), target=None)
+    with pytest.raises(InputError, match="trains on two domains, but there is one"):
+        unlabelled(network(False), domains=alone)
+    with pytest.raises(InputError, match="trains on two domains, but there is one"):
+        LabelledDomains(
+            model=network(False),
+            loss=cross_entropy,
+            masker=Nothing(),
+            domains=alone,
+            gradients="apart",
+        )
+    with pytest.raises(InputError, match="scheme=supervised trains on one domain"):
+        Supervised(
+            model=network(False), loss=cross_entropy, masker=Nothing(), domains=domains(False)
+        )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("guidance_weight", -1.0), ("guidance_threshold", 1.5)]
+)
+def test_guidance_out_of_range_is_refused(key: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"scheme.{key} must lie in"):
+        unlabelled(network(False, auxiliary=True), **{key: value})
+
+
+def test_guidance_without_an_auxiliary_head_is_refused() -> None:
+    with pytest.raises(InputError, match="trains an auxiliary head, which this network does not"):
+        unlabelled(network(False), guidance_weight=0.1)
+
+
+def test_masks_of_queries_are_no_scores() -> None:
+    with pytest.raises(InputError, match="returns masks of queries"):
+        scores_of(Output(None, {}))
+
+
+def test_supervised_shows_the_domain_to_its_head() -> None:
+    model = network(True)
+    given = domains(True)
+    alone = replace(given, target=None, target_is=None)
+    scheme = Supervised(model=model, loss=cross_entropy, masker=Nothing(), domains=alone)
+    (phase,) = scheme.phases(images("source", 0).to("cpu"), generator_of)
+    assert model.calls == [(("rgb",), "day", True)]
+    assert phase.optimizers == ("main",)
