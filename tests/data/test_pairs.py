@@ -41,11 +41,12 @@ def stream(dataset: MFNet, split: str, seed: int, steps: range, **changes: objec
     return train_batches(dataset, split, TRANSFORM, loading, seed, steps)
 
 
-def pairs(dataset: MFNet, steps: range, **changes: object) -> PairedBatches:
+def pairs(dataset: MFNet, steps: range, per_step: int = 1, **changes: object) -> PairedBatches:
     return PairedBatches(
         stream(dataset, "train", 3, steps, **changes),
         stream(dataset, "val", 4, steps, **changes),
         first=steps.start,
+        per_step=per_step,
     )
 
 
@@ -58,7 +59,7 @@ def assert_equal(one: Batch, other: Batch) -> None:
 def assert_equal_pairs(one: TwoDomains, other: TwoDomains) -> None:
     assert_equal(one.source, other.source)
     assert_equal(one.target, other.target)
-    assert one.number == other.number
+    assert one.step == other.step
 
 
 def test_each_stream_is_what_it_is_alone(dataset: MFNet) -> None:
@@ -90,7 +91,13 @@ def test_starting_later_continues(dataset: MFNet) -> None:
     late = list(pairs(dataset, range(10, 20)))
     for one, other in zip(whole[10:], late, strict=True):
         assert_equal_pairs(one, other)
-    assert [pair.number for pair in late] == list(range(10, 20))
+    assert [pair.step for pair in late] == list(range(10, 20))
+
+
+def test_pairs_of_one_step_have_its_number(dataset: MFNet) -> None:
+    found = [pair.step for pair in pairs(dataset, range(6), per_step=3)]
+    assert found == [0, 0, 0, 1, 1, 1]
+    assert [pair.step for pair in pairs(dataset, range(3, 6), per_step=3)] == [1, 1, 1]
 
 
 def test_the_same_pairs_whatever_the_workers(dataset: MFNet) -> None:
@@ -103,7 +110,7 @@ def test_the_same_pairs_whatever_the_workers(dataset: MFNet) -> None:
 def test_moved_both_are_moved(dataset: MFNet) -> None:
     pair = next(pairs(dataset, range(7, 8)))
     moved = pair.to("cpu")
-    assert moved.number == 7
+    assert moved.step == 7
     for side in ("source", "target"):
         assert_equal(getattr(moved, side), getattr(pair, side).to("cpu"))
         assert getattr(moved, side).rgb.max() <= 1

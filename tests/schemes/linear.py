@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -105,12 +106,9 @@ def images(purpose: str, number: int, confidence: bool = False) -> Batch:
 
 
 def pairs(first: int = 0, confidence: bool = False) -> Iterator[TwoDomains]:
-    number = first
-    while True:
-        yield TwoDomains(
-            images("source", number), images("target", number, confidence=confidence), number
-        )
-        number += 1
+    for number in count(first):
+        target = images("target", number, confidence=confidence)
+        yield TwoDomains(images("source", number), target, number)
 
 
 def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: Any) -> Trainer:

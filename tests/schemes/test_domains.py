@@ -16,10 +16,9 @@ from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.losses.guidance import guidance
 from rgbt.losses.unlabelled import Entropy, MaxSquares
-from rgbt.schemes.domains import scores as scores_of
 from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
-from rgbt.types import IGNORE, Output
+from rgbt.types import IGNORE
 from tests.schemes.linear import (
     K,
     Linear,
@@ -159,7 +158,7 @@ def test_accumulated_phases_equal_the_mean_of_both_batches(tmp_path: Path) -> No
             return lambda v: (each[0][side](v) + each[1][side](v)) / 2
 
         written_out(values, mode, day, dark, mean(0), mean(1))
-            made = trainer(labelled(model, True, mode), model, tmp_path / mode, 1, accumulate=2)
+        made = trainer(labelled(model, True, mode), model, tmp_path / mode, 1, accumulate=2)
         made.fit(pairs(), State(seed=0))
         assert_same(model, values)
 
@@ -204,7 +203,7 @@ def test_labels_of_an_unlabelled_target_are_not_read(tmp_path: Path) -> None:
         made = trainer(unlabelled(model), model, tmp_path / str(label), 1)
         pair = next(pairs())
         pair.target.label.fill_(label)
-            made.fit(iter([pair]), State(seed=0))
+        made.fit(iter([pair]), State(seed=0))
         found.append(values_of(model))
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
 
@@ -320,9 +319,12 @@ def test_guidance_without_an_auxiliary_head_is_refused() -> None:
         unlabelled(network(False), guidance_weight=0.1)
 
 
-def test_masks_of_queries_are_no_scores() -> None:
-    with pytest.raises(InputError, match="returns masks of queries"):
-        scores_of(Output(None, {}))
+def test_masks_of_queries_are_refused() -> None:
+    model = network(False)
+    model.predicts = "masks"
+    for made in (lambda: labelled(model, False, "apart"), lambda: unlabelled(model)):
+        with pytest.raises(InputError, match="Linear returns masks of queries in training"):
+            made()
 
 
 def test_supervised_shows_the_domain_to_its_head() -> None:

@@ -68,8 +68,8 @@ def test_every_row_of_the_thesis_runs() -> None:
 def test_the_printed_mean_is_that_of_both_columns(number: int) -> None:
     mean = next(column for column in TABLES[number].columns if column.name == "mean_mIoU")
     for row in TABLES[number].rows:
-        both = [row.values[name] for name in mean.sources]
-        printed = row.values["mean_mIoU"]
+        both = [row.values.get(name) for name in mean.sources]
+        printed = row.values.get("mean_mIoU")
         known = [value for value in (*both, printed) if value is not None]
         if len(known) == 3:
             assert known[2] == pytest.approx((known[0] + known[1]) / 2, abs=0.0501), row.label
