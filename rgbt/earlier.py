@@ -3,7 +3,7 @@
 A configuration names them by their experiment: ``model.weights=experiment:NAME/last.pt`` starts
 from the end of that run (the stage before, or another task), ``domains.target.labels=
 experiment:NAME/best.pt`` learns from what its network predicts. Seed, scale and data set are those
-of the run that asks (`rgbt.config.SHARED`), so that a run of seed 2 stands on runs of seed 2.
+of the run that asks (`rgbt.identity.SHARED`), so that a run of seed 2 stands on runs of seed 2.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import DOMAINS, earlier_config, earlier_run, run_key
+from rgbt.identity import DOMAINS, earlier_config, earlier_run, run_key
 from rgbt.naming import TAGS
 from rgbt.tracking.files import is_held
 from rgbt.tracking.terminal import tell

@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config import compose, weights_file
+from rgbt.config import compose
+from rgbt.identity import weights_file
 from rgbt.tracking.terminal import tell
 from rgbt.weights.load import load_weights
 from rgbt.weights.report import Report

@@ -9,9 +9,10 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config import check, compose, flatten, register_resolvers, run_key, weights_file
+from rgbt.config import check, compose, flatten, register_resolvers
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights
+from rgbt.identity import run_key, weights_file
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, open_session
 from rgbt.tracking.folder import find_run

@@ -15,11 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config import build, run_key
+from rgbt.config import build
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.trainer import StepData, Trainer
+from rgbt.identity import run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe
@@ -205,7 +206,7 @@ class Run:
         def validate(step: int) -> float:
             found = evaluate(session, self.prepared.model, split)
             values = scores.summary(found.counts, session.regions.absent)
-            values |= _of_target(session, self.prepared.model, split)
+            values |= self._of_target(session, self.prepared.model, split)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
             if values[names.MIOU] > state.best_score or session.trainer.tested == "last":
@@ -258,7 +259,7 @@ class Run:
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
-        of_target = _of_target(session, session.model, "test")
+        of_target = self._of_target(session, session.model, "test")
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
@@ -272,6 +273,17 @@ class Run:
         else:
             tell("none of the images of the panel could be read; no pictures were drawn.")
 
+    def _of_target(self, session: Session, model: nn.Module, split: str) -> dict[str, float]:
+        """Where the target is seen in another view than the source: its mIoU, named after that."""
+        target = session.domains.target
+        if target is None or target.view in (None, view_of(session)):
+            return {}
+        counts = evaluate(session, model, split, view=target.view).counts
+        counts.save(self.folder.counts_path(f"{split}_{target.view}"))
+        values = scores.summary(counts, session.regions.absent)
+        kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
+        return {names.subset(target.view, name): values[name] for name in kept if name in values}
+
     def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
         draw_panel(kept, legend_of(session.dataset), self.folder.figure_path("panel"))
         heat = RegionHeat(
@@ -280,17 +292,6 @@ class Run:
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
-
-
-def _of_target(session: Session, model: nn.Module, split: str) -> dict[str, float]:
-    """Where the target is seen in another view than the source: its mIoU, named after that."""
-    target = session.domains.target
-    if target is None or target.view in (None, view_of(session)):
-        return {}
-    counts = evaluate(session, model, split, view=target.view).counts
-    values = scores.summary(counts, session.regions.absent)
-    kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
-    return {names.subset(target.view, name): values[name] for name in kept if name in values}
 
 
 def _parts_of(of_target: Mapping[str, float]) -> dict[str, float]:

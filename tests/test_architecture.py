@@ -27,6 +27,7 @@ ALLOWED = {
     "geometry": {"rgbt.types", "rgbt.checks", "rgbt.geometry"},
     "randomness.py": set(),
     "config.py": {"rgbt.checks"},
+    "identity.py": {"rgbt.checks", "rgbt.config"},
     "command.py": {"rgbt.checks", "rgbt.config"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
@@ -64,7 +65,7 @@ def is_command(text: str) -> bool:
     return 'if __name__ == "__main__"' in text
 
 
-SWEEPS_MAY = {"checks", "types", "config", "command", "naming", "metrics", "tracking"}
+SWEEPS_MAY = {"checks", "types", "config", "identity", "command", "naming", "metrics", "tracking"}
 """What of rgbt the sweeps may import: they call its commands and read what these leave."""
 
 ROOMS = {
@@ -90,7 +91,10 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
             assert rest[0] in ROOMS[room], f"{inside} imports {name}"
 
 
-ANALYSIS_MAY = {"checks", "types", "config", "command", "randomness", "metrics", "tracking", "data"}
+ANALYSIS_MAY = {
+    *("checks", "types", "config", "identity", "command"),
+    *("randomness", "metrics", "tracking", "data"),
+}
 """What of rgbt the analysis may import: data sets and what runs have left, never a network."""
 
 ANALYSIS_ROOMS = {

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import NODES, build, check, conf_dir, flatten, run_key
+from rgbt.config import NODES, build, check, conf_dir, flatten
+from rgbt.identity import run_key
 from tests.models.golden import compose
 
 

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.config import compose, run_key
+from rgbt.config import compose
 from rgbt.engine.checkpoint import load_checkpoint
+from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.transforms.virtual_view import VirtualView
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train

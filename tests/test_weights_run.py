@@ -12,7 +12,7 @@ import torch
 
 from rgbt import evaluate, predict
 from rgbt.command import plain_command
-from rgbt.config import run_key
+from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.weights.__main__ import main as weights_main
 from tests.commands import Call, Trained, assert_one_sentence, only_run, short, train

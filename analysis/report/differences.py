@@ -14,7 +14,7 @@ from analysis.report.runs import Run
 from analysis.report.tables_intervals import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
 from rgbt.checks import InputError
-from rgbt.config import NOT_IN_KEY
+from rgbt.identity import NOT_IN_KEY
 from rgbt.metrics import names
 
 FILE = Path(__file__).with_name("differences.yaml")

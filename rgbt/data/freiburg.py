@@ -68,8 +68,9 @@ class Freiburg:
     (Eq. 7) and HeatNet compute the same in real numbers from 0 to 1; the code of the thesis stores
     it with eight bits as well.
 
-    Source: HeatNet (Vertens et al., IROS 2020); crop and range: J. Sun, "Semantic segmentation
-    using thermal images" (TU Eindhoven, 2022) and its code.
+    Source: HeatNet (Vertens et al., IROS 2020); crop and range: J. Sun, "RGB-only day-night
+    semantic segmentation using domain adaptation with thermal images" (TU Eindhoven, 2022) and its
+    code.
 
     Args:
         root: folder that holds `train`, `test` or both.

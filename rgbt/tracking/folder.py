@@ -6,7 +6,8 @@ provenance.json     a list: one entry per process that worked on the run (`prove
 diff.patch          uncommitted changes of the code at the first of these, if there were any
 run.json            name, tags and parameters, as a tracker shall show them
 metrics.jsonl       one JSON object per line, see `MetricLine`
-counts_<split>.npz  integer counts that every score is derived from
+counts_<split>.npz  integer counts that every score is derived from; counts_<split>_<view>.npz: of a
+                    target domain that is seen in another view than the source
 tables.json         the last region and class tables (`tables.py`)
 figures/*.png       pictures
 evaluations/*.npz   counts of later evaluations (`rgbt.evaluate`) and of pairs of frames

@@ -12,7 +12,8 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.command import composing
-from rgbt.config import build, check, compose, run_key
+from rgbt.config import build, check, compose
+from rgbt.identity import run_key
 from sweeps.points import Point
 
 

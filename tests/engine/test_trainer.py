@@ -12,7 +12,7 @@ from torch import nn
 
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights, save_checkpoint
-from rgbt.engine.optimizers import SGD, AdamW
+from rgbt.engine.optimizers import SGD, Adam, AdamW
 from rgbt.engine.schedules import Exponential, Poly
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
@@ -133,20 +133,21 @@ def test_loss_falls(tmp_path: Path) -> None:
     assert {"loss/fit", "loss/extra", "grad_norm", "lr/main_0", "images_per_s"} <= set(log[0][1])
 
 
-def test_accumulated_halves_equal_the_whole_batch(tmp_path: Path) -> None:
-    def halves() -> Iterator[Batch]:
-        for batch in batches(0):
-            for part in (slice(0, 2), slice(2, 4)):
-                yield Batch(
-                    batch.rgb[part],
-                    batch.thermal[part],
-                    batch.label[part],
-                    batch.name[part],
-                    batch.centre_yx[part],
-                    None,
-                    batch.original_hw[part],
-                )
+def halves() -> Iterator[Batch]:
+    for batch in batches(0):
+        for part in (slice(0, 2), slice(2, 4)):
+            yield Batch(
+                batch.rgb[part],
+                batch.thermal[part],
+                batch.label[part],
+                batch.name[part],
+                batch.centre_yx[part],
+                None,
+                batch.original_hw[part],
+            )
 
+
+def test_accumulated_halves_equal_the_whole_batch(tmp_path: Path) -> None:
     whole, _ = make(tmp_path / "whole", max_steps=1)
     split, _ = make(tmp_path / "split", max_steps=1, accumulate=2)
     for trainer, source in ((whole, batches(0)), (split, halves())):
@@ -275,3 +276,171 @@ def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_durations_below_one_are_refused(key: str) -> None:
     with pytest.raises(InputError, match=f"trainer.{key} must be at least 1, got 0"):
         TrainerSettings(**{**SETTINGS, key: 0})
+
+
+class Alternating:
+    """A network that fits, and a judge that fits too, in turn; both under noise of the step."""
+
+    def __init__(self, model: nn.Module, judge: nn.Module) -> None:
+        self.model, self.others = model, {"judge": judge}
+        self.calls, self.dies_at = 0, -1
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        noise = torch.randn(batch.rgb.shape, generator=generator_of("noise"))
+        seen = (batch.rgb + 0.1 * noise).mean((2, 3))
+        wanted = batch.rgb.mean((1, 2, 3))[:, None]
+        yield Phase(("main",), {"fit": (self.model(seen) - wanted).square().mean()})
+        self.calls += 1
+        if self.calls == self.dies_at:
+            raise KeyboardInterrupt
+        yield Phase(("judge",), {"judge": (self.others["judge"](seen) - wanted).abs().mean()})
+
+
+def make_two(folder: Path, **changes: object) -> Trainer:
+    trainer, log = make(folder, **changes)
+    torch.manual_seed(2)
+    judge = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, 1))
+    trainer.scheme = Alternating(trainer.model, judge)
+    trainer.others = trainer.scheme.others
+    builder = Adam(lr=0.05, betas=(0.9, 0.99), weight_decay=0.0, eps=1e-8)
+    trainer.optimizers["judge"] = builder(judge)
+    trainer.log = log
+    return trainer
+
+
+def test_others_are_resumed_with_their_statistics_and_moments(tmp_path: Path) -> None:
+    straight = make_two(tmp_path / "a")
+    straight.fit(batches(0), State(seed=7))
+    first = make_two(tmp_path / "b")
+    first.scheme.dies_at = 6  # between the phases of its last step
+    with pytest.raises(KeyboardInterrupt):
+        first.fit(batches(0), State(seed=7))
+    second, state = make_two(tmp_path / "b"), State(seed=7)
+    assert second.resume(state)
+    assert state.step == 4
+    second.fit(batches(4), state)
+    ends = [load_checkpoint(tmp_path / where / "last.pt") for where in ("a", "b")]
+    for part in ("model", "others", "optimizers"):
+        assert_equal(ends[0][part], ends[1][part])
+    assert set(ends[0]["others"]) == {"judge"}
+    assert "1.running_mean" in ends[0]["others"]["judge"]
+    assert [v["loss"] for _, v in straight.log[4:]] == [v["loss"] for _, v in second.log]
+    assert {"loss/fit", "loss/judge", "grad_norm/main", "grad_norm/judge"} <= set(
+        straight.log[0][1]
+    )
+    assert straight.log[0][1]["loss"] == pytest.approx(
+        straight.log[0][1]["loss/fit"] + straight.log[0][1]["loss/judge"]
+    )
+
+
+def assert_equal(one: object, other: object) -> None:
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_equal(one[key], other[key])
+    elif isinstance(one, list):
+        assert len(one) == len(other)
+        for a, b in zip(one, other, strict=True):
+            assert_equal(a, b)
+    else:
+        assert one == other
+
+
+def test_a_checkpoint_keeps_no_critic_from_before_there_was_one(tmp_path: Path) -> None:
+    trainer, _ = make(tmp_path, max_steps=2)
+    trainer.fit(batches(0), State(seed=0))
+    payload = load_checkpoint(tmp_path / "last.pt")
+    del payload["others"]  # as checkpoints were before
+    save_checkpoint(tmp_path / "last.pt", payload)
+    again, _ = make(tmp_path)
+    state = State(seed=0)
+    assert again.resume(state)
+    assert state.step == 2
+
+
+@pytest.mark.parametrize(("tested", "kept"), [("best", 3), ("last", 6)])
+def test_which_checkpoint_is_tested(tmp_path: Path, tested: str, kept: int) -> None:
+    trainer, _ = make(tmp_path, tested=tested)
+    trainer.validate = {3: 0.9, 6: 0.1}.__getitem__
+    state = State(seed=0)
+    trainer.fit(batches(0), state)
+    assert load_checkpoint(tmp_path / "best.pt")["step"] == kept
+    assert (state.best_step, state.best_score) == (kept, {3: 0.9, 6: 0.1}[kept])
+    last = load_checkpoint(tmp_path / "last.pt")
+    same = all(
+        torch.equal(value, last["model"][name])
+        for name, value in load_checkpoint(tmp_path / "best.pt")["model"].items()
+    )
+    assert same == (tested == "last")
+
+
+class Shared:
+    """Two optimisers that share everything, in two phases; the mean of images, no noise."""
+
+    def __init__(self, model: nn.Module, clear: bool) -> None:
+        self.model, self.clear = model, clear
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        del generator_of
+        seen = batch.rgb.mean((2, 3))
+        yield Phase(("main",), {"one": self.model(seen).square().mean()})
+        yield Phase(("second",), {"two": (self.model(seen) - 1).square().mean()}, clear=self.clear)
+
+
+@pytest.mark.parametrize("clear", [True, False])
+@pytest.mark.parametrize("clip_norm", [None, 1e-3])
+def test_accumulated_phases_equal_those_of_the_whole_batch(
+    tmp_path: Path, clear: bool, clip_norm: float | None
+) -> None:
+    found = []
+    for where, accumulate in (("whole", 1), ("halves", 2)):
+        trainer, _ = make(
+            tmp_path / where, max_steps=2, accumulate=accumulate, clip_norm=clip_norm
+        )
+        trainer.scheme = Shared(trainer.model, clear)
+        builder = SGD(lr=0.05, backbone_multiplier=1.0, momentum=0.9, weight_decay=0.01)
+        trainer.optimizers = {"main": builder(trainer.model), "second": builder(trainer.model)}
+        trainer.fit(batches(0) if accumulate == 1 else halves(), State(seed=0))
+        found.append([p.detach().clone() for p in trainer.model.parameters()])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_what_is_not_cleared_is_added(tmp_path: Path) -> None:
+    """SGD by hand on one weight: w - lr g1, then - lr g2 or - lr (g1 + g2)."""
+    for clear in (True, False):
+        trainer, _ = make(tmp_path / str(clear), max_steps=1, clip_norm=None)
+        model = nn.Linear(1, 1, bias=False)
+        nn.init.constant_(model.weight, 2.0)
+        builder = SGD(lr=0.25, backbone_multiplier=1.0, momentum=0.0, weight_decay=0.0)
+        trainer.model = model
+        trainer.optimizers = {"main": builder(model), "second": builder(model)}
+        trainer.schedule = lambda step, total, per_epoch: 1.0
+        ones = next(batches(0))
+        ones.rgb.fill_(255)
+
+        def phases(batch: Batch, generator_of: GeneratorOf, *, clear: bool = clear, model=model):
+            seen = batch.rgb[:, :1].mean((2, 3))
+            yield Phase(("main",), {"one": model(seen).square().mean()})  # w^2: 2 w = 4
+            yield Phase(("second",), {"two": 3 * model(seen).mean()}, clear=clear)  # 3 w: 3
+
+        trainer.scheme.phases = phases
+        trainer.fit(iter([ones]), State(seed=0))
+        expected = 2 - 0.25 * 4 - 0.25 * (3 if clear else 7)
+        assert model.weight.item() == pytest.approx(expected)
+
+
+def test_a_line_has_the_last_values_of_steps_that_alternate(tmp_path: Path) -> None:
+    trainer, log = make(tmp_path, max_steps=4, log_every=2)
+    model, calls = trainer.model, iter(range(100))
+
+    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        name = ("even", "odd")[next(calls) % 2]
+        yield Phase(("main",), {name: model(batch.rgb.mean((2, 3))).square().mean()})
+
+    trainer.scheme.phases = phases
+    trainer.fit(batches(0), State(seed=0))
+    assert [step for step, _ in log] == [2, 4]
+    assert all({"loss/even", "loss/odd"} <= set(values) for _, values in log)

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.config import compose, run_key
+from rgbt.config import compose
+from rgbt.identity import run_key
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.points import Evaluation, Point
 from sweeps.running.found import Runs

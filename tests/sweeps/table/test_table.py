@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.config import build, check, conf_dir, register_resolvers, run_key
+from rgbt.config import build, check, conf_dir, register_resolvers
+from rgbt.identity import run_key
 from rgbt.metrics.named import parse
 from sweeps.table.table import Column, Row, Table, load_table, table_names
 
