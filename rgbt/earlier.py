@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -49,7 +50,7 @@ class Earlier:
     checkpoint: str
     config: DictConfig
 
-    @property
+    @cached_property
     def folder(self) -> Path:
         """Its run folder."""
         return Path(self.config.runs_dir) / run_key(self.config)

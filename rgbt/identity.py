@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -115,10 +116,10 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
             "python -m rgbt.predict ... pseudo_labels=true."
         )
     try:
-        found = dict(json.loads(path.read_text()))
+        found = json.loads(path.read_text())
     except ValueError as error:
         raise InputError(f"{path} is damaged ({error}); remove it and predict again.") from error
-    if "digest" not in found:
+    if not isinstance(found, dict) or "digest" not in found:
         raise InputError(f"{path} does not describe pseudo-labels; predict into another folder.")
     return found
 
@@ -159,7 +160,7 @@ def earlier_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
     """
     if config.name == experiment:
         raise InputError(f"experiment {experiment} names itself as an earlier run.")
-    earlier = compose([f"+experiment={experiment}", f"scale={config.scale.name}"])
+    earlier = _composed(experiment, config.scale.name).copy()
     # Whether a network has pretrained weights is said by its experiment, all else by the scale.
     shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == "model.weights":
@@ -174,6 +175,12 @@ def earlier_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
         OmegaConf.update(earlier, each, value, merge=False, force_add=True)
     check(earlier)
     return earlier
+
+
+@cache
+def _composed(experiment: str, scale: str) -> DictConfig:
+    """An experiment as it stands; composing takes long, and a chain asks for it again and again."""
+    return compose([f"+experiment={experiment}", f"scale={scale}"])
 
 
 def weights_file(config: DictConfig) -> Path | None:

@@ -34,6 +34,7 @@ class DataSet(Protocol):
     name: str
     classes: tuple[str, ...]
     palette: tuple[tuple[int, int, int], ...]
+    unscored: tuple[str, ...]
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in order."""
@@ -97,8 +98,15 @@ def collect(
 
     Raises:
         InputError: no such split; a file that cannot be read (without `skip_unreadable`, or all);
-            an image without label or of another size than the first.
+            an image without label or of another size than the first; a data set whose background
+            is not class 0.
     """
+    if dataset.unscored and dataset.unscored[0] != dataset.classes[0]:
+        raise InputError(
+            f"these statistics take class 0 for the background, as MFNet has it, but class 0 of "
+            f"{dataset.name} is '{dataset.classes[0]}' and its background "
+            f"{' and '.join(dataset.unscored)}; they are not made for it yet."
+        )
     names = dataset.names(split)
     first = _first_readable(dataset, names, settings)
     region_map = settings.regions.map((first.rgb.shape[0], first.rgb.shape[1]))

@@ -20,6 +20,7 @@ class InMemory:
     name = "memory"
     classes = CLASSES
     palette = PALETTE
+    unscored: tuple[str, ...] = ()
 
     def __init__(self, samples: list[Sample]) -> None:
         self.samples = {sample.name: sample for sample in samples}

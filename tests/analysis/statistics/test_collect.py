@@ -157,3 +157,11 @@ def test_sizes_that_disagree_are_refused() -> None:
         replace(made(), labels=np.zeros((40, 2, 4), np.int64))
     with pytest.raises(ValueError, match=r"noise\['std'\]"):
         replace(made(), noise={"std": np.zeros((40, 2, 2))})
+
+
+def test_a_data_set_whose_background_is_not_class_0_is_refused() -> None:
+    dataset = memory(["a"])
+    dataset.classes = ("road", *dataset.classes[1:])
+    dataset.unscored = (dataset.classes[1],)
+    with pytest.raises(InputError, match="class 0 of .* is 'road'"):
+        collect(dataset, "train", SETTINGS)
