@@ -93,6 +93,13 @@ def finish_earlier(config: DictConfig, train: Train, rehearse: Rehearse) -> None
             _write_labels(earlier, config, earlier.key.split(".")[1])
 
 
+def reads_pretrained(config: DictConfig) -> bool:
+    """Whether `config`, or a run that it stands on, starts from the file `pretrained`."""
+    return config.model.get("weights") == config.pretrained or any(
+        reads_pretrained(earlier.config) for earlier in earlier_runs(config)
+    )
+
+
 def labels_folder(config: DictConfig, name: str) -> Path | None:
     """The folder of pseudo-labels of a domain; None where it takes no pseudo-labels."""
     node = config.domains[name]

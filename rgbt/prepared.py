@@ -12,7 +12,7 @@ from torch import nn
 from rgbt.checks import InputError
 from rgbt.config import build
 from rgbt.data.batches import Dataset
-from rgbt.data.domains import NONE, Domain
+from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
@@ -127,6 +127,7 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     }
     for name, domain in domains.named.items():
         steps_per_epoch(datasets[name], session.loading, domain.split)
+        _check_labelled(session, name, domain)
     masker: Masker = build(config.masker)
     if session.transform.crop_hw is not None and not masker.hides_nothing:
         # One draw for nothing: cells that do not fit the crop are told before the run is begun.
@@ -155,6 +156,24 @@ def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
     if folder is not None:
         return PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
     return Unlabelled(session.dataset) if domain.labels == NONE else session.dataset
+
+
+def _check_labelled(session: Session, name: str, domain: Domain) -> None:
+    """Refuse labels that the data set does not have, and tell of those that it is tested on."""
+    if domain.labels != GIVEN:
+        return
+    if _first_readable(session, domain.split).label is None:
+        raise InputError(
+            f"domains.{name}.labels=given, but {session.dataset.name} has no labels of "
+            f"{domain.split}; name pseudo-labels (experiment:thermal_teacher/best.pt), or set it "
+            "to none."
+        )
+    shared = set(session.dataset.names(domain.split)) & set(session.dataset.names("test"))
+    if shared:
+        tell(
+            f"domains.{name}.split={domain.split}: {len(shared)} of its images are test images, "
+            "so that the test says nothing of new ones."
+        )
 
 
 def _scheme(session: Session, **collaborators: Any) -> Scheme:

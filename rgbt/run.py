@@ -17,10 +17,13 @@ if TYPE_CHECKING:
 @command(sweeper="study")
 def main(config: DictConfig) -> int:
     """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
-    from rgbt.earlier import finish_earlier  # torch and mlflow load here, after --help
+    from rgbt.earlier import finish_earlier, reads_pretrained  # torch loads here, after --help
     from rgbt.prepared import rehearse
+    from rgbt.tracking.terminal import tell
     from rgbt.training import is_finished, train
 
+    if config.pretrained is not None and not reads_pretrained(config):
+        tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")
     if not is_finished(config):
         finish_earlier(config, train, rehearse)
     train(config, task_overrides())

@@ -161,11 +161,19 @@ def heads_of(session: Session, view: View, head: TestedHead | None = None) -> He
     asked = session.domains.tested_head if head is None else head
 
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
-        nights = session.dataset.nights(names) if session.domains.target_is == "night" else None
-        dark = nights or (None,) * len(names)
+        by_night = asked == "own" and session.domains.target_is == "night"
+        dark = (_nights(session, names) if by_night else None) or (None,) * len(names)
         return tuple(session.domains.head_of(view, night, asked) for night in dark)
 
     return choose
+
+
+def _nights(session: Session, names: tuple[str, ...]) -> tuple[bool, ...] | None:
+    """Which images were taken at night; None where that is not known, as of files of one's own."""
+    try:
+        return session.dataset.nights(names)
+    except InputError:
+        return None
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,7 @@ def test_an_earlier_run_is_the_run_of_its_experiment_alone(typed: list[str]) -> 
             assert run_key(found.config) == alone(found.experiment, *typed), found.experiment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", ["demo", "paper"])
 @pytest.mark.parametrize("experiment", STANDING)
 def test_every_earlier_run_is_the_run_of_its_experiment_alone(experiment: str, scale: str) -> None:
@@ -415,6 +416,7 @@ def test_a_run_that_another_process_began_in_between(bring: Any, tmp_path: Path)
 # ---- stored runs of before ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_stored_run_of_before_domains_opens(call: Call, trained: Trained, tmp_path: Path) -> None:
     from rgbt import evaluate
     from rgbt.command import plain_command
@@ -430,8 +432,6 @@ def test_a_stored_run_of_before_domains_opens(call: Call, trained: Trained, tmp_
     (path,) = (folder / "evaluations").glob("*.npz")
     again, first = Counts.load(path), Counts.load(folder / "counts_test.npz")
     assert np.array_equal(again.counts, first.counts)
-    code, _, err = call(
-        plain_command(evaluate.OWN, evaluate.main), f"run={folder}", "head=source"
-    )
+    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={folder}", "head=source")
     assert code == 2
     assert "head=source chooses between the heads of two domains" in err

@@ -396,9 +396,7 @@ def test_accumulated_phases_equal_those_of_the_whole_batch(
 ) -> None:
     found = []
     for where, accumulate in (("whole", 1), ("halves", 2)):
-        trainer, _ = make(
-            tmp_path / where, max_steps=2, accumulate=accumulate, clip_norm=clip_norm
-        )
+        trainer, _ = make(tmp_path / where, max_steps=2, accumulate=accumulate, clip_norm=clip_norm)
         trainer.scheme = Shared(trainer.model, clear)
         builder = SGD(lr=0.05, backbone_multiplier=1.0, momentum=0.9, weight_decay=0.01)
         trainer.optimizers = {"main": builder(trainer.model), "second": builder(trainer.model)}
