@@ -79,7 +79,9 @@ def finish_earlier(config: DictConfig, train: Train, rehearse: Rehearse) -> None
         train: see `Train`.
         rehearse: see `Rehearse`; called before anything is trained.
     """
-    if not all(earlier.is_finished for earlier in earlier_runs(config)):
+    labels = [labels_folder(config, name) for name in DOMAINS if config.domains[name] is not None]
+    are_there = all(folder is None or folder.is_dir() for folder in labels)
+    if not (are_there and all(earlier.is_finished for earlier in earlier_runs(config))):
         rehearse(config)
     for earlier in earlier_runs(config):
         if not earlier.is_finished:

@@ -16,7 +16,7 @@ from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
-from rgbt.earlier import earlier_runs, labels_folder
+from rgbt.earlier import Earlier, earlier_runs, labels_folder
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
@@ -26,7 +26,7 @@ from rgbt.randomness import derive, numpy_generator, torch_generator
 from rgbt.session import Session, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import VIEWS, Masker, Sample
+from rgbt.types import VIEWS, Masker, Sample, View
 
 FUNCTIONS = {
     "sdc": sdc,
@@ -98,7 +98,20 @@ def rehearse(config: DictConfig) -> None:
         if earlier.key == "model.weights":
             copy.model.weights, copy.model.fresh = None, []
             copy.scale.pretrained = False
+        else:
+            _check_teacher(config.domains[earlier.key.split(".")[1]].teacher_view, earlier)
     prepare(copy, rehearsal=True)
+
+
+def _check_teacher(view: View | None, earlier: Earlier) -> None:
+    """Refuse a view that the network of an earlier run does not predict from."""
+    with torch.device("meta"):
+        views = getattr(build(earlier.config.model), "views", VIEWS)
+    if view is not None and view not in views:
+        raise InputError(
+            f"{earlier.key.removesuffix('labels')}teacher_view={view}, but the network of "
+            f"{earlier.experiment} predicts from {', '.join(views)}; choose one of these, or null."
+        )
 
 
 def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
@@ -154,7 +167,16 @@ def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
     config = session.config
     folder = labels_folder(config, name)
     if folder is not None:
-        return PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
+        found = PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
+        listed = session.dataset.names(domain.split)
+        missing = found.labels.missing(listed)
+        if missing and (session.loading.on_error == "raise" or len(missing) == len(listed)):
+            raise InputError(
+                f"domains.{name}.labels: {folder} has no pseudo-labels of {len(missing)} of the "
+                f"{len(listed)} images of {domain.split}, such as '{missing[0]}'; predict that "
+                "split."
+            )
+        return found
     return Unlabelled(session.dataset) if domain.labels == NONE else session.dataset
 
 

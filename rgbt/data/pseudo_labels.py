@@ -10,6 +10,7 @@ A folder of them (written by `rgbt.pseudo`) holds:
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,10 @@ class PseudoLabels:
     def digest(self) -> str:
         """SHA-256 over the names and the decoded labels and confidences: their content."""
         return str(self.manifest["digest"])
+
+    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of the names that have no pseudo-label here."""
+        return tuple(name for name in names if not label_path(self.folder, name).is_file())
 
     def read(self, name: str, num_classes: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Label and confidence of the image `name`, see `read_pair`."""

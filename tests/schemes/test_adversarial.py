@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import log
@@ -21,10 +20,10 @@ from rgbt.losses.adversarial import judged, least_squares
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.types import TwoDomains
 from tests.schemes.linear import (
-    K,
     LR,
     MOMENTUM,
     Cost,
+    K,
     Linear,
     Momentum,
     Nothing,
@@ -278,7 +277,7 @@ def test_confidence_weighs_the_adversarial_cost_of_both_domains() -> None:
     target = replace(pair.target, confidence=torch.full((2, 4, 4), 0.8))
     (found,) = parts_of(scheme, replace(pair, target=target, step=1))
     assert set(found) == {"source/ce", "target/ce", "source/adversarial", "target/adversarial"}
-    # 0.01 * (1 - 0.8) * 0.25
+    # A hundredth of a fifth of a quarter.
     assert found["source/adversarial"] == pytest.approx(0.0005)
     assert found["target/adversarial"] == pytest.approx(0.0005)
 
@@ -410,7 +409,6 @@ def test_the_step_after_a_critics_step_that_broke_off_is_whole() -> None:
 
 # ---- what does not fit ----------------------------------------------------------------------
 
-Make = Callable[[], Adversarial]
 NETWORK = network(False)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "one domain": ({"domains": replace(domains(False), target=None)}, "but there is one"),
