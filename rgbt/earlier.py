@@ -8,6 +8,7 @@ of the run that asks (`rgbt.identity.SHARED`), so that a run of seed 2 stands on
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -152,9 +153,13 @@ def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
     assert folder is not None, "the domain takes labels of an earlier run"
     if (folder / "pseudo_labels.json").exists():
         return
-    # The earlier run may have been made where the data lie elsewhere.
-    root = config.dataset.get("root")
-    place = [] if root is None else [f"dataset.root={root}"]
+    # The earlier run may have been made on another machine, and where the data lie elsewhere.
+    here = [
+        *(f"data.{each}" for each in config.data if each != "_target_"),
+        *("trainer.accelerator", "trainer.threads"),
+        *(f"dataset.{each}" for each in ("root", "cache_dir") if each in config.dataset),
+    ]
+    place = [f"{each}={json.dumps(OmegaConf.select(config, each))}" for each in here]
     session = open_run(earlier.folder, place, earlier.checkpoint.removesuffix(".pt")).session
     view = view_of(session, node.teacher_view or "default")
     teacher = teacher_of(earlier.folder.name, session.model)

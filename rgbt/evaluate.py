@@ -60,7 +60,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     counts.save(path)
     label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
     tables = result_tables(counts, session.regions, label, stored.step)
-    show(result_view(tables, path.parent, [("counts", str(path))]))
+    heads = session.domains.told(head or session.domains.tested_head)
+    places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
+    show(result_view(tables, path.parent, places))
     return 0
 
 

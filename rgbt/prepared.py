@@ -176,6 +176,13 @@ def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
                 f"{len(listed)} images of {domain.split}, such as '{missing[0]}'; predict that "
                 "split."
             )
+        made_on = found.labels.manifest["fingerprint"]
+        if domain.labels.startswith("experiment:") and made_on != session.dataset.fingerprint():
+            raise InputError(
+                f"{folder} was predicted on other files of {session.dataset.name} than those of "
+                f"{session.dataset.root}; give the runs another folder (runs_dir=...), or remove "
+                "that one to predict again."
+            )
         return found
     return Unlabelled(session.dataset) if domain.labels == NONE else session.dataset
 

@@ -16,6 +16,7 @@ from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build
+from rgbt.data.domains import Domains
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
@@ -81,7 +82,10 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             Run(prepared, folder, tracking, asked).complete()
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
-    show(result_view(ResultTables.from_json(tables), folder.path, tracking.links()))
+    domains: Domains = build(config.domains)
+    heads = domains.told(domains.tested_head)
+    links = [*([("heads", heads)] if heads else []), *tracking.links()]
+    show(result_view(ResultTables.from_json(tables), folder.path, links))
 
 
 def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> None:

@@ -123,6 +123,17 @@ class Domains:
         """Names of the heads, the source's first; () where the network has one for all."""
         return tuple(dict.fromkeys(head for head in self._own_heads() if head is not None))
 
+    def told(self, asked: TestedHead) -> str:
+        """Which head predicts which images, in words; "" where there is one for all."""
+        if len(self.heads) < 2:
+            return ""
+        source, target = self.heads
+        if asked != "own":
+            return f"{self.named[asked].head} for all images"
+        if self.target_is == "night":
+            return f"{source} by day, {target} at night"
+        return f"{target} for {self.named['target'].view}, {source} otherwise"
+
     def head_of(self, view: View, night: bool | None, asked: TestedHead) -> str | None:
         """The head that predicts an image.
 
