@@ -18,6 +18,9 @@ Gradients = Literal["apart", "kept", "together"]
                that step (thesis' code, stage with labels on both domains: nothing is cleared)
     together   both with the sum of both, one after the other (thesis' code, adversarial stage),
                so that shared parameters are stepped twice
+
+Where gradients are clipped (published: they are not), each optimiser clips what it steps with, so
+that with "kept" and "together" the second finds the shared ones clipped by the first.
 """
 
 
