@@ -20,7 +20,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.identity import DOMAINS, earlier_config, earlier_run, run_key
+from rgbt.identity import DOMAINS, SHARED, earlier_config, earlier_run, run_key
 from rgbt.naming import TAGS
 from rgbt.tracking.files import is_held
 from rgbt.tracking.terminal import tell
@@ -70,7 +70,9 @@ def earlier_runs(config: DictConfig) -> Iterator[Earlier]:
             yield Earlier(key, *reference, earlier_config(config, key, reference[0]))
 
 
-def finish_earlier(config: DictConfig, train: Train, rehearse: Rehearse) -> None:
+def finish_earlier(
+    config: DictConfig, train: Train, rehearse: Rehearse, words: Sequence[str]
+) -> None:
     """Train what `config` needs and is not finished, and what that needs, and predict its labels.
 
     A run that another process trains is waited for.
@@ -79,19 +81,25 @@ def finish_earlier(config: DictConfig, train: Train, rehearse: Rehearse) -> None
         config: composed and checked.
         train: see `Train`.
         rehearse: see `Rehearse`; called before anything is trained.
+        words: overrides of `config` as they were typed, for the names of the earlier runs.
+
+    Raises:
+        InputError: see `rehearse` and `train`; where an earlier run is wrong, it is named.
     """
     labels = [labels_folder(config, name) for name in DOMAINS if config.domains[name] is not None]
     are_there = all(folder is None or folder.is_dir() for folder in labels)
     if not (are_there and all(earlier.is_finished for earlier in earlier_runs(config))):
         rehearse(config)
     for earlier in earlier_runs(config):
+        typed = [f"+experiment={earlier.experiment}", *_shared(words, earlier.key)]
         if not earlier.is_finished:
-            finish_earlier(earlier.config, train, rehearse)
-            tell(
-                f"{config.name} needs a run of {earlier.experiment} ({earlier.key}), which comes "
-                f"first: {earlier.folder}"
-            )
-            _finish(earlier, train)
+            with _naming(earlier, config):
+                finish_earlier(earlier.config, train, rehearse, typed)
+                tell(
+                    f"{config.name} needs a run of {earlier.experiment} ({earlier.key}), which "
+                    f"comes first: {earlier.folder}"
+                )
+                _finish(earlier, train, typed)
         if earlier.key != "model.weights":
             _write_labels(earlier, config, earlier.key.split(".")[1])
 
@@ -115,7 +123,32 @@ def labels_folder(config: DictConfig, name: str) -> Path | None:
     return None if node.labels in ("given", "none") else Path(node.labels).expanduser()
 
 
-def _finish(earlier: Earlier, train: Train) -> None:
+def _shared(words: Sequence[str], key: str) -> list[str]:
+    """Those of the typed overrides that hold for an earlier run as well."""
+    groups = ("scale", "dataset", "metric", *(("model",) if key == "model.weights" else ()))
+    own = ("model.weights", "model.fresh")
+    places = [(word, word.partition("=")[0].lstrip("+").rpartition("@")[2]) for word in words]
+    return [
+        word
+        for word, place in places
+        if place not in own
+        and (place in SHARED or place.split(".")[0] in groups or place.startswith("data."))
+        and place not in ("seed", "runs_dir")
+    ]
+
+
+@contextmanager
+def _naming(earlier: Earlier, config: DictConfig) -> Iterator[None]:
+    """Say which run is wrong, where it is not the one that was asked for."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(
+            f"{earlier.experiment}, which {config.name} needs ({earlier.key}): {error}"
+        ) from error
+
+
+def _finish(earlier: Earlier, train: Train, words: Sequence[str]) -> None:
     told = False
     while not earlier.is_finished:
         if is_held(earlier.folder / "lock"):
@@ -126,7 +159,7 @@ def _finish(earlier: Earlier, train: Train) -> None:
             continue
         try:
             with _without_tags():
-                train(earlier.config, [f"+experiment={earlier.experiment}"])
+                train(earlier.config, words)
         except InputError:
             # Another process may have begun it between the look and the start, and even ended it.
             if not (earlier.is_finished or is_held(earlier.folder / "lock")):

@@ -176,6 +176,12 @@ def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
                 f"{len(listed)} images of {domain.split}, such as '{missing[0]}'; predict that "
                 "split."
             )
+        if found.labels.manifest["kept"] == 0:
+            raise InputError(
+                f"domains.{name}.labels: {folder} holds no label of any pixel, its threshold of "
+                f"{found.labels.manifest['threshold']:g} was above every confidence; predict with "
+                "a lower one."
+            )
         made_on = found.labels.manifest["fingerprint"]
         if domain.labels.startswith("experiment:") and made_on != session.dataset.fingerprint():
             raise InputError(

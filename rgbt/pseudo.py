@@ -215,10 +215,15 @@ def _settings(session: Session, teacher: Teacher, asked: _Asked) -> dict[str, An
 
 
 def _network(config: DictConfig) -> str:
-    """SHA-256 of how the network is built, fed and asked, whatever its weights."""
+    """SHA-256 of how the network is built, fed and asked, whatever its weights.
+
+    How the data set is read belongs to it (the range of thermal counts), where it lies does not.
+    """
     plain: Any = OmegaConf.to_container(config, resolve=True)
     model = {key: value for key, value in plain["model"].items() if key not in ("weights", "fresh")}
-    asked = [model, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
+    places = ("root", "cache_dir", "palette", "layout")
+    read = {key: value for key, value in plain["dataset"].items() if key not in places}
+    asked = [model, read, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
     text = json.dumps(asked, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

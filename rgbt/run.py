@@ -25,7 +25,7 @@ def main(config: DictConfig) -> int:
     if config.pretrained is not None and not reads_pretrained(config):
         tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")
     if not is_finished(config):
-        finish_earlier(config, train, rehearse)
+        finish_earlier(config, train, rehearse, task_overrides())
     train(config, task_overrides())
     return 0
 

@@ -55,7 +55,8 @@ class Domain:
         if not predicts and (self.threshold or self.teacher_view is not None):
             raise InputError(
                 f"domains: threshold and teacher_view are for labels=experiment:..., with labels="
-                f"{self.labels} they have no effect; leave them away."
+                f"{self.labels} they have no effect; set teacher_view=null and threshold=0 of that "
+                "domain."
             )
         if self.confidence and self.labels in (GIVEN, NONE):
             raise InputError(

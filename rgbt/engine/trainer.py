@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -170,17 +170,16 @@ class Trainer:
         logged = self._backward(phase)
         for phases in others:
             _add(logged, self._backward(next(phases)))
-        for name in phase.optimizers:
-            optimizer = self.optimizers[name]
-            norm = self.fabric.clip_gradients(
-                self.model,
-                optimizer,
-                max_norm=self.settings.clip_norm or math.inf,
-                error_if_nonfinite=False,
-            )
-            assert norm is not None, "clipping by norm returns the norm"
-            key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{name}"
-            logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
+        stepped = [self.optimizers[name] for name in phase.optimizers]
+        # Once for all of them: what two optimisers share is clipped as one gradient.
+        norm = nn.utils.clip_grad_norm_(
+            _parameters(stepped),
+            self.settings.clip_norm or math.inf,
+        )
+        names = "+".join(phase.optimizers)
+        key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
+        logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
+        for optimizer in stepped:
             optimizer.step()
         return logged
 
@@ -201,6 +200,12 @@ class Trainer:
                 group["lr"] = group["base_lr"] * factor
                 rates[f"lr/{name}_{index}"] = group["lr"]
         return rates
+
+
+def _parameters(optimizers: Sequence[torch.optim.Optimizer]) -> list[nn.Parameter]:
+    """Parameters of all optimisers, each once."""
+    groups = (group["params"] for optimizer in optimizers for group in optimizer.param_groups)
+    return list({id(each): each for group in groups for each in group}.values())
 
 
 def torch_generator_of(

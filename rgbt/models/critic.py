@@ -37,6 +37,7 @@ class Critic(nn.Module):
                 "critic.align_corners=true has no effect with critic.upsample=false; "
                 "set it to false."
             )
+        self.in_channels = in_channels
         self.upsample = upsample
         self.align_corners = align_corners
         widths = [base_width * factor for factor in (1, 2, 4, 8)]

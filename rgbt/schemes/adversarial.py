@@ -115,6 +115,12 @@ class Adversarial:
                 "of the target's labels, which are read without; set "
                 "domains.target.confidence=true, or scheme.weighed_by_confidence=false."
             )
+        classes = getattr(model, "num_classes", None)
+        if classes is not None and getattr(critic, "in_channels", classes) != classes:
+            raise InputError(
+                f"scheme.critic.in_channels={critic.in_channels}, but the critic sees a map for "
+                f"each of the network's {classes} classes; leave it at ${{dataset.num_classes}}."
+            )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
         self.optimizers = self.passes.optimizers
         self.domains = domains

@@ -19,8 +19,8 @@ Gradients = Literal["apart", "kept", "together"]
     together   both with the sum of both, one after the other (thesis' code, adversarial stage),
                so that shared parameters are stepped twice
 
-Where gradients are clipped (published: they are not), each optimiser clips what it steps with, so
-that with "kept" and "together" the second finds the shared ones clipped by the first.
+Where gradients are clipped (published: they are not), with "kept" the target's is added to what the
+source's was clipped to.
 """
 
 
