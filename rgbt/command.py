@@ -57,7 +57,8 @@ def command(
             # argparse takes overrides on one side of an option only, and people write -m anywhere.
             words = readable_paths(sys.argv[1:])
             if not any(word.startswith("hydra/sweeper=") for word in words):
-                words.append(f"hydra/sweeper={sweeper}")
+                places = [n for n, word in enumerate(words) if "=" in word and word[0] != "-"]
+                words.insert(places[0] if places else len(words), f"hydra/sweeper={sweeper}")
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:

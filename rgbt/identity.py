@@ -139,7 +139,11 @@ def earlier_run(key: str, value: str | None) -> tuple[str, str] | None:
         )
     known = [path.stem for path in (conf_dir() / "experiment").glob("*.yaml")]
     if name not in known:
-        raise InputError(f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}.")
+        raise InputError(
+            f"{key}={value}: there is no experiment '{name}' in {conf_dir() / 'experiment'}; "
+            f"{nearest(name, known)}. One of your own lies there too, or its run is named by its "
+            f"folder (runs/<key>/{checkpoint})."
+        )
     return name, checkpoint
 
 
