@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,6 +23,7 @@ from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.schemes.adversarial import Adversarial
 from tests.commands import Call, assert_one_sentence
+from tests.conftest import write_png
 from tests.test_run import ADAPTATION, EXPERIMENTS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -226,6 +228,83 @@ def test_thermal_images_are_predicted_by_the_targets_head(
     # The run's own tables hold the same score.
     values = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])["values"]
     assert values["thermal/mIoU"] == pytest.approx(mean_of_twelve(thermal.sum((0, 1))))
+
+
+def test_the_targets_counts_are_stored(run: Runs, evaluated: Callable[..., Counts]) -> None:
+    """Its scores in every line follow from them."""
+    folder = run("multi_head_thermal")
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    for split in ("val", "test"):
+        stored = Counts.load(folder / f"counts_{split}_thermal.npz")
+        again = evaluated(folder, "modality=thermal", f"split={split}")
+        assert (stored.split, stored.names) == (split, again.names)
+        assert np.array_equal(stored.counts, again.counts)
+        (values,) = (line["values"] for line in lines if line["kind"] == split)
+        by_image = stored.counts.sum(1)
+        assert values["thermal/mIoU"] == pytest.approx(mean_of_twelve(by_image.sum(0)))
+        assert values["thermal/day/mIoU"] == pytest.approx(
+            mean_of_twelve(by_image[[not dark for dark in stored.night]].sum(0))
+        )
+    for name in ("multi_head_night", "sh_source"):  # seen as the source is
+        assert not list(run(name).glob("counts_*_*.npz"))
+
+
+def heads_line(said: str) -> list[str]:
+    return [" ".join(line.split()) for line in said.splitlines() if line.split()[:1] == ["heads"]]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "own"),
+    [
+        ("multi_head_night", "source by day, target at night"),
+        ("multi_head_thermal", "target for thermal, source otherwise"),
+        ("sh_source", None),
+    ],
+)
+def test_which_head_predicted_what_is_said(
+    run: Runs, call: Call, tmp_path: Path, experiment: str, own: str | None
+) -> None:
+    from rgbt import evaluate
+    from rgbt.command import plain_command
+
+    folder = run(experiment)
+    expected = [] if own is None else [f"heads {own}"]
+    _, said, _ = run.told(experiment)
+    assert heads_line(said) == expected
+    asked = {"as trained": expected}
+    if own is not None:
+        asked |= {head: [f"heads {head} for all images"] for head in ("source", "target")}
+    for head, line in asked.items():
+        words = (f"run={folder}", f"head={head}", f"out={tmp_path / 'x.npz'}")
+        code, said, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
+        assert code == 0, err
+        assert heads_line(said) == line
+
+
+def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
+    run: Runs, call: Call, tmp_path: Path
+) -> None:
+    from rgbt import predict
+    from rgbt.command import plain_command
+
+    folder = run("multi_head_night")
+    broken = without_head(folder, "target", tmp_path / "broken")
+    dataset = build(compose(run.words("multi_head_night")).dataset)
+    sample = dataset.read(dataset.names("test_day")[0])
+    write_png(tmp_path / "mine" / "street.png", np.dstack([sample.rgb, sample.thermal]))
+    entry, out = plain_command(predict.OWN, predict.main), tmp_path / "out"
+    words = (f"run={broken}", f"input={tmp_path / 'mine'}", f"out={out}")
+    code, _, err = call(entry, *words)
+    assert code == 2
+    assert_one_sentence(err, "so that no head can be chosen; say head=source or head=target")
+
+    found = {}
+    for head in ("source", "target"):
+        code, _, err = call(entry, *words, f"head={head}")
+        assert code == 0, err
+        found[head] = cv2.imread(str(out / "street.png"), cv2.IMREAD_UNCHANGED)
+    assert not found["target"].any()
+    assert found["source"].any()
 
 
 @pytest.mark.slow

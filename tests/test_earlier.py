@@ -76,10 +76,12 @@ class Train:
 
     made: list[str] = field(default_factory=list)
     refused: list[BaseException] = field(default_factory=list)
+    words: dict[str, list[str]] = field(default_factory=dict)
 
     def __call__(self, config: DictConfig, overrides: Sequence[str]) -> None:
-        assert list(overrides) == [f"+experiment={config.name}"]
+        assert overrides[0] == f"+experiment={config.name}"
         assert TAGS not in os.environ
+        self.words[config.name] = list(overrides[1:])
         if self.refused:
             raise self.refused.pop(0)
         self.made.append(config.name)
@@ -118,7 +120,8 @@ def bring(labels: list, rehearsed: list[str], tmp_path: Path) -> Any:
     def run(name: str, train: Train, *overrides: str) -> list[str]:
         config = composed(name, *overrides)
         config.runs_dir = str(tmp_path)
-        finish_earlier(config, train, lambda each: rehearsed.append(each.name))
+        typed = [f"+experiment={name}", *overrides]
+        finish_earlier(config, train, lambda each: rehearsed.append(each.name), typed)
         return train.made
 
     return run
@@ -232,7 +235,7 @@ REFUSED = {
     ),
     "unknown": (
         "model.weights=experiment:sh_sourc/last.pt",
-        "there is no experiment 'sh_sourc'; did you mean 'sh_source'",
+        "there is no experiment 'sh_sourc'.*did you mean 'sh_source'",
     ),
     "unknown teacher": (
         "domains.target.labels=experiment:teacher/best.pt",
@@ -340,7 +343,7 @@ def test_a_rehearsal_that_fails_trains_nothing(labels: list, tmp_path: Path) -> 
 
     train = Train()
     with pytest.raises(InputError, match="sh_adversarial does not fit"):
-        finish_earlier(composed("sh_adversarial", f"runs_dir={tmp_path}"), train, refuses)
+        finish_earlier(composed("sh_adversarial", f"runs_dir={tmp_path}"), train, refuses, [])
     assert train.made == []
 
 
@@ -348,6 +351,207 @@ def test_an_error_of_an_earlier_run_is_told_and_ends_it(bring: Any) -> None:
     for error in (RunError("step 3: loss is nan."), InputError("no such file."), KeyError("x")):
         with pytest.raises(type(error)):
             bring("sh_adversarial", Train(refused=[error]))
+
+
+def test_a_mistake_names_the_run_that_it_is_of_and_who_needs_that(bring: Any) -> None:
+    with pytest.raises(InputError) as raised:
+        bring("sh_adversarial", Train(refused=[InputError("no such file.")]))
+    assert str(raised.value) == (
+        "sh_source, which sh_adversarial needs (model.weights): no such file."
+    )
+    with pytest.raises(InputError) as raised:  # the teacher of the stage before
+        bring("multi_head_night", Train(refused=[InputError("no such file.")]))
+    assert str(raised.value) == (
+        "multi_head_night_stage1, which multi_head_night needs (model.weights): thermal_teacher, "
+        "which multi_head_night_stage1 needs (domains.target.labels): no such file."
+    )
+
+
+def test_a_mistake_that_a_later_rehearsal_finds_names_its_run(tmp_path: Path, labels: list) -> None:
+    def refuses(config: DictConfig) -> None:
+        if config.name == "multi_head_night_stage1":
+            raise InputError("does not fit.")
+
+    config = composed("multi_head_night", f"runs_dir={tmp_path}")
+    sentence = "^multi_head_night_stage1, which multi_head_night needs .*: does not fit.$"
+    with pytest.raises(InputError, match=sentence):
+        finish_earlier(config, Train(), refuses, [])
+
+
+COMMON = (
+    *("scale=demo", "scale.lr=0.5", "dataset=synth_freiburg", "++dataset.num_test=4"),
+    *("data.on_error=skip", "trainer.max_steps=3", "trainer.threads=1", "metric=ring9"),
+    "metric.absent=exclude",
+)
+OWN = (
+    *("optimizer.lr=0.1", "scheme.weight=0.5", "seed=3", "loss=cross_entropy"),
+    *("trainer.clip_norm=1.0", "transform.test_short_edge=96", "masker=none"),
+    *("model.fresh=[]", "tracking=none"),
+)
+
+
+def test_an_earlier_run_is_named_after_what_was_typed_for_it_too(bring: Any) -> None:
+    """And after nothing that does not change it: its name is that of a run of its own."""
+    train, model = Train(), ["model.base_width=7", "model=multi_head_demo"]
+    bring("multi_head_night", train, *COMMON, *OWN, *model)
+    unsaid = ["tracking=none"]  # which no name says
+    assert train.words == {
+        "multi_head_night_stage1": [*COMMON, *unsaid, *model],
+        "thermal_teacher": [*COMMON, *unsaid],
+    }
+
+
+def test_the_network_of_a_run_that_starts_from_another_is_named_by_it_alone(bring: Any) -> None:
+    train = Train()
+    weights = "model.weights=experiment:sh_source/best.pt"
+    bring("sh_max_squares", train, weights, "model.fresh=[auxiliary]", "optimizer.momentum=0.5")
+    assert train.words == {"sh_source": []}
+
+
+def test_a_group_of_the_same_run_at_other_seeds(bring: Any, tmp_path: Path) -> None:
+    from rgbt.naming import describe
+
+    for seed in (0, 1):
+        train = Train()
+        bring("sh_adversarial", train, f"seed={seed}", "trainer.max_steps=3")
+        config = composed("sh_source", f"seed={seed}", "trainer.max_steps=3")
+        found = describe(config, ["+experiment=sh_source", *train.words["sh_source"]])
+        assert found.name == f"sh_source max_steps=3 seed={seed}"
+        assert found.tags["rgbt.group"] == "sh_source max_steps=3"
+
+
+def finished(experiment: str, tmp_path: Path) -> DictConfig:
+    """A configuration whose earlier runs have their results."""
+    config = composed(experiment, f"runs_dir={tmp_path}")
+    for each in earlier_runs(config):
+        finish(each.config)
+    return config
+
+
+@pytest.mark.parametrize("state", ["missing", "begun", "whole"])
+def test_labels_that_are_not_whole_are_rehearsed_for(
+    tmp_path: Path, labels: list, state: str
+) -> None:
+    """Predicting takes long: what would go wrong after it is found before."""
+    config, rehearsed = finished("multi_head_night_stage1", tmp_path), []
+    folder = labels_folder(config, "target")
+    if state != "missing":
+        folder.mkdir(parents=True)
+        name = {"begun": "pseudo_labels.begun.json", "whole": "pseudo_labels.json"}[state]
+        (folder / name).write_text("{}")
+    finish_earlier(config, Train(), rehearsed.append, [])
+    assert len(rehearsed) == (0 if state == "whole" else 1)
+
+
+def test_whole_labels_are_not_predicted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rgbt import stored
+
+    config = finished("multi_head_night_stage1", tmp_path)
+    folder = labels_folder(config, "target")
+    folder.mkdir(parents=True)
+
+    def opened(*given: Any) -> None:
+        raise KeyError(given[0])
+
+    monkeypatch.setattr(stored, "open_run", opened)
+    with pytest.raises(KeyError, match="thermal_teacher|" + folder.parent.parent.name):
+        finish_earlier(config, Train(), lambda config: None, [])
+    (folder / "pseudo_labels.json").write_text("{}")
+    finish_earlier(config, Train(), lambda config: None, [])
+
+
+def test_the_folder_of_an_earlier_run_is_worked_out_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its key reads whole files of weights, and it is asked for in every look at the run."""
+    (found,) = earlier_runs(composed("sh_adversarial", f"runs_dir={tmp_path}"))
+    asked: list[str] = []
+    monkeypatch.setattr(earlier, "run_key", lambda config: asked.append(config.name) or "key")
+    assert found.folder == found.folder == tmp_path / "key"
+    assert not found.is_finished
+    assert asked == ["sh_source"]
+
+
+# ---- folders of labels ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        ([], "train_night_thermal_best"),
+        (["domains.target.labels=experiment:thermal_teacher/last.pt"], "train_night_thermal_last"),
+        (["domains.target.threshold=0.9"], "train_night_thermal_best_0.9"),
+        (["domains.target.threshold=0.95"], "train_night_thermal_best_0.95"),
+        (["domains.target.teacher_view=null"], "train_night_default_best"),
+        (["domains.target.split=train_day"], "train_day_thermal_best"),
+    ],
+)
+def test_other_labels_lie_in_another_folder(typed: list[str], name: str) -> None:
+    config = composed("multi_head_night_stage1", *typed)
+    (found,) = earlier_runs(config)
+    assert labels_folder(config, "target") == found.folder / "pseudo_labels" / name
+
+
+# ---- the file that the first of the stages starts from ---------------------------------------
+
+
+def test_pretrained_weights_reach_the_first_stage(tmp_path: Path) -> None:
+    """And count by what is in them in its key, and in the keys of all that stand on it."""
+
+    def keys(file: Path | None) -> list[str]:
+        typed = [] if file is None else [f"pretrained={file}"]
+        config = composed("multi_head_night", *typed)
+        (stage,) = earlier_runs(config)
+        (teacher,) = earlier_runs(stage.config)
+        assert stage.config.model.weights == (None if file is None else str(file))
+        assert teacher.config.model.weights is None
+        return [run_key(each) for each in (config, stage.config, teacher.config)]
+
+    files = [tmp_path / name for name in ("one.pth", "same.pth", "other.pth")]
+    for file, content in zip(files, (b"abc", b"abc", b"abd"), strict=True):
+        file.write_bytes(content)
+    none, one, same, other = (keys(file) for file in (None, *files))
+    assert one == same
+    assert len({none[0], one[0], other[0]}) == len({none[1], one[1], other[1]}) == 3
+    assert none[2] == one[2] == other[2]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "typed", "reads"),
+    [
+        ("sh_source", [], True),
+        ("sh_adversarial", [], True),
+        ("multi_head_modified_night_init", [], True),
+        ("sh_source", ["model.weights=/some/file.pth"], False),
+        ("sh_adversarial", ["model.weights=null"], False),
+        ("heatnet", [], False),
+        ("heatnet_rgb_only", [], False),
+    ],
+)
+def test_who_reads_pretrained_weights(experiment: str, typed: list[str], reads: bool) -> None:
+    config = composed(experiment, "pretrained=/some/imagenet.pth", *typed)
+    assert earlier.reads_pretrained(config) == reads
+
+
+@pytest.mark.parametrize("experiment", ["sh_adversarial", "heatnet"])
+def test_a_file_that_nothing_reads_is_told(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str
+) -> None:
+    from rgbt import run, training
+
+    done: list[str] = []
+    monkeypatch.setattr(training, "is_finished", lambda config: True)
+    monkeypatch.setattr(training, "train", lambda config, words: done.append(config.name))
+    file = tmp_path / "imagenet.pth"
+    file.write_bytes(b"abc")
+    for typed in ([f"pretrained={file}"], []):
+        code, _, err = call(run.main, f"+experiment={experiment}", *typed)
+        assert code == 0, err
+        told = f"rgbt: pretrained={file} is not read: heatnet starts otherwise.\n"
+        assert err == (told if experiment == "heatnet" and typed else "")
+    assert done == [experiment] * 2
 
 
 def test_tags_are_those_of_the_run_that_was_asked_for(

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from rgbt import pseudo
 from rgbt.checks import InputError, RunError
 from rgbt.config import check, compose
+from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
@@ -166,6 +167,84 @@ def test_threshold_zero_keeps_all_and_a_threshold_itself_is_kept(
     for wrong in (-0.1, 1.1):
         with pytest.raises(InputError, match=r"threshold must lie in \[0, 1\]"):
             written(session, tmp_path / "never", threshold=wrong)
+
+
+class Half(nn.Module):
+    """Two of nine classes with one half each, to the last digit."""
+
+    num_classes = 9
+    views = ("rgbt", "thermal")
+    predicts = "scores"
+
+    def forward(self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = ()) -> Output:
+        del thermal, views
+        scores = torch.full((len(rgb), 9, *rgb.shape[2:]), -1e4)
+        scores[:, 3] = scores[:, 5] = 0
+        return Output(scores, {})
+
+
+def test_a_confidence_of_the_threshold_is_kept_and_rounded(
+    session: Session, tmp_path: Path
+) -> None:
+    session = replace(session, model=Half())
+    for threshold, kept in ((0.5, 3), (0.5000001, 255)):
+        out = tmp_path / str(threshold)
+        written(session, out, threshold=threshold, view="rgbt")
+        assert np.unique(image(out / "labels" / f"{NAMES[0]}.png")).tolist() == [kept]
+        # Half of 65535 is 32767.5, rounded to the even neighbour and not down.
+        assert np.unique(image(out / "confidence" / f"{NAMES[0]}.png")).tolist() == [32768]
+
+
+class Heads(nn.Module):
+    """The head "day" predicts class 1 everywhere, "dark" class 2."""
+
+    num_classes = 9
+    views = ("rgbt", "thermal")
+    predicts = "scores"
+    heads = ("day", "dark")
+
+    def forward(
+        self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = (), head: str = ""
+    ) -> Output:
+        del thermal, views
+        scores = torch.zeros(len(rgb), 9, *rgb.shape[2:])
+        scores[:, {"day": 1, "dark": 2}[head]] = 5
+        return Output(scores, {})
+
+
+def two_heads(tested_head: str) -> Domains:
+    given = {"split": "train", "view": "rgbt", "labels": "given"}
+    source, target = Domain(**given, head="day"), Domain(**given, head="dark")
+    return Domains(source=source, target=target, target_is="night", tested_head=tested_head)
+
+
+@pytest.mark.parametrize(
+    ("tested", "asked", "said", "by_day", "at_night"),
+    [
+        ("own", None, "own", 1, 2),
+        ("source", None, "source", 1, 1),
+        ("source", "own", "own", 1, 2),
+        ("own", "source", "source", 1, 1),
+        ("own", "target", "target", 2, 2),
+    ],
+)
+def test_the_head_that_is_asked_predicts_and_is_written_down(  # noqa: PLR0913 - a case and places
+    session: Session,
+    tmp_path: Path,
+    tested: str,
+    asked: str | None,
+    said: str,
+    by_day: int,
+    at_night: int,
+) -> None:
+    session = replace(session, model=Heads(), domains=two_heads(tested))
+    found = written(session, tmp_path / "out", view="rgbt", threshold=0, head=asked)
+    assert found.manifest["head"] == said
+    for name, expected in zip(NAMES, (by_day, at_night, by_day), strict=True):
+        assert np.unique(image(tmp_path / "out" / "labels" / f"{name}.png")).tolist() == [expected]
+    for other in {"own", "source", "target"} - {said}:
+        with pytest.raises(InputError, match=rf"another head \({said}, now {other}\)"):
+            written(session, tmp_path / "out", view="rgbt", threshold=0, head=other)
 
 
 def test_the_view_and_the_mode_of_the_network(session: Session, tmp_path: Path) -> None:

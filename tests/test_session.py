@@ -1,15 +1,18 @@
-"""Tables from counts, with numbers that can be followed by hand."""
+"""Tables from counts, with numbers that can be followed by hand; which view and head predict."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from rgbt.checks import InputError
+from rgbt.data.domains import Domain, Domains
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.session import result_tables
+from rgbt.session import heads_of, result_tables, view_of
 
 
 def test_tables_pool_the_image_and_keep_regions_apart() -> None:
@@ -52,3 +55,56 @@ def test_tables_pool_the_image_and_keep_regions_apart() -> None:
     assert road.classes == replace(
         tables.classes, unscored=("car",), subset_mious=road.classes.subset_mious
     )
+
+
+class Network:
+    views = ("rgb", "thermal")
+
+
+def asked_session(source: dict[str, object], **changes: object) -> SimpleNamespace:
+    """What `view_of` and `heads_of` ask of a session."""
+    target = {"split": "x", "view": "rgb", "head": "dark", "labels": "none"}
+    given = {
+        "source": Domain(**{"split": "x", "view": None, "head": None, "labels": "given", **source}),
+        **{"target": None, "target_is": None, "tested_head": "own", **changes},
+    }
+    if given["target_is"] is not None:
+        given["target"] = Domain(**target)
+    return SimpleNamespace(model=Network(), dataset=Nights(), domains=Domains(**given))
+
+
+class Nights:
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
+        if any(name not in ("day", "night") for name in names):
+            raise InputError("no such frame")
+        return tuple(name == "night" for name in names)
+
+
+@pytest.mark.parametrize(("view", "seen"), [("thermal", "thermal"), ("rgb", "rgb"), (None, "rgb")])
+def test_what_is_seen_is_what_the_source_is_seen_as(view: str | None, seen: str) -> None:
+    """The network's first view only where the domain does not say."""
+    session = asked_session({"view": view})
+    assert view_of(session) == view_of(session, "default") == seen
+    assert view_of(session, "thermal") == "thermal"
+    with pytest.raises(InputError, match="modality: 'rgbt' is not a choice"):
+        view_of(session, "rgbt")
+
+
+def test_heads_of_known_images() -> None:
+    session = asked_session({"head": "day", "view": "rgb"}, target_is="night")
+    assert heads_of(session, "rgb")(("day", "night", "day")) == ("day", "dark", "day")
+    assert heads_of(session, "rgb", "target")(("day", "night")) == ("dark", "dark")
+    one = asked_session({"head": "day", "view": "rgb"}, target_is="night", tested_head="source")
+    assert heads_of(one, "rgb")(("day", "night")) == ("day", "day")
+    assert heads_of(one, "rgb", "own")(("day", "night")) == ("day", "dark")
+
+
+def test_heads_of_images_that_are_in_no_list() -> None:
+    """Files of one's own: whether they are of the night is not known, nor asked in vain."""
+    session = asked_session({"head": "day", "view": "rgb"}, target_is="night")
+    for asked, head in (("source", "day"), ("target", "dark")):
+        assert heads_of(session, "rgb", asked)(("mine", "night")) == (head, head)
+    with pytest.raises(InputError, match=r"night, so that no head can be chosen; say head=source"):
+        heads_of(session, "rgb")(("mine",))
+    alone = asked_session({"view": "rgb"})
+    assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)

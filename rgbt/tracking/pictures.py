@@ -6,6 +6,7 @@ something is drawn and never opens a window.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ Image = NDArray[np.uint8]
 IGNORED_COLOUR = (128, 128, 128)
 """Pixels without a label are grey: black is a class in most palettes."""
 
+LETTER_INCHES = 0.07
+"""Width of a letter of eight points, on average."""
 
 HALF_SPAN = 15.0
 """Percent points from the mean region to either end of the heat map's colours, at least."""
@@ -155,11 +158,21 @@ def draw_columns(
     for row, (name, pictures) in zip(axes, rows, strict=True):
         for axis, picture in zip(row, pictures, strict=True):
             _image(axis, picture)
-        row[0].set_ylabel(name, fontsize=8)
+        row[0].set_ylabel(_broken(name, int(cell_h / LETTER_INCHES)), fontsize=8)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=10)
     _class_legend(figure, legend)
     figure.savefig(path)
+
+
+def _broken(name: str, letters: int) -> str:
+    """A name in lines of at most `letters`, broken after "_" where it can be."""
+    lines = [""]
+    for word in re.findall(r"[^_]*_|[^_]+", name):
+        if lines[-1] and len(lines[-1] + word) > letters:
+            lines.append("")
+        lines[-1] += word
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)

@@ -126,3 +126,34 @@ def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> Non
     for view in ("rgb", "thermal"):
         assert found.head_of(view, night, "source") == "day"
         assert found.head_of(view, night, "target") == "dark"
+
+
+@pytest.mark.parametrize(
+    ("found", "own"),
+    [
+        (two("view"), "dark for thermal, day otherwise"),
+        (two("night"), "day by day, dark at night"),
+        (two("night", tested_head="source"), "day by day, dark at night"),
+    ],
+    ids=["view", "night", "tested with one"],
+)
+def test_which_head_predicts_what_in_words(found: Domains, own: str) -> None:
+    """As asked, not as configured: the caller knows whether another one was asked for."""
+    assert found.told("own") == own
+    assert found.told("source") == "day for all images"
+    assert found.told("target") == "dark for all images"
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        domains(),
+        domains(source=domain(head="a")),
+        domains(target=domain()),
+        domains(source=domain(head="a"), target=domain(head="a")),
+    ],
+    ids=["none", "one", "two domains", "one of two domains"],
+)
+def test_one_head_is_not_told_of(found: Domains) -> None:
+    for asked in ("own", "source", "target"):
+        assert found.told(asked) == ""

@@ -45,6 +45,9 @@ def test_other_networks_and_data_sets_are_refused() -> None:
         label_map.check(9, TARGETS, "streets")
     with pytest.raises(InputError, match=r"leads to the classes road, car, but streets has sky"):
         label_map.check(2, ("sky",), "streets")
+    # The same names under other ids are other classes.
+    with pytest.raises(InputError, match=r"classes road, car, but streets has car, road"):
+        label_map.check(2, TARGETS[::-1], "streets")
 
 
 # Written down from the published lists a second time, class by class of the source.

@@ -151,6 +151,16 @@ def test_steps_halve_the_rate_every_sixty_of_two_hundred_epochs() -> None:
     assert Steps(factor=0.5, every=1.0)(99, 100, 1) == 1.0
 
 
+@pytest.mark.parametrize("every", [0.1, 0.2, 0.3, 0.6, 0.7, 0.14, 0.29, 0.57])
+@pytest.mark.parametrize("steps", [10, 100, 700, 608400])
+def test_shares_are_counted_as_they_are_written(every: float, steps: int) -> None:
+    """In hundredths: 0.3 of 10 steps are 3, where floats say 3 - 4e-16 of three times 0.1."""
+    schedule, hundredths = Steps(factor=0.5, every=every), round(100 * every)
+    near = {n * hundredths * steps // 100 + off for n in range(12) for off in (-1, 0, 1)}
+    for step in sorted(each for each in near if 0 <= each < steps):
+        assert schedule(step, steps, 1) == 0.5 ** (100 * step // (hundredths * steps))
+
+
 @pytest.mark.parametrize(
     ("make", "values", "key"),
     [

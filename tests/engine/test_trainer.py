@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning_fabric import Fabric
-from torch import nn
+from torch import Tensor, nn
 
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights, save_checkpoint
@@ -442,3 +442,89 @@ def test_a_line_has_the_last_values_of_steps_that_alternate(tmp_path: Path) -> N
     trainer.fit(batches(0), State(seed=0))
     assert [step for step, _ in log] == [2, 4]
     assert all({"loss/even", "loss/odd"} <= set(values) for _, values in log)
+
+
+def test_every_accumulated_batch_has_draws_of_its_own(tmp_path: Path) -> None:
+    """Those of its number in the run: of its own, whatever step they are accumulated to."""
+    trainer, _ = make(tmp_path, max_steps=2, accumulate=3)
+    seen: list[Tensor] = []
+
+    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        seen.append(torch.rand(4, generator=generator_of("noise")))
+        yield Phase(("main",), {"fit": trainer.model(batch.rgb.mean((2, 3))).mean()})
+
+    trainer.scheme.phases = phases
+    trainer.fit(batches(0), State(seed=7))
+    expected = [torch.rand(4, generator=torch_generator(7, "noise", n)) for n in range(6)]
+    assert len(seen) == 6
+    assert all(torch.equal(a, b) for a, b in zip(seen, expected, strict=True))
+
+
+class Heads(nn.Module):
+    """Parameters with the gradients 3 (shared), 4 and 4, whatever is seen."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shared, self.one, self.other = (nn.Parameter(torch.zeros(1)) for _ in range(3))
+
+    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        del batch, generator_of
+        yield Phase(self.named, {"fit": (3 * self.shared + 4 * self.one + 4 * self.other).sum()})
+
+
+def make_heads(folder: Path, named: tuple[str, ...], **changes: object) -> tuple[Heads, list]:
+    trainer, log = make(folder, max_steps=1, **changes)
+    model = Heads()
+    model.named = named
+    parts = {"a": [model.shared, model.one], "b": [model.shared, model.other]}
+    if len(named) == 1:
+        parts = {"main": list(model.parameters())}
+    trainer.model, trainer.scheme = model, model
+    groups = {name: [{"params": part, "base_lr": 1.0}] for name, part in parts.items()}
+    trainer.optimizers = {name: torch.optim.SGD(each, lr=1.0) for name, each in groups.items()}
+    trainer.fit(batches(0), State(seed=0))
+    return model, log
+
+
+@pytest.mark.parametrize(("limit", "factor"), [(1.0, 1 / 41**0.5), (None, 1.0), (7.0, 1.0)])
+def test_what_two_optimisers_step_is_clipped_once(
+    tmp_path: Path, limit: float | None, factor: float
+) -> None:
+    """The norm of 3, 4 and 4 is the root of 41; the shared parameter is stepped twice with it."""
+    model, log = make_heads(tmp_path, ("a", "b"), clip_norm=limit)
+    assert model.shared.item() == pytest.approx(-2 * 3 * factor, rel=1e-5)
+    assert model.one.item() == pytest.approx(-4 * factor, rel=1e-5)
+    assert model.other.item() == pytest.approx(-4 * factor, rel=1e-5)
+    norms = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
+    assert norms == {"grad_norm/a+b": pytest.approx(41**0.5)}
+
+
+def test_what_one_optimiser_of_two_steps_is_its_own_norm(tmp_path: Path) -> None:
+    trainer, log = make(tmp_path, max_steps=1, clip_norm=1.0)
+    model = Heads()
+
+    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        del batch, generator_of
+        yield Phase(("a",), {"fit": (3 * model.shared + 4 * model.one + 4 * model.other).sum()})
+        yield Phase(("b",), {"fit": (12 * model.shared + 5 * model.other).sum()})
+
+    model.phases = phases
+    trainer.model, trainer.scheme = model, model
+    parts = {"a": [model.shared, model.one], "b": [model.shared, model.other]}
+    groups = {name: [{"params": part, "base_lr": 1.0}] for name, part in parts.items()}
+    trainer.optimizers = {name: torch.optim.SGD(each, lr=1.0) for name, each in groups.items()}
+    trainer.fit(batches(0), State(seed=0))
+    # 3 and 4 of 5; then 12 and 5 of 13, what "a" left of the other head being cleared.
+    assert model.shared.item() == pytest.approx(-3 / 5 - 12 / 13, rel=1e-5)
+    assert model.one.item() == pytest.approx(-4 / 5, rel=1e-5)
+    assert model.other.item() == pytest.approx(-5 / 13, rel=1e-5)
+    assert log[0][1]["grad_norm/a"] == pytest.approx(5)
+    assert log[0][1]["grad_norm/b"] == pytest.approx(13)
+
+
+def test_the_only_optimiser_clips_all_it_has(tmp_path: Path) -> None:
+    model, log = make_heads(tmp_path, ("main",), clip_norm=1.0)
+    found = [each.item() for each in (model.shared, model.one, model.other)]
+    assert found == pytest.approx([-each / 41**0.5 for each in (3, 4, 4)], rel=1e-5)
+    norms = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
+    assert norms == {"grad_norm": pytest.approx(41**0.5)}

@@ -101,3 +101,9 @@ def test_raises() -> None:
         judged(torch.zeros(1, 3, 2, 2), "logit")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="logits: expected shape"):
         judged(torch.zeros(3, 2, 2), "logits")
+
+
+def test_one_class_is_judged_without_dividing_by_nothing() -> None:
+    logits = torch.randn(2, 1, 3, 5, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(judged(logits, "self_information"), torch.zeros(2, 1, 3, 5))
+    assert torch.equal(judged(logits, "probabilities"), torch.ones(2, 1, 3, 5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -49,6 +50,19 @@ def test_both_heads_get_a_gradient(make_batch: Any) -> None:
 
 def test_it_says_what_it_reads() -> None:
     assert with_auxiliary().reads == "scores"
+
+
+def test_it_reads_confidence_where_its_loss_does(make_batch: Any) -> None:
+    assert with_auxiliary().reads_confidence is True
+    assert WithAuxiliary(loss=lambda *_: {}, weight=0.1).reads_confidence is False
+    assert build(compose("loss=cross_entropy_auxiliary").loss).reads_confidence is True
+    # And weighs by it, in both: a half of log 2.
+    label = torch.zeros(1, 1, 1, dtype=torch.long)
+    batch = replace(make_batch(label), confidence=torch.full((1, 1, 1), 0.5))
+    scores = torch.zeros(1, 2, 1, 1)
+    parts = with_auxiliary()(Output(scores, {"aux_logits": scores}), batch, NOTHING)
+    assert parts["cross_entropy"].item() == pytest.approx(math.log(2) / 2)
+    assert parts["cross_entropy_aux"].item() == pytest.approx(0.1 * math.log(2) / 2)
 
 
 def test_raises(make_batch: Any) -> None:

@@ -153,3 +153,12 @@ def test_values_out_of_range_are_refused(changes: dict[str, Any], key: str) -> N
 def test_a_negative_weight_of_entropy_is_refused() -> None:
     with pytest.raises(InputError, match=r"entropy.weight must lie in"):
         Entropy(weight=-0.1)
+
+
+def test_of_one_class_there_is_nothing_to_be_unsure_of() -> None:
+    p = torch.ones(2, 1, 3, 5, requires_grad=True)
+    assert entropy(p).item() == 0
+    assert squares(p).item() == squares(p, "entries").item() == -0.5
+    entropy(p).backward()
+    assert p.grad is not None
+    assert p.grad.isfinite().all()

@@ -17,6 +17,7 @@ from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.losses.adversarial import cross_entropy as verdict_entropy
 from rgbt.losses.adversarial import judged, least_squares
+from rgbt.models.critic import Critic
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.types import TwoDomains
 from tests.schemes.linear import (
@@ -432,6 +433,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "which are read without; set domains.target.confidence=true",
     ),
     "gradients of one head": ({"gradients": "kept"}, "scheme.gradients=kept is about"),
+    "critic of more classes": (
+        {"critic": Critic(in_channels=4, base_width=4, upsample=False, align_corners=False)},
+        "scheme.critic.in_channels=4, but the critic sees a map for each of the network's 3 ",
+    ),
+    "critic of fewer classes": ({"critic": nn.Conv2d(2, 1, 1)}, "scheme.critic.in_channels=2"),
 }
 
 
@@ -439,6 +445,31 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         scheme_of(NETWORK, **changes)
+
+
+def test_a_critic_of_the_networks_classes_is_taken() -> None:
+    judge = Critic(in_channels=K, base_width=4, upsample=False, align_corners=False)
+    assert scheme_of(NETWORK, critic=judge).others["critic"] is judge
+
+
+def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
+    asked: list[str] = []
+
+    def noting(purpose: str) -> torch.Generator:
+        asked.append(purpose)
+        return generator_of(purpose)
+
+    settings = {**HEATNET, "alternates": False}
+    scheme = scheme_of(network(True), True, **settings)
+    list(scheme.phases(next(pairs(confidence=True)).to("cpu"), noting))
+    assert asked == ["source network", "source loss", "target network", "target loss"]
+    asked.clear()
+    list(scheme_of(network(False)).phases(next(pairs()).to("cpu"), noting))
+    assert asked == ["source network", "source loss", "target network"]
+    asked.clear()
+    judging = scheme_of(network(True), True, **HEATNET)  # the critic's step
+    list(judging.phases(next(pairs(confidence=True)).to("cpu"), noting))
+    assert asked == ["source network", "target network"]
 
 
 def test_masks_of_queries_are_refused() -> None:

@@ -95,9 +95,10 @@ def test_two_heads_step_as_the_thesis_code(tmp_path: Path, mode: str, steps: int
     wanted = expected(model, True, mode, steps)
     log = trained(labelled(model, True, mode), model, tmp_path, steps)
     assert_same(model, wanted)
-    assert {"loss/source/ce", "loss/target/ce", "grad_norm/source", "grad_norm/target"} <= set(
-        log[0]
-    )
+    both = ["grad_norm/source+target"]
+    norms = both if mode == "together" else ["grad_norm/source", "grad_norm/target"]
+    assert sorted(name for name in log[0] if name.startswith("grad_norm")) == norms
+    assert {"loss/source/ce", "loss/target/ce"} <= set(log[0])
     assert {"lr/source_0", "lr/target_0"} <= set(log[0])
 
 
@@ -174,6 +175,35 @@ def test_a_view_that_is_left_to_the_network_is_not_asked_for() -> None:
     scheme = labelled(model, False, "apart", view=None)
     list(scheme.phases(next(pairs()).to("cpu"), generator_of))
     assert model.calls == [(("rgb",), None, True), ((), None, True)]
+
+
+def test_the_network_draws_from_the_generator_of_its_pass() -> None:
+    """What is dropped of the target does not follow from what is dropped of the source."""
+    drawn: dict[str, Tensor] = {}
+
+    class Drawing(Linear):
+        def forward(self, *images: Tensor, **asked: Any) -> Any:
+            drawn[f"{asked['head']} network"] = torch.rand(4, generator=asked["generator"])
+            return super().forward(*images, **asked)
+
+    def loss(output: Any, batch: Any, generator: torch.Generator) -> dict[str, Tensor]:
+        drawn[f"{batch.name[0]} loss"] = torch.rand(4, generator=generator)
+        return cross_entropy(output, batch, torch.Generator())
+
+    model = Drawing(("day", "dark"))
+    scheme = LabelledDomains(
+        model=model, loss=loss, masker=Nothing(), domains=domains(True), gradients="apart"
+    )
+    pair = next(pairs()).to("cpu")
+    pair = replace(pair, target=replace(pair.target, name=("t", "u")))
+    list(scheme.phases(pair, generator_of))
+    names = {
+        **{"day network": "source network", "dark network": "target network"},
+        **{"a loss": "source loss", "t loss": "target loss"},
+    }
+    assert drawn.keys() == names.keys()
+    for name, purpose in names.items():
+        assert torch.equal(drawn[name], torch.rand(4, generator=generator_of(purpose))), name
 
 
 # ---- without labels of the target -----------------------------------------------------------

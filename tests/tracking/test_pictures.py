@@ -15,6 +15,7 @@ from rgbt.tracking.pictures import (
     Example,
     Legend,
     RegionHeat,
+    _broken,
     colour_limits,
     colours,
     draw_panel,
@@ -106,3 +107,11 @@ def test_panel_is_drawn_with_every_class_colour(tmp_path: Path) -> None:
     assert sizes[1][0] > 2 * sizes[0][0]
     with pytest.raises(ValueError, match="at least one example"):
         draw_panel([], Legend(("unlabelled", "car"), PALETTE), tmp_path / "none.png")
+
+
+def test_long_names_are_broken_after_underscores() -> None:
+    name = "test_day_1570001920_541752960"
+    assert _broken(name, 22) == "test_day_1570001920_\n541752960"
+    assert _broken(name, 40) == name
+    assert _broken("00012D", 22) == "00012D"
+    assert _broken("x" * 30, 22) == "x" * 30
