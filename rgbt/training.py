@@ -73,6 +73,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     if (path / "result.json").exists():
         folder = RunFolder(path)
         _show_again(folder, tracking, asked)
+        _tell_other_files(folder, config)
         _tell_unmeasured(folder, build(config.consistency))
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
@@ -96,6 +97,20 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     shown = asked if len(asked.name) > len(known.name) else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish("FINISHED")
+
+
+def _tell_other_files(folder: RunFolder, config: DictConfig) -> None:
+    """A finished run of the same key may have been made on another copy: say so."""
+    result = folder.result()
+    try:
+        now = build(config.dataset).fingerprint()
+    except InputError:
+        return  # a result can be shown where its data are not at hand
+    if result is not None and result["dataset"] != now:
+        tell(
+            f"it was made on other files of the data set ({result['dataset'][:8]}, now "
+            f"{now[:8]}); to train on these: runs_dir=..., or dataset.name=..."
+        )
 
 
 def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
