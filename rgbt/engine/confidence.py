@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from rgbt.engine.evaluate import class_scores
+from rgbt.engine.evaluate import label_scores
 from rgbt.types import Batch, View
 
 FAINTEST = 1e-6
@@ -41,12 +40,8 @@ def probabilities(
         view: what is predicted from; None leaves it to the network.
         heads: which head predicts each image of the batch; () leaves it to the network.
     """
-    with torch.inference_mode(), fabric.autocast():
-        scores = class_scores(model, batch, view, heads).float()
-    label_hw = batch.label.shape[-2:]
     with torch.inference_mode():
-        if scores.shape[-2:] != label_hw:
-            scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
+        scores = label_scores(model, batch, fabric, view, heads)
         if getattr(model, "predicts", "scores") == "masks":
             return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
         return scores.softmax(1)

@@ -65,13 +65,26 @@ def class_maps(
         view: what is predicted from; None leaves it to the network.
         heads: which head predicts each image of the batch; () leaves it to the network.
     """
+    with torch.inference_mode():
+        scores = label_scores(model, batch, fabric, view, heads)
+        classes: Tensor = scores.argmax(1).to(torch.uint8)
+    return classes
+
+
+def label_scores(
+    model: nn.Module,
+    batch: Batch,
+    fabric: Fabric,
+    view: View | None = None,
+    heads: Sequence[str | None] = (),
+) -> Tensor:
+    """(B, K, H', W') float32 scores at every pixel of the labels; arguments as in `class_maps`."""
     with torch.inference_mode(), fabric.autocast():
         scores = class_scores(model, batch, view, heads).float()
         label_hw = batch.label.shape[-2:]
         if scores.shape[-2:] != label_hw:
             scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
-        classes: Tensor = scores.argmax(1).to(torch.uint8)
-    return classes
+    return scores
 
 
 def class_scores(
