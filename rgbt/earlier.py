@@ -87,7 +87,7 @@ def finish_earlier(
         InputError: see `rehearse` and `train`; where an earlier run is wrong, it is named.
     """
     labels = [labels_folder(config, name) for name in DOMAINS if config.domains[name] is not None]
-    are_there = all(folder is None or folder.is_dir() for folder in labels)
+    are_there = all(each is None or (each / "pseudo_labels.json").is_file() for each in labels)
     if not (are_there and all(earlier.is_finished for earlier in earlier_runs(config))):
         rehearse(config)
     for earlier in earlier_runs(config):
@@ -132,7 +132,7 @@ def _shared(words: Sequence[str], key: str) -> list[str]:
         word
         for word, place in places
         if place not in own
-        and (place in SHARED or place.split(".")[0] in groups or place.startswith("data."))
+        and (place in SHARED or place.replace("/", ".").split(".")[0] in groups or place.startswith("data."))
         and place not in ("seed", "runs_dir")
     ]
 

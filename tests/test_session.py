@@ -74,7 +74,11 @@ def asked_session(source: dict[str, object], **changes: object) -> SimpleNamespa
 
 
 class Nights:
+    def __init__(self) -> None:
+        self.asked = 0
+
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
+        self.asked += 1
         if any(name not in ("day", "night") for name in names):
             raise InputError("no such frame")
         return tuple(name == "night" for name in names)
@@ -104,7 +108,9 @@ def test_heads_of_images_that_are_in_no_list() -> None:
     session = asked_session({"head": "day", "view": "rgb"}, target_is="night")
     for asked, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", asked)(("mine", "night")) == (head, head)
+    assert session.dataset.asked == 0
     with pytest.raises(InputError, match=r"night, so that no head can be chosen; say head=source"):
         heads_of(session, "rgb")(("mine",))
     alone = asked_session({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
+    assert alone.dataset.asked == 0
