@@ -132,7 +132,11 @@ def _shared(words: Sequence[str], key: str) -> list[str]:
         word
         for word, place in places
         if place not in own
-        and (place in SHARED or place.replace("/", ".").split(".")[0] in groups or place.startswith("data."))
+        and (
+            place in SHARED
+            or place.replace("/", ".").split(".")[0] in groups
+            or place.startswith("data.")
+        )
         and place not in ("seed", "runs_dir")
     ]
 

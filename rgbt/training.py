@@ -225,10 +225,11 @@ class Run:
         def validate(step: int) -> float:
             found = evaluate(session, self.prepared.model, split)
             values = scores.summary(found.counts, session.regions.absent)
-            values |= self._of_target(session, self.prepared.model, split)
+            is_kept = values[names.MIOU] > state.best_score or session.trainer.tested == "last"
+            values |= self._of_target(session, self.prepared.model, split, save=is_kept)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
-            if values[names.MIOU] > state.best_score or session.trainer.tested == "last":
+            if is_kept:
                 found.counts.save(self.folder.counts_path(split))
             self.tracking.update()
             return values[names.MIOU]
@@ -278,7 +279,7 @@ class Run:
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
-        of_target = self._of_target(session, session.model, "test")
+        of_target = self._of_target(session, session.model, "test", save=True)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
@@ -292,13 +293,16 @@ class Run:
         else:
             tell("none of the images of the panel could be read; no pictures were drawn.")
 
-    def _of_target(self, session: Session, model: nn.Module, split: str) -> dict[str, float]:
+    def _of_target(
+        self, session: Session, model: nn.Module, split: str, *, save: bool
+    ) -> dict[str, float]:
         """Where the target is seen in another view than the source: its mIoU, named after that."""
         target = session.domains.target
         if target is None or target.view in (None, view_of(session)):
             return {}
         counts = evaluate(session, model, split, view=target.view).counts
-        counts.save(self.folder.counts_path(f"{split}_{target.view}"))
+        if save:
+            counts.save(self.folder.counts_path(f"{split}_{target.view}"))
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}
