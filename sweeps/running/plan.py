@@ -14,7 +14,7 @@ from rgbt.checks import InputError
 from rgbt.command import composing
 from rgbt.config import build, check, compose
 from rgbt.identity import run_key
-from sweeps.points import Point
+from sweeps.points import Evaluation, Point
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,14 @@ class Planner:
         runs = tuple(self._run(overrides) for overrides in point.runs())
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            # What is None is left out: an attribute that is new keeps the keys of older studies.
+            # Attributes that came later are left out where they say what older studies did.
+            plain = vars(Evaluation())
             asked = [
-                {name: value for name, value in vars(each).items() if value is not None}
+                {
+                    name: value
+                    for name, value in vars(each).items()
+                    if name not in ("frames", "head") or value != plain[name]
+                }
                 for each in point.evaluations
             ]
             parts = [[run.key for run in runs], asked]

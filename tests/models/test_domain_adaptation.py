@@ -79,7 +79,7 @@ def test_small_networks_are_the_large_ones_in_kind(
 ) -> None:
     """Only sizes and rates differ, and the dropout that a demo has no channels to spare for."""
     small, large = compose(f"model={name}").model, compose(f"model={name[:-5]}").model
-    sizes = {"depths", "base_width", "rates", "summed_rates", "dropout"}
+    sizes = {"depths", "base_width", "decoder_width", "rates", "summed_rates", "dropout"}
     assert {key for key in large if small[key] != large[key]} <= sizes
     assert small.get("heads") == heads
     assert small.get("modalities") == modalities
