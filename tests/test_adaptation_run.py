@@ -35,8 +35,8 @@ SMALL = (
     *("scale.batch_size=2", "scale.eval_batch_size=4", "scale.critic_width=4", "tracking=none"),
     *("trainer.accelerator=cpu", "trainer.threads=1", "trainer.log_every=1"),
 )
-QUICK = ("sh_adversarial", "multi_head_thermal", "multi_head_night", "heatnet")
-"""One of each kind; the others are like one of them, and slow."""
+QUICK = ("multi_head_night", "heatnet")
+"""Two kinds; the others are like one of them, or run below, and are slow."""
 
 
 def short(steps: int) -> tuple[str, ...]:
@@ -378,7 +378,11 @@ def losses(folder: Path) -> list[dict[str, float]]:
 
 
 @pytest.mark.parametrize(
-    "case", ["one head", pytest.param("two heads", marks=pytest.mark.slow), "heatnet"]
+    "case",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("one head", "two heads")),
+        "heatnet",
+    ],
 )
 def test_stopped_in_the_critics_phase_and_continued(
     run: Runs,

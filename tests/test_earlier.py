@@ -148,7 +148,14 @@ TYPED = {
 }
 
 
-@pytest.mark.parametrize("typed", TYPED.values(), ids=TYPED)
+@pytest.mark.parametrize(
+    "typed",
+    [
+        pytest.param(words, marks=() if name in ("seed", "data", "durations") else pytest.mark.slow)
+        for name, words in TYPED.items()
+    ],
+    ids=TYPED,
+)
 def test_an_earlier_run_is_the_run_of_its_experiment_alone(typed: list[str]) -> None:
     for experiment in ("multi_head_modified_night_init_stage1", "heatnet_rgb_only"):
         for found in earlier_runs(composed(experiment, *typed)):
