@@ -20,6 +20,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.data.domains import GIVEN, NONE
+from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.identity import DOMAINS, SHARED, earlier_config, earlier_run, run_key
 from rgbt.naming import TAGS
 from rgbt.tracking.files import is_held
@@ -65,9 +67,16 @@ class Earlier:
 def earlier_runs(config: DictConfig) -> Iterator[Earlier]:
     """The runs that a configuration names, in the order in which it does."""
     for key in ("model.weights", *(f"domains.{name}.labels" for name in DOMAINS)):
-        reference = earlier_run(key, OmegaConf.select(config, key))
-        if reference is not None:
-            yield Earlier(key, *reference, earlier_config(config, key, reference[0]))
+        found = _named_by(key, config)
+        if found is not None:
+            yield found
+
+
+def _named_by(key: str, config: DictConfig) -> Earlier | None:
+    reference = earlier_run(key, OmegaConf.select(config, key))
+    if reference is None:
+        return None
+    return Earlier(key, *reference, earlier_config(config, key, reference[0]))
 
 
 def finish_earlier(
@@ -87,10 +96,11 @@ def finish_earlier(
         InputError: see `rehearse` and `train`; where an earlier run is wrong, it is named.
     """
     labels = [labels_folder(config, name) for name in DOMAINS if config.domains[name] is not None]
-    are_there = all(each is None or (each / "pseudo_labels.json").is_file() for each in labels)
-    if not (are_there and all(earlier.is_finished for earlier in earlier_runs(config))):
+    are_there = all(each is None or (each / MANIFEST).is_file() for each in labels)
+    needed = list(earlier_runs(config))
+    if not (are_there and all(earlier.is_finished for earlier in needed)):
         rehearse(config)
-    for earlier in earlier_runs(config):
+    for earlier in needed:
         typed = [f"+experiment={earlier.experiment}", *_shared(words, earlier.key)]
         if not earlier.is_finished:
             with _naming(earlier, config):
@@ -114,13 +124,13 @@ def reads_pretrained(config: DictConfig) -> bool:
 def labels_folder(config: DictConfig, name: str) -> Path | None:
     """The folder of pseudo-labels of a domain; None where it takes no pseudo-labels."""
     node = config.domains[name]
-    for earlier in earlier_runs(config):
-        if earlier.key == f"domains.{name}.labels":
-            words = [node.split, node.teacher_view or "default"]
-            words += [earlier.checkpoint.removesuffix(".pt")]
-            words += [f"{node.threshold:g}"] if node.threshold else []
-            return earlier.folder / "pseudo_labels" / "_".join(words)
-    return None if node.labels in ("given", "none") else Path(node.labels).expanduser()
+    earlier = _named_by(f"domains.{name}.labels", config)
+    if earlier is not None:
+        words = [node.split, node.teacher_view or "default"]
+        words += [earlier.checkpoint.removesuffix(".pt")]
+        words += [f"{node.threshold:g}"] if node.threshold else []
+        return earlier.folder / "pseudo_labels" / "_".join(words)
+    return None if node.labels in (GIVEN, NONE) else Path(node.labels).expanduser()
 
 
 def _shared(words: Sequence[str], key: str) -> list[str]:
@@ -188,7 +198,7 @@ def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
 
     folder, node = labels_folder(config, name), config.domains[name]
     assert folder is not None, "the domain takes labels of an earlier run"
-    if (folder / "pseudo_labels.json").exists():
+    if (folder / MANIFEST).exists():
         return
     # The earlier run may have been made on another machine, and where the data lie elsewhere.
     here = [

@@ -17,14 +17,16 @@ if TYPE_CHECKING:
 @command(sweeper="study")
 def main(config: DictConfig) -> int:
     """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
-    from rgbt.earlier import finish_earlier, reads_pretrained  # torch loads here, after --help
+    # torch loads here, after --help
+    from rgbt.earlier import earlier_runs, finish_earlier, reads_pretrained
     from rgbt.prepared import rehearse
     from rgbt.tracking.terminal import tell
     from rgbt.training import is_finished, train
 
     if config.pretrained is not None and not reads_pretrained(config):
         tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")
-    if not is_finished(config):
+    # A key may hash a large file of weights: it is asked for only where it decides something.
+    if any(earlier_runs(config)) and not is_finished(config):
         finish_earlier(config, train, rehearse, task_overrides())
     train(config, task_overrides())
     return 0

@@ -101,6 +101,8 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
 
 def _tell_other_files(folder: RunFolder, config: DictConfig) -> None:
     """A finished run of the same key may have been made on another copy: say so."""
+    if "root" not in config.dataset:
+        return  # made by its settings alone, which are in the key; it need not be made for this
     result = folder.result()
     try:
         now = build(config.dataset).fingerprint()

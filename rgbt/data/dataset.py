@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rgbt.checks import InputError
 from rgbt.types import Sample
 
 
@@ -61,3 +62,15 @@ class LabelledDataset(Protocol):
     def fingerprint(self) -> str:
         """Hash of names and files, equal for equal copies wherever they lie."""
         ...
+
+
+def check_lengths(
+    num_classes: int, classes: tuple[str, ...], palette: tuple[tuple[int, int, int], ...]
+) -> None:
+    """Refuse names or colours that are not one per class, naming the key."""
+    for key, length in (("classes", len(classes)), ("palette", len(palette))):
+        if length != num_classes:
+            raise InputError(
+                f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                "make them agree."
+            )

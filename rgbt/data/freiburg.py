@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
+from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
 from rgbt.types import IGNORE, Sample
@@ -120,12 +121,7 @@ class Freiburg:
         self.splits = SPLITS
         self._split_frames: dict[str, tuple[Frame, ...]] = {}
         _check_root(self.root, root)
-        for key, length in (("classes", len(classes)), ("palette", len(palette))):
-            if length != num_classes:
-                raise InputError(
-                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
-                    "make them agree."
-                )
+        check_lengths(num_classes, classes, palette)
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
                 check_choice(f"dataset.{key}", word, classes)

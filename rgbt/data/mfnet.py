@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
+from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_channels, read_label, read_packed
 from rgbt.types import Sample
 
@@ -90,12 +91,7 @@ class MFNet:
                 f"dataset.root: there is no folder '{root}'; give the one that holds "
                 f"{_either_layout()} and the split lists."
             )
-        for key, length in (("classes", len(classes)), ("palette", len(palette))):
-            if length != num_classes:
-                raise InputError(
-                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
-                    "make them agree."
-                )
+        check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
 
