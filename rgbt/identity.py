@@ -27,6 +27,7 @@ NOT_IN_KEY = (
     *("name", "runs_dir", "out", "scale", "recipe", "tracking", "consistency"),
     *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
+    *("data.prefetch", "data.augment", "data.cache"),
     *("trainer.accelerator", "trainer.threads", "trainer.log_every", "trainer.checkpoint_every"),
 )
 """What may differ between two runs that are the same run: labels, paths, hardware, tracking, what

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -11,11 +13,13 @@ import numpy as np
 import torch
 from lightning_fabric import Fabric
 from omegaconf import DictConfig
+from rich.progress import Progress, TaskID
 from torch import nn
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build
 from rgbt.data.dataset import LabelledDataset
+from rgbt.data.decoded import Decoded, decoded_dataset
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
@@ -91,7 +95,10 @@ def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Sessi
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(config.seed, "weights"))
         model: nn.Module = build(config.model)
-    dataset: LabelledDataset = build(config.dataset)
+    loading: LoaderSettings = build(config.data)
+    dataset: LabelledDataset = decoded_dataset(
+        build(config.dataset), loading.cache, num_threads=len(os.sched_getaffinity(0))
+    )
     _check_classes(config, dataset, label_map)
     weights = start(model, config)
     return Session(
@@ -99,7 +106,7 @@ def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Sessi
         dataset=dataset,
         domains=build(config.domains),
         transform=build(config.transform),
-        loading=build(config.data),
+        loading=loading,
         regions=build(config.metric),
         consistency=build(config.consistency),
         trainer=trainer,
@@ -133,6 +140,31 @@ def _fabric(trainer: TrainerSettings) -> Fabric:
             f"trainer.accelerator={trainer.accelerator} with trainer.precision={trainer.precision} "
             f"cannot be used on this machine ({str(error).splitlines()[0]})."
         ) from error
+
+
+def decode_ahead(session: Session, *splits: str) -> None:
+    """Fill the cache of decoded images with these splits, where one is asked for.
+
+    In the main process, before others read from it.
+
+    Raises:
+        InputError: the cache cannot be written.
+    """
+    dataset = session.dataset
+    if isinstance(dataset, Decoded):
+        names = tuple(name for split in splits for name in dataset.names(split))
+        with ExitStack() as shown:
+            tasks: dict[str, TaskID] = {}
+            display: list[Progress] = []
+
+            def advance(what: str, done: int, total: int) -> None:
+                if not display:  # where everything is there, nothing is shown
+                    display.append(shown.enter_context(progress()))
+                if what not in tasks:
+                    tasks[what] = display[0].add_task(what, total=total, note="images")
+                display[0].update(tasks[what], completed=done)
+
+            dataset.ensure(names, advance)
 
 
 def view_of(session: Session, modality: str = "default") -> View:
@@ -214,6 +246,7 @@ def evaluate(
         InputError: a file cannot be read (data.on_error=raise), or none could be.
     """
     dataset = session.dataset
+    decode_ahead(session, split)
     batches = eval_batches(dataset, split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: dict[str, np.ndarray] = {}

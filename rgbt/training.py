@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
@@ -20,7 +21,7 @@ from rgbt.data.domains import Domains
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
-from rgbt.engine.trainer import StepData, Trainer
+from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.identity import run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.pairs import file_name
@@ -44,6 +45,9 @@ from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
+
+MUCH_WAITING = 0.3
+"""Share of a step spent waiting for images above which the user is told."""
 
 LABEL_WIDTH = 40
 """Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
@@ -218,7 +222,24 @@ class Run:
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = self.prepared.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
+        self._tell_waiting(session)
         return state
+
+    def _tell_waiting(self, session: Session) -> None:
+        """Say so where the training mostly waited for images, and what helps."""
+        shares = [
+            line.values[WAIT_SHARE]
+            for line in self.folder.lines()
+            if line.kind == "train" and WAIT_SHARE in line.values
+        ]
+        if shares and np.median(shares) > MUCH_WAITING:
+            cache = (
+                "" if session.loading.cache else "data.cache=auto decodes every image once, and "
+            )
+            tell(
+                f"{np.median(shares):.0%} of the time of a step was waiting for images; {cache}"
+                "data.num_workers=... gives more processes to reading them."
+            )
 
     def _trainer(self, session: Session, state: State) -> Trainer:
         split = session.trainer.selection_split
@@ -324,7 +345,7 @@ def _parts_of(of_target: Mapping[str, float]) -> dict[str, float]:
     return {", ".join(name.split("/")[:-1]): value for name, value in of_target.items()}
 
 
-def _noting_skipped(batches: Batches | PairedBatches, state: State) -> Iterator[StepData]:
+def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iterator[Loaded]:
     """The batches, with unreadable files noted in `state` before a checkpoint is written."""
     for batch in batches:
         state.skip(batches.skipped)

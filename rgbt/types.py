@@ -98,6 +98,19 @@ class Batch:
         )
 
 
+class Loadable(Protocol):
+    """What a loader yields: a batch, or examples that become one on their way to the device."""
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """B names."""
+        ...
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The batch on `device`, with images as float32 in [0, 1]."""
+        ...
+
+
 @dataclass(frozen=True)
 class TwoDomains:
     """What a step of domain adaptation gets: a batch of each domain, drawn independently.
@@ -111,15 +124,6 @@ class TwoDomains:
     source: Batch
     target: Batch
     step: int
-
-    @property
-    def name(self) -> tuple[str, ...]:
-        """Names of all samples, those of the source first."""
-        return self.source.name + self.target.name
-
-    def to(self, device: torch.device | str) -> TwoDomains:
-        """Both batches on `device` (see `Batch.to`)."""
-        return replace(self, source=self.source.to(device), target=self.target.to(device))
 
 
 class MaskPair(NamedTuple):

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.types import Batch, Sample
+from rgbt.types import Batch, Loadable, Sample
 
 
 class Dataset(Protocol):
@@ -80,6 +80,23 @@ class Transform(Protocol):
 
     def test(self, sample: Sample) -> Example:
         """Example for evaluation, the same every time."""
+        ...
+
+
+class BatchTransform(Protocol):
+    """A transform that can leave the work to the device (see `rgbt.transforms.crm.CrmTransform`).
+
+    ``stack([drawn(sample, rng), ...]).to(device)`` is the batch of ``train(sample, rng)``.
+    """
+
+    works_on_batches: bool
+
+    def drawn(self, sample: Sample, rng: np.random.Generator) -> Any:
+        """What `train` would read and do; every draw comes from `rng`."""
+        ...
+
+    def stack(self, drawn: Sequence[Any]) -> Loadable:
+        """Examples of one size; InputError where they differ."""
         ...
 
 

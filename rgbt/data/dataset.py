@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,14 @@ class LabelledDataset(Protocol):
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W); None where the pair is unlabelled."""
+        ...
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Every file that `read` opens for `name`, in a fixed order, there or not."""
+        ...
+
+    def decoding(self) -> dict[str, Any]:
+        """What decides, beside the files, what `read` makes of them: values of JSON by key."""
         ...
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb
+from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb, within
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
+from rgbt.data.integrity import is_there
 from rgbt.types import IGNORE, Sample
 
 CLASSES = (
@@ -157,7 +158,7 @@ class Freiburg:
                 smaller than the crop.
         """
         frame = self.frame(name)
-        rgb, thermal = read_rgb(frame.rgb), self._thermal(frame)
+        rgb, thermal = read_rgb(within(frame.rgb, self.root)), self._thermal(frame)
         if rgb.shape[:2] != thermal.shape:
             raise InputError(
                 f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but thermal is "
@@ -181,6 +182,22 @@ class Freiburg:
         """Counts of the thermal camera, (H, W) uint16, cut as in `read`; InputError as there."""
         return self._cut(self._thermal(self.frame(name)), name)
 
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
+        frame = self.frame(name)
+        paths = (frame.rgb, frame.thermal, frame.label)
+        return tuple(path for path in paths if path is not None)
+
+    def decoding(self) -> dict[str, Any]:
+        """What decides, beside the files, what `read` makes of them."""
+        return {
+            "crop": self.crop,
+            "thermal_range": self.thermal_range,
+            "ignored_test": sorted(self.ignored_test),
+            "val_sequences": sorted(self.val_sequences),
+            "classes": self.classes,
+        }
+
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
         """Whether each frame lies in a folder that says night; InputError where there is none."""
         return tuple(self.frame(name).night for name in names)
@@ -196,9 +213,8 @@ class Freiburg:
         for split in sorted(self.splits):
             names = [frame.name for frame in self._of(split)]
             digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
-        for name, frame in self._frames.items():
-            paths = [path for path in (frame.rgb, frame.thermal, frame.label) if path is not None]
-            sizes = [_size(path) for path in paths]
+        for name in self._frames:
+            sizes = [_size(path) for path in self.files(name)]
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
@@ -263,23 +279,23 @@ class Freiburg:
         )
 
     def _thermal(self, frame: Frame) -> NDArray[np.uint16]:
-        if not frame.thermal.is_file():
+        if not is_there(frame.thermal):
             raise InputError(
                 f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
                 "data.on_error=skip to leave the frame out."
             )
-        return read_counts(frame.thermal)
+        return read_counts(within(frame.thermal, self.root))
 
     def _label(self, frame: Frame, hw: tuple[int, ...]) -> Array:
         """The label at the size of the frame, at the nearest pixel."""
         assert frame.label is not None, "only frames with a label are asked for it"
-        if not frame.label.is_file():
+        if not is_there(frame.label):
             raise InputError(
                 f"'{frame.name}': its label {frame.label} is missing; restore it, or use "
                 "data.on_error=skip to leave the frame out."
             )
         read = read_label if frame.label.suffix == ".png" else read_label_array
-        label = read(frame.label, self.num_classes)
+        label = read(within(frame.label, self.root), self.num_classes)
         if label.shape != hw:
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from functools import partial
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, check_choice, check_range
-from rgbt.data.batches import Dataset, Transform
+from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
@@ -25,12 +26,14 @@ from rgbt.data.reader import (
     start_worker,
 )
 from rgbt.randomness import numpy_generator
-from rgbt.types import Batch
+from rgbt.types import Batch, Loadable
 
 LOG = logging.getLogger(__name__)
 
 CROP_ADVICE = "; choose transform.crop_hw so that it fits into every resized image"
 EVAL_ADVICE = "; set data.eval_batch_size=1"
+
+Kind = TypeVar("Kind", bound=Loadable)
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,11 @@ class LoaderSettings:
         batch_size: samples of a training batch, >= 1.
         eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
         num_workers: processes that decode and augment; 0 = the main process does.
+        prefetch: batches that each process prepares ahead of the one that is used.
+        augment: "loader" augments in the processes that read, "device" whole batches where the
+            network is, with the same bits; "auto" does so on a GPU, where the transform can.
+        cache: images are decoded once into memory-mapped files of this folder and read from there
+            (`rgbt.data.decoded`); "auto": in the folder of the user's cache; None: no such files.
         on_error: "raise" stops at a file that cannot be read; "skip" names it once and takes the
             next readable sample of the list instead (training) or leaves it out (evaluation).
     """
@@ -48,35 +56,43 @@ class LoaderSettings:
     batch_size: int
     eval_batch_size: int
     num_workers: int
+    prefetch: int = 2
+    augment: Literal["auto", "loader", "device"] = "auto"
+    cache: str | None = None
     on_error: Literal["raise", "skip"] = "raise"
 
     def __post_init__(self) -> None:
         check_range("data.batch_size", self.batch_size, 1, 2**20)
         check_range("data.eval_batch_size", self.eval_batch_size, 1, 2**20)
         check_range("data.num_workers", self.num_workers, 0, 2**10)
+        check_range("data.prefetch", self.prefetch, 1, 2**10)
+        check_choice("data.augment", self.augment, ("auto", "loader", "device"))
         check_choice("data.on_error", self.on_error, ("raise", "skip"))
 
 
-class Batches(Iterator[Batch]):
+class Batches(Iterator[Kind]):
     """Batches in order, as `train_batches` and `eval_batches` make them.
 
     Args:
         reader: makes a batch of a list of keys.
         keys: one list of keys per batch.
-        num_workers: processes that read.
+        settings: processes that read, and how far ahead.
 
     Attributes:
         skipped: name -> why it could not be read, of the samples left out so far.
     """
 
-    def __init__(self, reader: BatchReader, *, keys: Iterable[list[Any]], num_workers: int):
+    def __init__(
+        self, reader: BatchReader, *, keys: Iterable[list[Any]], settings: LoaderSettings
+    ) -> None:
         self.skipped: dict[str, str] = {}
         loader = DataLoader(
             reader,
             sampler=keys,
             batch_size=None,  # a key stands for a whole batch
             collate_fn=_unchanged,
-            num_workers=num_workers,
+            num_workers=settings.num_workers,
+            prefetch_factor=settings.prefetch if settings.num_workers else None,
             worker_init_fn=start_worker,
             pin_memory=torch.cuda.is_available(),
             # Without one of its own, the loader draws a seed for its workers from the global one.
@@ -84,7 +100,7 @@ class Batches(Iterator[Batch]):
         )
         self._loaded = cast(Iterator[Loaded], iter(loader))
 
-    def __next__(self) -> Batch:
+    def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
 
         Raises:
@@ -97,7 +113,7 @@ class Batches(Iterator[Batch]):
                 self.close()
                 raise InputError(loaded.error)
             if loaded.batch is not None:
-                return loaded.batch
+                return cast(Kind, loaded.batch)
 
     def close(self) -> None:
         """Stop the worker processes; nothing comes after it."""
@@ -119,7 +135,7 @@ def train_batches(
     settings: LoaderSettings,
     seed: int,
     steps: range,
-) -> Batches:
+) -> Batches[Loadable]:
     """Augmented training batches of the global steps in `steps`.
 
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
@@ -130,7 +146,8 @@ def train_batches(
         dataset: where samples come from.
         split: name of the split.
         transform: its `train` makes the examples.
-        settings: batch size, workers, what to do about unreadable files.
+        settings: batch size, workers, what to do about unreadable files. ``augment="device"`` asks
+            for a `BatchTransform`, whose batches are augmented as they are moved.
         seed: run seed.
         steps: numbers of the batches, counted from the start of the run.
 
@@ -140,16 +157,19 @@ def train_batches(
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
     source = Source(dataset, names, transform, settings.on_error == "skip")
-    return Batches(
-        BatchReader(TrainExamples(source, seed), CROP_ADVICE),
-        keys=_train_keys(len(names), settings.batch_size, per_epoch, seed, steps),
-        num_workers=settings.num_workers,
-    )
+    if settings.augment == "device":
+        work = cast(BatchTransform, transform)
+        reader = BatchReader(TrainExamples(source, work.drawn, seed), work.stack)
+    else:
+        stack = partial(collate, advice=CROP_ADVICE)
+        reader = BatchReader(TrainExamples(source, transform.train, seed), stack)
+    keys = _train_keys(len(names), settings.batch_size, per_epoch, seed, steps)
+    return Batches(reader, keys=keys, settings=settings)
 
 
 def eval_batches(
     dataset: Dataset, split: str, transform: Transform, settings: LoaderSettings
-) -> Batches:
+) -> Batches[Batch]:
     """Every sample of the split once, in the order of its list.
 
     Args:
@@ -162,9 +182,9 @@ def eval_batches(
     source = Source(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     return Batches(
-        BatchReader(EvalExamples(source), EVAL_ADVICE),
+        BatchReader(EvalExamples(source), partial(collate, advice=EVAL_ADVICE)),
         keys=[list(names[start : start + size]) for start in range(0, len(names), size)],
-        num_workers=settings.num_workers,
+        settings=settings,
     )
 
 

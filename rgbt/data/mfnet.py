@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_channels, read_label, read_packed
+from rgbt.data.files import read_channels, read_label, read_packed, within
+from rgbt.data.integrity import read_names
 from rgbt.types import Sample
 
 Layout = Literal["auto", "packed", "folders"]
@@ -131,7 +132,15 @@ class MFNet:
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
-        return read_label(self.label_path(name), self.num_classes)
+        return read_label(within(self.label_path(name), self.root), self.num_classes)
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Every file that `read` opens for `name`: its images, then its label."""
+        return (*self.image_paths(name), self.label_path(name))
+
+    def decoding(self) -> dict[str, Any]:
+        """What decides, beside the files, what `read` makes of them."""
+        return {"layout": self.layout, "num_classes": self.num_classes}
 
     def is_night(self, name: str) -> bool:
         """Whether the letter before the ending says night (N) and not day (D).
@@ -168,8 +177,7 @@ class MFNet:
             names = self.names(split) if self.list_path(split).is_file() else ()
             digest.update(f"{split} {len(names)}\n".encode())
             for name in names:
-                paths = (*self.image_paths(name), self.label_path(name))
-                sizes = [path.stat().st_size if path.is_file() else -1 for path in paths]
+                sizes = [path.stat().st_size if path.is_file() else -1 for path in self.files(name)]
                 digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
@@ -202,16 +210,10 @@ class MFNet:
                 f"dataset.splits.{split}: there is no list '{path}'; write it (one name per line), "
                 f"or name another list with dataset.splits.{split}=..."
             )
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        names = tuple(line.strip() for line in lines if line.strip())
-        if not names:
-            raise InputError(
-                f"dataset.splits.{split}: the list '{path}' is empty; expected one name per line."
-            )
-        return names
+        return read_names(path, f"dataset.splits.{split}")
 
     def _read_images(self, name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        paths = self.image_paths(name)
+        paths = tuple(within(path, self.root) for path in self.image_paths(name))
         if self.layout == "packed":
             return read_packed(paths[0])
         rgb, thermal = read_channels(*paths)

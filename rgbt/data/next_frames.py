@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
+from rgbt.data.decoded import Decoded
 from rgbt.data.mfnet import MFNet
 
 FOLDER = "next"
@@ -37,6 +38,7 @@ class NextFrames:
     """
 
     def __init__(self, first: LabelledDataset) -> None:
+        first = first.source if isinstance(first, Decoded) else first
         if not isinstance(first, MFNet):
             raise InputError(
                 f"{first.name} ({first.root}) cannot hold second frames: they are read in MFNet's "

@@ -3,13 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import count
 
+import torch
+
 from rgbt.data.loaders import Batches
-from rgbt.types import TwoDomains
+from rgbt.types import Loadable, TwoDomains
 
 
-class PairedBatches(Iterator[TwoDomains]):
+@dataclass(frozen=True)
+class LoadedPair:
+    """What becomes `TwoDomains` on its way to the device; see there.
+
+    Attributes:
+        source: with labels.
+        target: with or without labels.
+        step: optimiser step that it is for, counted from the start of the run.
+    """
+
+    source: Loadable
+    target: Loadable
+    step: int
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """Names of all samples, those of the source first."""
+        return self.source.name + self.target.name
+
+    def to(self, device: torch.device | str) -> TwoDomains:
+        """Both batches on `device` (see `Batch.to`)."""
+        return TwoDomains(self.source.to(device), self.target.to(device), self.step)
+
+
+class PairedBatches(Iterator[LoadedPair]):
     """A batch of the source with a batch of the target, each from its own stream.
 
     The two lists need not be of one length: each is shuffled anew when it is through, and an epoch
@@ -22,20 +49,22 @@ class PairedBatches(Iterator[TwoDomains]):
         per_step: pairs of one optimiser step, whose number they have.
     """
 
-    def __init__(self, source: Batches, target: Batches, *, first: int, per_step: int) -> None:
+    def __init__(
+        self, source: Batches[Loadable], target: Batches[Loadable], *, first: int, per_step: int
+    ) -> None:
         self._source = source
         self._target = target
         self._numbers = count(first)
         self._per_step = per_step
 
-    def __next__(self) -> TwoDomains:
+    def __next__(self) -> LoadedPair:
         """The next pair; errors as of `Batches`."""
         try:
             source, target = next(self._source), next(self._target)
         except BaseException:
             self.close()
             raise
-        return TwoDomains(source, target, next(self._numbers) // self._per_step)
+        return LoadedPair(source, target, next(self._numbers) // self._per_step)
 
     @property
     def skipped(self) -> dict[str, str]:

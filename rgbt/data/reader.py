@@ -10,16 +10,20 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import cv2
+import numpy as np
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
 from rgbt.checks import InputError
-from rgbt.data.batches import Dataset, Example, Transform, collate
+from rgbt.data.batches import Dataset, Example, Transform
 from rgbt.randomness import numpy_generator
-from rgbt.types import Batch, Sample
+from rgbt.types import Loadable, Sample
 
-MakeExample = Callable[[Any, dict[str, str]], Example | None]
+MakeExample = Callable[[Any, dict[str, str]], Any]
 """(key, skipped) -> example, or None where it is left out; notes unreadable names in `skipped`."""
+
+Stack = Callable[[list[Any]], Loadable]
+"""Examples of one size -> one value; InputError where their sizes differ."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,19 @@ class Source:
 
 @dataclass(frozen=True)
 class TrainExamples:
-    """Augmented examples; a key is (epoch, index in the split)."""
+    """Augmented examples; a key is (epoch, index in the split).
+
+    Attributes:
+        source: what is read.
+        make: (sample, generator) -> example: the transform's `train` or `drawn`.
+        seed: run seed.
+    """
 
     source: Source
+    make: Callable[[Sample, np.random.Generator], Any]
     seed: int
 
-    def __call__(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
+    def __call__(self, key: tuple[int, int], skipped: dict[str, str]) -> Any:
         """The example of `key`, or of the next readable sample of the list.
 
         Raises:
@@ -68,7 +79,7 @@ class TrainExamples:
         for name in (*names[index:], *names[:index]):
             sample = self.source.read(name, skipped)
             if sample is not None:
-                return self.source.transform.train(sample, rng)
+                return self.make(sample, rng)
         raise InputError(
             f"none of the {len(names)} training samples of {self.source.dataset.name} can be read; "
             f"the first one: {skipped[names[0]]}"
@@ -92,13 +103,13 @@ class Loaded:
     """What a worker hands back.
 
     Attributes:
-        batch: None where every sample was left out, or after an error.
+        batch: None where every sample was left out, or after an error; a dataclass of tensors.
         skipped: name -> why it could not be read.
         error: message of an InputError; it travels as text because torch wraps exceptions of
             workers into others.
     """
 
-    batch: Batch | None = None
+    batch: Loadable | None = None
     skipped: dict[str, str] = field(default_factory=dict)
     error: str = ""
 
@@ -112,12 +123,12 @@ class BatchReader(TorchDataset[Loaded]):
 
     Args:
         make_example: called once per key.
-        advice: ends the message where sizes within a batch differ.
+        stack: makes a batch of examples.
     """
 
-    def __init__(self, make_example: MakeExample, advice: str):
+    def __init__(self, make_example: MakeExample, stack: Stack):
         self.make_example = make_example
-        self.advice = advice
+        self.stack = stack
 
     def __getitem__(self, keys: list[Any]) -> Loaded:
         """The batch of `keys`, without the samples that are left out."""
@@ -125,7 +136,7 @@ class BatchReader(TorchDataset[Loaded]):
         try:
             found = [self.make_example(key, skipped) for key in keys]
             examples = [example for example in found if example is not None]
-            batch = collate(examples, self.advice) if examples else None
+            batch = self.stack(examples) if examples else None
         except InputError as error:
             return Loaded(skipped=skipped, error=str(error))
         return Loaded(batch, skipped)
@@ -137,7 +148,7 @@ def start_worker(_: int) -> None:
     cv2.setNumThreads(0)
 
 
-def _pinned(batch: Batch) -> Batch:
+def _pinned(batch: Any) -> Any:
     pinned: dict[str, Any] = {}
     for each in fields(batch):
         value = getattr(batch, each.name)

@@ -53,12 +53,14 @@ class TrainerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Published numbers in which methods differ on the same data; `scale=paper` takes them.
+    """Published numbers in which methods and data sets differ; `scale=paper` takes them.
 
     Attributes:
+        dataset: name of the data set that the sizes and steps are for; on another one a run at
+            `scale=paper` says so.
         batch_size: samples per process and step.
         max_steps: optimiser steps.
-        eval_every: steps between evaluations: five epochs of MFNet's 1568 training images.
+        eval_every: steps between evaluations.
         train_sizes: shortest edges that the training resize draws from, pixels.
         crop_hw: training crop, pixels.
         lr: base learning rate.
@@ -66,9 +68,11 @@ class Recipe:
         critic_lr: learning rate of a critic, where the scheme has one.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
-        demo_steps: optimiser steps at scale=demo, which takes nothing else from here.
+        demo_steps: optimiser steps at scale=demo.
+        demo_sizes: shortest edges at scale=demo, which takes nothing else from here.
     """
 
+    dataset: str
     batch_size: int
     max_steps: int
     eval_every: int
@@ -80,6 +84,7 @@ class Recipe:
     clip_norm: float | None
     warmup_steps: int
     demo_steps: int
+    demo_sizes: tuple[int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,22 @@ RecordStep = Callable[[int, dict[str, float]], None]
 Validate = Callable[[int], float]
 StepData = Batch | TwoDomains
 
+WAIT_SHARE = "wait_share"
+"""Share of the time of a step that the loop waited for its images, 0..1."""
+
+
+class Loaded(Protocol):
+    """What a step is made from, before it is on the device."""
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """Names of all samples."""
+        ...
+
+    def to(self, device: torch.device | str) -> StepData:
+        """The data of the step on `device`, with images as float32 in [0, 1]."""
+        ...
+
 
 class Scheme(Protocol):
     """What the loop asks a scheme."""
@@ -94,7 +110,7 @@ class Trainer:
         vars(state).update(payload["state"])
         return True
 
-    def fit(self, batches: Iterator[StepData], state: State) -> None:
+    def fit(self, batches: Iterator[Loaded], state: State) -> None:
         """Train from ``state.step`` to the last step, keeping `state` up to date.
 
         Args:
@@ -133,7 +149,7 @@ class Trainer:
             payload = training_payload(self.model, self.others, self.optimizers, state)
             save_checkpoint(self.last, payload)
 
-    def _step(self, step: int, batches: Iterator[StepData], seed: int) -> dict[str, float]:
+    def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
         """One optimiser step of every phase; what to record of it."""
         started = time.perf_counter()
         rates = self._set_rates(step)
@@ -155,7 +171,7 @@ class Trainer:
             **values,
             **rates,
             "images_per_s": sum(len(batch.name) for batch in micro) / elapsed,
-            "wait_share": waited / elapsed,
+            WAIT_SHARE: waited / elapsed,
             "peak_memory_mib": _peak_memory_mib(self.fabric.device),
         }
 

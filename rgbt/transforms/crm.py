@@ -6,6 +6,7 @@ their mean colour, and losses pad labels with "ignore" (`rgbt.geometry.padding`)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -13,8 +14,9 @@ import numpy as np
 
 from rgbt.checks import check_choice, check_range
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
-from rgbt.transforms.joint import check_lengths, draw_view, short_edge_hw
-from rgbt.transforms.photometric import ColourJitter
+from rgbt.transforms.joint import View, check_lengths, draw_view, short_edge_hw
+from rgbt.transforms.on_batch import Drawn, DrawnBatch
+from rgbt.transforms.photometric import ColourJitter, Colours
 from rgbt.types import Sample
 
 
@@ -26,7 +28,7 @@ class CrmTransform:
     Paper: random crop, colour jitter and horizontal flip of ordinary 8-bit images:
         ``colour="intended"``. Images stay uint8 and are resized as such (rounded).
     Released: images are float32 before resizing, which changes what the colour steps do
-        (`ColourJitter.rgb`): ``colour="released"``. Values between steps are not rounded.
+        (`Colours.rgb`): ``colour="released"``. Values between steps are not rounded.
     Both resize bilinearly with half-pixel centres and without antialiasing, and labels by nearest.
 
     Args:
@@ -97,6 +99,40 @@ class CrmTransform:
             sample: as it lies on disk; without a label, all pixels are ignored.
             rng: every draw comes from here.
         """
+        view, colours = self._draw(sample, rng)
+        # Colours change pixel by pixel, so that it does not matter that the flip comes before.
+        example = viewed(sample, view, self.dtype, track_position=self.track_position)
+        rgb = colours.rgb(example.rgb)
+        thermal = colours.thermal(example.thermal)
+        return replace(
+            example,
+            rgb=rgb.astype(self.dtype, copy=False),
+            thermal=thermal.astype(self.dtype, copy=False),
+        )
+
+    @property
+    def works_on_batches(self) -> bool:
+        """Whether `drawn` and `stack` make what `train` makes: of uint8 images alone."""
+        return self.dtype == np.uint8
+
+    def drawn(self, sample: Sample, rng: np.random.Generator) -> Drawn:
+        """What `train` would read and do, not done yet; the same draws.
+
+        Args:
+            sample: as it lies on disk; without a label, all pixels are ignored.
+            rng: every draw comes from here.
+        """
+        return Drawn.of(sample, *self._draw(sample, rng))
+
+    def stack(self, drawn: Sequence[Drawn]) -> DrawnBatch:
+        """Examples of one size in one value, which `DrawnBatch.to` augments on a device.
+
+        Raises:
+            InputError: sizes differ.
+        """
+        return DrawnBatch.of(drawn, track_position=self.track_position)
+
+    def _draw(self, sample: Sample, rng: np.random.Generator) -> tuple[View, Colours]:
         source_hw = image_hw(sample)
         resized_hw = source_hw
         if self.sizes is not None:
@@ -104,15 +140,7 @@ class CrmTransform:
             resized_hw = short_edge_hw(source_hw, short_edge, self.max_size)
         crop_hw = self.crop_hw or resized_hw
         view = draw_view(source_hw, resized_hw, crop_hw, self.flip_probability, rng)
-        # Colours change pixel by pixel, so that it does not matter that the flip comes before.
-        example = viewed(sample, view, self.dtype, track_position=self.track_position)
-        rgb = self.jitter.rgb(example.rgb, rng)
-        thermal = self.jitter.thermal(example.thermal, rng)
-        return replace(
-            example,
-            rgb=rgb.astype(self.dtype, copy=False),
-            thermal=thermal.astype(self.dtype, copy=False),
-        )
+        return view, self.jitter.draw(rng)
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""

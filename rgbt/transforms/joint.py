@@ -28,6 +28,17 @@ class Part(NamedTuple):
     width: int
 
 
+class Taps(NamedTuple):
+    """What is read of one axis, (n,) int64 each.
+
+    ``((256 - weight) * image[first] + weight * image[second]) / 256``
+    """
+
+    first: Indices
+    second: Indices
+    weight: Indices
+
+
 @dataclass(frozen=True)
 class View:
     """A window of the resized image, mirrored or not.
@@ -87,6 +98,18 @@ class View:
         part = self._part()
         columns = part.left + nearest_source(part.width, self.resized_hw[1])[self._span(1)]
         return columns[::-1] if self.flipped else columns
+
+    def taps(self) -> tuple[Taps, Taps]:
+        """What `bilinear` reads of a uint8 image for every row, and every column, of the view."""
+        part = self._part()
+        rows = bilinear_taps(part.height, self.resized_hw[0], self._span(0))
+        columns = bilinear_taps(part.width, self.resized_hw[1], self._span(1))
+        if self.flipped:
+            columns = Taps(*(each[::-1] for each in columns))
+        return (
+            Taps(part.top + rows.first, part.top + rows.second, rows.weight),
+            Taps(part.left + columns.first, part.left + columns.second, columns.weight),
+        )
 
     def position(self) -> NDArray[np.float32]:
         """(2, h, w) float32: (row, column) in the original image of every pixel of the view.
@@ -206,6 +229,27 @@ def nearest_source(source: int, resized: int) -> Indices:
     index = np.floor(np.arange(resized, dtype=np.float32) * factor).astype(np.int64)
     clipped: Indices = np.minimum(index, source - 1)
     return clipped
+
+
+def bilinear_taps(source: int, resized: int, span: slice) -> Taps:
+    """What "exact" bilinear resizing of uint8 images reads of one axis, with OpenCV's rounding.
+
+    Pixel i samples at s (i + 1/2) - 1/2 with s = source / resized, and never outside of the axis;
+    weights are rounded to 1/256.
+
+    Args:
+        source: length of the original axis.
+        resized: length of the resized axis.
+        span: which of its pixels.
+    """
+    # The reciprocal of a quotient, as OpenCV computes it: rounding decides at ties.
+    step = 1.0 / (resized / source)
+    place = step * (np.arange(resized, dtype=np.float64)[span] + 0.5) - 0.5
+    first = np.floor(place).astype(np.int64)
+    weight = np.rint((place - first) * 256).astype(np.int64)
+    weight[(first < 0) | (first >= source - 1)] = 0
+    first = first.clip(0, source - 1)
+    return Taps(first, np.minimum(first + 1, source - 1), weight)
 
 
 @dataclass(frozen=True)

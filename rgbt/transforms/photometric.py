@@ -1,7 +1,9 @@
 """Colour jitter in the order of SSD: brightness, contrast, saturation, hue.
 
 One code path for uint8 and float32 images. What the release does to float images differs from what
-it means to do, only because OpenCV's HSV has other units there; see `ColourJitter.rgb`.
+it means to do, only because OpenCV's HSV has other units there; see `Colours.rgb`.
+
+On the batch the same changes are made by `rgbt.transforms.on_batch`, with the same bits.
 """
 
 from __future__ import annotations
@@ -16,6 +18,12 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, check_range
 
 Image = NDArray[Any]
+
+LEVELS = np.arange(256, dtype=np.uint8)
+"""Every value of an 8-bit image."""
+
+WIDEST_VECTOR = 64
+"""8-bit values that the widest vector unit takes at a time (AVX-512)."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +64,56 @@ class ColourJitter:
                     f"[{low:g}, {high:g}]."
                 )
 
-    def rgb(self, image: Image, rng: np.random.Generator) -> Image:
-        """Brightness; then, with even odds, contrast, saturation, hue or saturation, hue, contrast.
+    def draw(self, rng: np.random.Generator) -> Colours:
+        """What happens to one example; every draw comes from `rng`."""
+        brightness = self._drawn(rng, -self.brightness_delta, self.brightness_delta)
+        # The even odds of the order belong to SSD, whatever the probability of each change.
+        contrast_first = bool(rng.random() < 0.5)
+        contrast = self._drawn(rng, *self.contrast_range) if contrast_first else None
+        saturation = self._drawn(rng, *self.saturation_range)
+        hue = None
+        if self._happens(rng):
+            hue = int(rng.integers(-self.hue_delta, self.hue_delta + 1))
+        if not contrast_first:
+            contrast = self._drawn(rng, *self.contrast_range)
+        return Colours(
+            brightness=brightness,
+            contrast_first=contrast_first,
+            contrast=contrast,
+            saturation=saturation,
+            hue=hue,
+            thermal_contrast=self._drawn(rng, *self.thermal_contrast_range),
+        )
+
+    def _happens(self, rng: np.random.Generator) -> bool:
+        return bool(rng.random() < self.probability)
+
+    def _drawn(self, rng: np.random.Generator, low: float, high: float) -> float | None:
+        return rng.uniform(low, high) if self._happens(rng) else None
+
+
+@dataclass(frozen=True)
+class Colours:
+    """Changes of one example, drawn by `ColourJitter.draw`; None where one does not happen.
+
+    Attributes:
+        brightness: added to RGB, grey levels.
+        contrast_first: whether contrast comes before saturation and hue, or after them.
+        contrast: factor of RGB.
+        saturation: factor of the HSV saturation.
+        hue: added hue, whole steps in OpenCV's units.
+        thermal_contrast: factor of thermal.
+    """
+
+    brightness: float | None
+    contrast_first: bool
+    contrast: float | None
+    saturation: float | None
+    hue: int | None
+    thermal_contrast: float | None
+
+    def rgb(self, image: Image) -> Image:
+        """Brightness; then contrast, saturation, hue or saturation, hue, contrast.
 
         A uint8 image stays uint8 to the end, which is what is meant. A float32 image becomes uint8
         with the first brightness or contrast change; a saturation or hue change that comes before
@@ -67,55 +123,37 @@ class ColourJitter:
 
         Args:
             image: (H, W, 3), uint8 or float32, RGB, 0..255.
-            rng: every draw comes from here.
 
         Returns:
             (H, W, 3), uint8 or float32, 0..255.
         """
-        if self._happens(rng):
-            delta = rng.uniform(-self.brightness_delta, self.brightness_delta)
-            image = scale_and_truncate(image, offset=delta)
-        # The even odds of the order belong to SSD, whatever the probability of each change.
-        contrast_first = rng.random() < 0.5
-        if contrast_first:
-            image = self._contrast(image, self.contrast_range, rng)
-        image = self._hue(self._saturation(image, rng), rng)
-        if not contrast_first:
-            image = self._contrast(image, self.contrast_range, rng)
-        return image
+        if self.brightness is not None:
+            image = scale_and_truncate(image, offset=self.brightness)
+        if self.contrast_first:
+            image = _contrast(image, self.contrast)
+        if self.saturation is not None:
+            image = scale_saturation(image, self.saturation)
+        if self.hue is not None:
+            image = shift_hue(image, self.hue)
+        return image if self.contrast_first else _contrast(image, self.contrast)
 
-    def thermal(self, image: Image, rng: np.random.Generator) -> Image:
-        """Contrast alone, with its own draw.
+    def thermal(self, image: Image) -> Image:
+        """Contrast alone.
 
         Args:
             image: (H, W), uint8 or float32, 0..255.
-            rng: every draw comes from here.
         """
-        return self._contrast(image, self.thermal_contrast_range, rng)
+        return _contrast(image, self.thermal_contrast)
 
-    def _happens(self, rng: np.random.Generator) -> bool:
-        return bool(rng.random() < self.probability)
 
-    def _contrast(
-        self, image: Image, limits: tuple[float, float], rng: np.random.Generator
-    ) -> Image:
-        return scale_and_truncate(image, rng.uniform(*limits)) if self._happens(rng) else image
-
-    def _saturation(self, image: Image, rng: np.random.Generator) -> Image:
-        if not self._happens(rng):
-            return image
-        return scale_saturation(image, rng.uniform(*self.saturation_range))
-
-    def _hue(self, image: Image, rng: np.random.Generator) -> Image:
-        if not self._happens(rng):
-            return image
-        return shift_hue(image, int(rng.integers(-self.hue_delta, self.hue_delta + 1)))
+def _contrast(image: Image, factor: float | None) -> Image:
+    return image if factor is None else scale_and_truncate(image, factor)
 
 
 def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -> NDArray[np.uint8]:
     """``image * factor + offset``, clipped to 0..255 and truncated to whole numbers (uint8)."""
     if image.dtype == np.uint8:  # the same arithmetic, done once for each of the 256 values
-        table = scale_and_truncate(np.arange(256, dtype=np.float32), factor, offset)
+        table = scale_and_truncate(LEVELS.astype(np.float32), factor, offset)
         return np.asarray(cv2.LUT(image, table), np.uint8)
     scaled = image.astype(np.float32) * np.float32(factor) + np.float32(offset)
     return scaled.clip(0, 255).astype(np.uint8)
@@ -132,8 +170,10 @@ def scale_saturation(image: Image, factor: float) -> Image:
         Same shape and dtype.
     """
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+    if hsv.dtype == np.uint8:
+        return _rgb_of(_mapped(hsv, 1, scale_and_truncate(LEVELS, factor)))
     hsv[..., 1] = scale_and_truncate(hsv[..., 1], factor)
-    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    return _rgb_of(hsv)
 
 
 def shift_hue(image: Image, shift: int) -> Image:
@@ -147,5 +187,31 @@ def shift_hue(image: Image, shift: int) -> Image:
         Same shape and dtype.
     """
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+    if hsv.dtype == np.uint8:
+        turned = (LEVELS.astype(np.int32) + shift) % 180
+        return _rgb_of(_mapped(hsv, 0, turned.astype(np.uint8)))
     hsv[..., 0] = (hsv[..., 0].astype(np.int32) + shift) % 180
-    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    return _rgb_of(hsv)
+
+
+def _mapped(hsv: Image, channel: int, table: NDArray[np.uint8]) -> Image:
+    """One channel of an 8-bit image through a table of its 256 values."""
+    tables = np.repeat(LEVELS[:, None], 3, axis=1)
+    tables[:, channel] = table.ravel()
+    return np.asarray(cv2.LUT(hsv, tables[None]))
+
+
+def _rgb_of(hsv: Image) -> Image:
+    """HSV to RGB by OpenCV, the same for a pixel wherever it lies in a row.
+
+    OpenCV 5 truncates in its vector code and rounds in what is left of a row of 8-bit pixels, so
+    that a pixel would depend on the width of the image and on the processor. One long row of a
+    length that every vector divides has nothing left.
+    """
+    if hsv.dtype != np.uint8:
+        return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    pixels = hsv.reshape(-1, 3)
+    rest = -len(pixels) % WIDEST_VECTOR
+    row = np.concatenate([pixels, np.zeros((rest, 3), np.uint8)]) if rest else pixels
+    rgb = cv2.cvtColor(row[None], cv2.COLOR_HSV2RGB)[0, : len(pixels)]
+    return np.asarray(rgb).reshape(hsv.shape)

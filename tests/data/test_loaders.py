@@ -102,6 +102,18 @@ def test_same_batches_whatever_the_workers(dataset: MFNet) -> None:
             assert_equal(one, other)
 
 
+def test_same_batches_on_the_device(dataset: MFNet) -> None:
+    """Augmented as they are moved: whatever the workers, and what the loader makes."""
+    expected = list(train_batches(dataset, "train", crm(), settings(), 7, range(5)))
+    for workers in (0, 2):
+        changed = settings(num_workers=workers, augment="device")
+        found = train_batches(dataset, "train", crm(), changed, 7, range(5))
+        for one, other in zip(expected, found, strict=True):
+            assert not isinstance(other, Batch)
+            assert one.name == other.name
+            assert_equal(one.to("cpu"), other.to("cpu"))
+
+
 def test_evaluation_does_not_depend_on_the_workers(dataset: MFNet) -> None:
     runs = [list(eval_batches(dataset, "train", crm(), settings(num_workers=n))) for n in (0, 2)]
     for one, other in zip(*runs, strict=True):

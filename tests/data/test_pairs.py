@@ -12,9 +12,9 @@ import torch
 from rgbt.checks import InputError
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.pairs import PairedBatches
+from rgbt.data.pairs import LoadedPair, PairedBatches
 from rgbt.transforms.thesis import ThesisTransform
-from rgbt.types import Batch, TwoDomains
+from rgbt.types import Batch
 
 DAY = [f"{number:05d}D" for number in range(1, 8)]
 NIGHT = [f"{number:05d}N" for number in range(1, 5)]
@@ -56,7 +56,7 @@ def assert_equal(one: Batch, other: Batch) -> None:
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
 
 
-def assert_equal_pairs(one: TwoDomains, other: TwoDomains) -> None:
+def assert_equal_pairs(one: LoadedPair, other: LoadedPair) -> None:
     assert_equal(one.source, other.source)
     assert_equal(one.target, other.target)
     assert one.step == other.step

@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.data.domains import Domain, Domains
+from rgbt.data.pairs import LoadedPair
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
-from rgbt.types import Batch, Output, TwoDomains, View
+from rgbt.types import Batch, Output, View
 
 K = 3
 LR, MOMENTUM = 0.5, 0.9
@@ -105,10 +106,10 @@ def images(purpose: str, number: int, confidence: bool = False) -> Batch:
     )
 
 
-def pairs(first: int = 0, confidence: bool = False) -> Iterator[TwoDomains]:
+def pairs(first: int = 0, confidence: bool = False) -> Iterator[LoadedPair]:
     for number in count(first):
         target = images("target", number, confidence=confidence)
-        yield TwoDomains(images("source", number), target, number)
+        yield LoadedPair(images("source", number), target, number)
 
 
 def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: Any) -> Trainer:

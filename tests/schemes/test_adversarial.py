@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
+from rgbt.data.pairs import LoadedPair
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.losses.adversarial import cross_entropy as verdict_entropy
@@ -482,4 +483,4 @@ def test_masks_of_queries_are_refused() -> None:
 def test_another_map_is_refused_when_it_is_judged() -> None:
     scheme = scheme_of(NETWORK, judged="logit")
     with pytest.raises(InputError, match="judged"):
-        list(scheme.phases(TwoDomains(images("s", 0), images("t", 0), 0).to("cpu"), generator_of))
+        list(scheme.phases(LoadedPair(images("s", 0), images("t", 0), 0).to("cpu"), generator_of))

@@ -2,18 +2,41 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 def default_cache() -> Path:
     """$XDG_CACHE_HOME/rgbt, or ~/.cache/rgbt where that is not set."""
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "rgbt"
+
+
+def cache_of(cache_dir: str | None) -> Path:
+    """The folder that the configuration names; None: `default_cache`."""
+    return Path(cache_dir).expanduser() if cache_dir else default_cache()
+
+
+def described(versions: Mapping[str, int], plan: DataclassInstance) -> str:
+    """A plan and the versions of what writes it, as text: what the name of its folder hashes."""
+    everything: dict[str, Any] = {**versions, **asdict(plan)}
+    return json.dumps(everything, sort_keys=True, indent=1)
+
+
+def key_of(text: str) -> str:
+    """12 hexadecimal digits that name what is described."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def written_once(folder: Path, plan: str, write: Callable[[Path], None]) -> Path:
