@@ -25,6 +25,8 @@ OWN = {
     "metrics": "auto",
     "split": "",
     "frames": "",
+    "degradation": "",
+    "severity": "",
     "missing": "refuse",
     "level": "0.95",
     "resamples": "10000",
@@ -48,6 +50,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA
     frames    of runs, counts of pairs of frames (python -m rgbt.consistency run=...): aligned or
               released (virtual views), next (consecutive frames); default: of single frames
+    degradation, severity  of runs, counts of failing images (python -m rgbt.robustness run=...):
+              degradation=noise severity=16
     missing   refuse, or leave_out: compare the images that both hold
     level     of the intervals;  resamples: their number;  seed: of the draws
     method    percentile or bca: how intervals over images are taken from the resamples
@@ -59,6 +63,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rich.markup import escape
 
     from analysis.results import open_counts
+    from analysis.robustness import under
     from analysis.uncertainty import compare
     from analysis.uncertainty.sentence import sentence
     from rgbt.tracking.terminal import rich_table, show
@@ -66,17 +71,22 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
     frames = _frames(arguments["frames"])
+    degradation, severity = arguments["degradation"], arguments["severity"]
+    _check_failing(degradation, severity, frames)
     out = out_folder(arguments["out"])
     _check_given(arguments)
     opened = [
         open_counts(arguments[side], arguments["runs_dir"], arguments["split"], frames)
         for side in "ab"
     ]
+    if degradation:
+        opened = [under(each, degradation, severity) for each in opened]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
     metrics = metrics_of(arguments["metrics"], [*a, *b], settings)
     comparison = compare(a, b, metrics, settings)
-    labels = _labels(opened)
+    failing = " ".join(word for word in (degradation, severity) if word)
+    labels = [f"{label} ({failing})" if failing else label for label in _labels(opened)]
     grid = comparison_grid(comparison, labels)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
@@ -206,6 +216,13 @@ def _frames(text: str) -> Frames:
     if text:
         check_choice("frames", text, PROTOCOLS)
     return cast("Frames", text)
+
+
+def _check_failing(degradation: str, severity: str, frames: str) -> None:
+    if severity and not degradation:
+        raise InputError("'severity' has no effect without degradation=..., for example noise.")
+    if degradation and frames:
+        raise InputError(f"degradation={degradation} is of single frames; leave frames= out.")
 
 
 def _check_given(arguments: dict[str, str]) -> None:

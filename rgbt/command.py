@@ -154,7 +154,7 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
             raise
         terminated = isinstance(interrupt, Terminated)
         word, code = ("stopped by SIGTERM", 143) if terminated else ("interrupted", 130)
-        return _say(f"{word}; a training called again goes on from its checkpoint.", code)
+        return _say(f"{word}; given again, the same command goes on where it was.", code)
 
 
 def _say(sentence: str, code: int) -> int:

@@ -6,11 +6,14 @@ Counts are written, and the tables that follow from them are shown.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast, get_args
+from typing import TYPE_CHECKING, cast, get_args
 
-from rgbt.checks import check_choice
+from rgbt.checks import InputError, check_choice
 from rgbt.command import plain_command
 from rgbt.data.domains import TestedHead
+
+if TYPE_CHECKING:
+    from rgbt.degraded import Failure
 
 OWN = {
     "run": "",
@@ -19,6 +22,8 @@ OWN = {
     "modality": "default",
     "regions": "as trained",
     "head": "as trained",
+    "degradation": "none",
+    "severity": "",
     "checkpoint": "best",
     "out": "",
 }
@@ -33,14 +38,20 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
     head      of a network with a head per domain: own, source or target
+    degradation  of the images: a file of conf/degradation such as thermal_removed or noise, with a
+              severity: degradation=noise severity=16; python -m rgbt.robustness takes all of them
     checkpoint  best (by validation mIoU) or last
     out       file of the counts; default: evaluations/ in the run folder
-    overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1
+    overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
+              degradation: degradation.block=16 degradation.seed=1
     """
+    from rgbt.degraded import own_words
     from rgbt.session import evaluate, result_tables, view_of
     from rgbt.stored import open_trained
     from rgbt.tracking.terminal import result_view, show
 
+    words, overrides = own_words(overrides)
+    failure = _failure(arguments, words)
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     runs_dir = Path(arguments["runs_dir"])
@@ -48,17 +59,21 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     session = stored.session
     view = view_of(session, arguments["modality"])
     head = _head(arguments["head"])
+    if failure is not None:
+        session = failure.applied(session, arguments["split"])
     found = evaluate(session, session.model, arguments["split"], view=view, head=head)
     counts = found.counts
     stem = "_".join(
         [session.dataset.name, counts.split, view, counts.partition]
         + ([] if head is None else [f"{head}-head"])
+        + ([] if failure is None else [failure.mark])
         + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
     )
     path = Path(arguments["out"] or stored.folder / f"{stem}.npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)
     label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
+    label += f", {failure.told}" if failure else ""
     tables = result_tables(counts, session.regions, label, stored.step)
     heads = session.domains.told(head or session.domains.tested_head)
     places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
@@ -71,6 +86,19 @@ def _head(asked: str) -> TestedHead | None:
         return None
     check_choice("head", asked, get_args(TestedHead))
     return cast(TestedHead, asked)
+
+
+def _failure(arguments: dict[str, str], words: list[str]) -> Failure | None:
+    """The degradation and its severity; None where none is asked for."""
+    from rgbt.degraded import choose
+
+    if arguments["degradation"] != OWN["degradation"]:
+        return choose(arguments["degradation"], words).at(arguments["severity"])
+    idle = [*(["severity"] if arguments["severity"] else []), *words]
+    if idle:
+        key = idle[0].partition("=")[0]
+        raise InputError(f"'{key}' has no effect without degradation=..., for example noise.")
+    return None
 
 
 if __name__ == "__main__":

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from omegaconf import DictConfig
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config import build
+from rgbt.config import build, conf_dir
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
@@ -23,10 +23,10 @@ from rgbt.losses.adversarial import cross_entropy, judged, least_squares
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
 from rgbt.randomness import derive, numpy_generator, torch_generator
-from rgbt.session import Session, open_session
+from rgbt.session import Session, decode_ahead, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import VIEWS, Masker, Sample, View
+from rgbt.types import VIEWS, Loadable, Masker, Sample, View
 
 FUNCTIONS = {
     "sdc": sdc,
@@ -70,14 +70,15 @@ class Prepared:
             self.datasets["source"], self.session.loading, self.splits()["source"]
         )
 
-    def batches(self, steps: range) -> Batches | PairedBatches:
+    def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.config.seed
+        loading = replace(session.loading, augment=_where_to_augment(session))
         # Each domain is shuffled and augmented by draws of its own.
         seeds = {"source": seed, "target": derive(seed, "target domain")}
         found = [
             train_batches(
-                *(self.datasets[name], split, session.transform, session.loading),
+                *(self.datasets[name], split, session.transform, loading),
                 *(seeds[name], steps),
             )
             for name, split in self.splits().items()
@@ -141,17 +142,14 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     for name, domain in domains.named.items():
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
+    _where_to_augment(session)
     masker: Masker = build(config.masker)
     if session.transform.crop_hw is not None and not masker.hides_nothing:
         # One draw for nothing: cells that do not fit the crop are told before the run is begun.
         centre = torch.zeros(1, 2, dtype=torch.int64)
         masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
-    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
-    if expected and session.weights is None:
-        tell(
-            "the published recipe starts from ImageNet weights, this run from random ones; name a "
-            "file with pretrained=..., or expect less than published."
-        )
+    if not rehearsal:
+        _tell_what_is_not_as_published(session)
     loss = build(config.loss)
     _check_loss(loss, session)
     model = session.fabric.setup_module(session.model)
@@ -159,7 +157,51 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     _check_domains(scheme, session)
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
+    if not rehearsal:
+        decode_ahead(session, *(domain.split for domain in domains.named.values()))
     return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
+
+
+def _tell_what_is_not_as_published(session: Session) -> None:
+    """Remarks on what is no mistake, and yet not what a paper's numbers were made with."""
+    config, data = session.config, session.dataset
+    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
+    if expected and session.weights is None:
+        tell(
+            "the published recipe starts from ImageNet weights, this run from random ones; name a "
+            "file with pretrained=..., or expect less than published."
+        )
+    meant = config.recipe.dataset
+    if config.scale.name == "paper" and meant != data.name:
+        known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
+        tell(
+            f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
+            + (f"choose recipe={data.name}, or " if known else "")
+            + "set recipe.train_sizes, crop_hw, batch_size, max_steps and eval_every, then "
+            f"recipe.dataset={data.name}."
+        )
+    picked = session.trainer.selection_split
+    if session.trainer.tested == "best" and picked != "test":
+        shared = set(data.names(picked)) & set(data.names("test"))
+        if shared:
+            tell(
+                f"trainer.selection_split={picked}: {len(shared)} of its {len(data.names(picked))} "
+                "images are test images, so that the best checkpoint is picked on what is reported."
+            )
+
+
+def _where_to_augment(session: Session) -> Literal["loader", "device"]:
+    """What `LoaderSettings.augment` comes to; InputError where the transform cannot do it."""
+    asked = session.loading.augment
+    can = getattr(session.transform, "works_on_batches", False)
+    if asked == "device" and not can:
+        raise InputError(
+            f"data.augment=device, but {type(session.transform).__name__} works on single images "
+            "as it is set; choose transform=crm, or data.augment=loader."
+        )
+    if asked == "auto":
+        return "device" if can and session.fabric.device.type == "cuda" else "loader"
+    return asked
 
 
 def _labelled(session: Session, name: str, domain: Domain) -> Dataset:

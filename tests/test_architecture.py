@@ -15,7 +15,7 @@ ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
 FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
 COMMON = {"rgbt.types", "rgbt.checks", "rgbt.geometry", "rgbt.randomness"}
-ISLANDS = {"data", "transforms", "maskers", "models", "losses", "metrics"}
+ISLANDS = {"data", "degradations", "transforms", "maskers", "models", "losses", "metrics"}
 ALLOWED = {
     **{island: COMMON | {f"rgbt.{island}"} for island in ISLANDS},
     "schemes": COMMON | {"rgbt.schemes"},
@@ -42,6 +42,9 @@ MEETING_PLACES = {
     "stored.py",
     "two_frames.py",
     "consistency.py",
+    "degraded.py",
+    "degradations/__main__.py",
+    "robustness.py",
     "training.py",
     "prepared.py",
     "earlier.py",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,7 @@ class Entry:
         make: draws it.
         metric: the partition unless ``metric=`` is given.
         idle: keys of the configuration below `groups` that take no effect nevertheless.
+        numbers: what it shows as text, written beside it by the ending of the file; None: nothing.
     """
 
     shows: str
@@ -35,6 +36,7 @@ class Entry:
     make: Callable[[Given], Figure]
     metric: str = "ring5"
     idle: tuple[str, ...] = ("metric.absent",)
+    numbers: Callable[[Given], Mapping[str, str]] | None = None
 
 
 STATISTICS = "statistics= (of analysis.spatial) or dataset="
@@ -43,6 +45,11 @@ QUALITATIVE = "dataset=, methods=label:folder of predictions"
 PANEL = ("methods", "names", "pick", "rows", "split", "layout", "format", "suffix")
 RUNS = "runs= (run, group or counts, with labels: label:run)"
 OF_RUNS = ("runs", "runs_dir", "split", "absent")
+FAILING = (
+    "runs= (run, group or folder of python -m rgbt.robustness, with labels: label:run)",
+    (*OF_RUNS, "degradations"),
+    (),
+)
 OF_INTERVALS = ("band", "resamples", "level", "blocks")
 BOTH = ("dataset", "metric")
 
@@ -124,6 +131,18 @@ FIGURES: dict[str, Entry] = {
         (),
         make_papers.multihead_fig3,
     ),
+    "robustness": Entry(
+        "mIoU as images fail, one panel per degradation, one line per method",
+        *FAILING,
+        make_methods.robustness,
+        numbers=make_methods.robustness_numbers,
+    ),
+    "robustness/relative": Entry(
+        "the same in percent of the mIoU on clean images",
+        *FAILING,
+        make_methods.robustness_relative,
+        numbers=make_methods.robustness_numbers,
+    ),
     "regions/heat": Entry(
         "mIoU of each region as a heat map, one per method",
         RUNS,
@@ -141,8 +160,10 @@ FIGURES: dict[str, Entry] = {
 }
 
 
-def make(figure: str, values: dict[str, str], overrides: list[str]) -> Figure:
-    """The figure called `figure`.
+def make(
+    figure: str, values: dict[str, str], overrides: list[str]
+) -> tuple[Figure, Mapping[str, str]]:
+    """The figure called `figure`, and its numbers as text by the ending of their file.
 
     Args:
         figure: a key of `FIGURES`.
@@ -165,4 +186,4 @@ def make(figure: str, values: dict[str, str], overrides: list[str]) -> Figure:
     given = Given(figure, values, tuple(overrides), entry.metric)
     if not given.has_dataset:
         given.refuse([key for key in words if key.startswith("dataset.")], "dataset=...")
-    return entry.make(given)
+    return entry.make(given), {} if entry.numbers is None else entry.numbers(given)

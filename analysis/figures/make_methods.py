@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from analysis.figures.panels import ReadPrediction
     from analysis.figures.profiles import Profile
+    from analysis.figures.robustness import Panel
     from analysis.predictions.images import Reader
 
 ABSENT = ("released", "exclude")
@@ -106,6 +107,43 @@ def _image_hw(size: str) -> tuple[int, int]:
     if max(height, width) > LONGEST * min(height, width):
         raise InputError(f"size={size}: one side is more than {LONGEST} times the other.")
     return height, width
+
+
+def robustness(given: Given) -> Figure:
+    """MIoU as images fail."""
+    from analysis.figures.robustness import draw
+
+    return draw(_failing(given), relative=False)
+
+
+def robustness_relative(given: Given) -> Figure:
+    """The same in percent of the clean mIoU."""
+    from analysis.figures.robustness import draw
+
+    return draw(_failing(given), relative=True)
+
+
+def robustness_numbers(given: Given) -> dict[str, str]:
+    """The numbers of both."""
+    from analysis.figures.robustness import numbers
+
+    return numbers(_failing(given))
+
+
+def _failing(given: Given) -> tuple[Panel, ...]:
+    from analysis.figures.robustness import panels
+    from analysis.results import split_words
+    from analysis.robustness import Training, trainings
+
+    runs_dir, split = given.get("runs_dir", "runs"), given.get("split", "")
+    absent: Any = given.choice("absent", ABSENT)
+    found: dict[str, list[Training]] = {}
+    for word in split_words(given.need("runs", "runs or groups; label:run names one")):
+        label, colon, place = word.partition(":")
+        for each in trainings(place if colon else label, Path(runs_dir).expanduser(), split):
+            found.setdefault(label if colon else each.label, []).append(each)
+    rows = [word.strip() for word in given.get("degradations", "").split(",") if word.strip()]
+    return panels(found, absent, rows)
 
 
 def region_profile(given: Given) -> Figure:

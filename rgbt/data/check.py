@@ -1,7 +1,7 @@
 """Command that reads a whole data set and reports what it holds and what is wrong.
 
     python -m rgbt.data.check dataset=mfnet dataset.root=...
-    python -m rgbt.data.check dataset=freiburg dataset.root=...
+    python -m rgbt.data.check dataset=kp dataset.root=...
 
 Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: problems, 2: wrong input.
 """
@@ -44,11 +44,13 @@ def print_report(dataset: LabelledDataset, report: Report) -> None:
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
-    console.print(f"{dataset.name} ({layout_of(dataset).title}): {dataset.root}", soft_wrap=True)
+    layout = layout_of(dataset)
+    console.print(f"{dataset.name} ({layout.title}): {dataset.root}", soft_wrap=True)
     if report.splits:
         console.print(split_table(report.splits))
-        labelled = tuple(split for split in report.splits if split.pixels.any())
-        console.print(class_table(labelled, (*dataset.classes, "ignored")))
+        labelled = (split for split in report.splits if split.pixels.any())
+        own = tuple(split for split in labelled if not layout.repeats(split.split))
+        console.print(class_table(own, (*dataset.classes, "ignored")))
     for kind, lines in (("note", report.notes), ("problem", report.problems)):
         for line in lines:
             console.print(f"{kind}: {line}", soft_wrap=True, markup=False, highlight=False)

@@ -138,11 +138,7 @@ class Decoded:
                 store.check_space(size * len(missing))
                 with closing(self._fresh(missing, advance)) as frames:
                     store.add(frames)
-        self._placed |= {
-            name: store.frames[name]
-            for name in wanted
-            if name in store.frames and name not in self._unreadable
-        }
+        self._placed |= {name: store.frames[name] for name in wanted if name in store.frames}
 
     def read(self, name: str) -> Sample:
         """The sample as `source.read` returns it.

@@ -6,6 +6,7 @@ thermal image lies in the alpha slot, so that nothing may treat the four channel
 
 from __future__ import annotations
 
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,25 +14,32 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rgbt.checks import InputError
+from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, read_image, read_whole
+from rgbt.data.integrity import within as within
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
 Counts = NDArray[np.uint16]
 
 
-def read_packed(path: Path) -> tuple[Array, Array]:
+def read_packed(
+    path: Path, advice: str = "dataset.layout=folders for separate images"
+) -> tuple[Array, Array]:
     """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal.
+
+    `advice` says what to do with a file of other channels.
 
     Raises:
         InputError: missing, not decodable, not 8 bit, or not four channels.
     """
     image = _decode(path)
-    if _channels(image) != 4:
+    if channels(image) != 4:
         raise InputError(
-            f"{path}: expected 4 channels (red, green, blue, thermal), got {_channels(image)}; "
-            "use the original file, or dataset.layout=folders for separate images."
+            f"{path}: expected 4 channels (red, green, blue, thermal), got {channels(image)}; "
+            f"use the original file, or {advice}."
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8), image[..., 3].copy()
 
@@ -45,7 +53,7 @@ def read_channels(rgb_path: Path, thermal_path: Path) -> tuple[Array, Array]:
         InputError: missing, not decodable, not 8 bit, or other channels.
     """
     advice = "dataset.layout=packed reads images with thermal as fourth channel"
-    return read_rgb(rgb_path, advice), _read_thermal(thermal_path)
+    return read_rgb(rgb_path, advice), read_thermal(thermal_path)
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:
@@ -55,11 +63,20 @@ def read_rgb(path: Path, advice: str = "use the original file") -> Array:
         InputError: missing, not decodable, not 8 bit, or other channels.
     """
     rgb = _decode(path)
-    if _channels(rgb) != 3:
+    if channels(rgb) != 3:
         raise InputError(
-            f"{path}: expected 3 channels (red, green, blue), got {_channels(rgb)}; {advice}."
+            f"{path}: expected 3 channels (red, green, blue), got {channels(rgb)}; {advice}."
         )
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_thermal(path: Path) -> Array:
+    """Grey levels of a thermal image, (H, W) uint8, of one channel or three equal ones.
+
+    Raises:
+        InputError: missing, not decodable, not 8 bit, or other channels.
+    """
+    return one_channel(_decode(path), path)
 
 
 def read_counts(path: Path) -> Counts:
@@ -68,7 +85,7 @@ def read_counts(path: Path) -> Counts:
     Raises:
         InputError: missing, not decodable, not 16 bit, or several channels.
     """
-    counts = _decoded(path)
+    counts = decode(path)
     if counts.dtype != np.uint16:
         raise InputError(
             f"{path}: expected a thermal image of 16 bits (counts of the camera), got "
@@ -89,14 +106,11 @@ def read_label(path: Path, num_classes: int) -> Array:
     Raises:
         InputError: missing, not decodable, not 8 bit, several channels, or another value.
     """
-    label = _decode(path)
-    if _channels(label) != 1:
-        raise InputError(
-            f"{path}: expected one channel of class indices, got {_channels(label)} channels; "
-            "save the indices themselves, not their colours."
-        )
-    _check_values(label, num_classes, path)
-    return label
+    label = read_indices(path)
+    if label.dtype != np.uint8:
+        raise InputError(f"{path}: expected 8 bits per channel, got {label.dtype}.")
+    check_values(label, num_classes, path)
+    return np.asarray(label, np.uint8)
 
 
 def read_label_array(path: Path, num_classes: int) -> Array:
@@ -105,26 +119,114 @@ def read_label_array(path: Path, num_classes: int) -> Array:
     Raises:
         InputError: missing, no array of whole numbers (H, W), or a value that is no class.
     """
-    if not path.is_file():
-        raise InputError(f"{path} is missing.")
-    try:
-        label = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    label = read_array(path, "class indices, whole numbers of shape (rows, columns)")
+    if label.dtype.kind not in "iu" or label.ndim != 2:
         raise InputError(
-            f"{path} cannot be read as an array ({error}): the file is damaged or none; replace "
-            "it, or use data.on_error=skip to leave it out."
-        ) from error
-    if not isinstance(label, np.ndarray) or label.dtype.kind not in "iu" or label.ndim != 2:
-        what = f"{label.shape} {label.dtype}" if isinstance(label, np.ndarray) else "several arrays"
-        raise InputError(
-            f"{path}: expected class indices, whole numbers of shape (rows, columns), got {what}; "
-            "use the original file."
+            f"{path}: expected class indices, whole numbers of shape (rows, columns), got "
+            f"{label.shape} {label.dtype}; use the original file."
         )
-    _check_values(label, num_classes, path)
+    check_values(label, num_classes, path)
     return label.astype(np.uint8)
 
 
-def _check_values(label: NDArray[Any], num_classes: int, path: Path) -> None:
+def read_indices(path: Path) -> NDArray[Any]:
+    """Whole numbers (H, W) of an image of one channel, at its own depth, as they were written.
+
+    A PNG with a palette holds indices, which are returned; its colours are not looked at.
+
+    Raises:
+        InputError: missing, not decodable, several channels, or a kind of file that does not keep
+            numbers as they are: JPEG, and grey PNG of less than 8 bits, which decoders stretch.
+    """
+    data = read_image(path)
+    depth, colours = data[24:26] if data.startswith(PNG) and len(data) > 25 else (8, 0)
+    if data.startswith(JPEG) or (colours == 0 and depth < 8):
+        kind = "a JPEG, which changes values" if data.startswith(JPEG) else f"a PNG of {depth} bit"
+        raise InputError(
+            f"{path}: expected class indices as they were written, got {kind}; save labels as PNG "
+            "of 8 bits."
+        )
+    label = _palette_indices(data, path) if colours == 3 else _decoded(data, path)
+    if channels(label) != 1:
+        raise InputError(
+            f"{path}: expected one channel of class indices, got {channels(label)} channels; "
+            "save the indices themselves, not their colours."
+        )
+    return label
+
+
+def read_colours(path: Path) -> Array:
+    """Colours of a label (H, W, 3) uint8, in the order R, G, B, as they were written.
+
+    A PNG with a palette is read as its colours; a fourth channel that hides nothing is dropped.
+
+    Raises:
+        InputError: missing, not decodable, not 8 bit, other channels, or a JPEG.
+    """
+    data = read_image(path)
+    if data.startswith(JPEG):
+        raise InputError(
+            f"{path}: expected colours as they were written, got a JPEG, which changes them; save "
+            "labels as PNG."
+        )
+    image = _decoded(data, path)
+    if channels(image) == 4 and (image[..., 3] == np.iinfo(image.dtype).max).all():
+        image = image[..., :3]
+    if channels(image) != 3 or image.dtype != np.uint8:
+        raise InputError(
+            f"{path}: expected colours (red, green, blue of 8 bits), got {channels(image)} "
+            f"channel(s) of {image.dtype}; a label of one channel holds indices, see dataset.ids."
+        )
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_array(path: Path, what: str) -> NDArray[Any]:
+    """The array of a `.npy` file; `what` it should hold, for the message.
+
+    Raises:
+        InputError: missing, damaged, or something else.
+    """
+    data = read_whole(path)
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path} cannot be read as an array ({error}): the file is damaged or none; {LEFT_OUT}."
+        ) from error
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{path}: expected {what}, got several arrays; use the original file.")
+    return array
+
+
+def one_channel(thermal: NDArray[Any], path: Path) -> NDArray[Any]:
+    """(H, W) of (H, W) or of (H, W, 3) with equal channels; InputError for all else."""
+    if thermal.ndim == 2:
+        return thermal
+    equal = (thermal[..., :1] == thermal[..., 1:]).all()
+    if channels(thermal) != 3 or not equal:
+        raise InputError(
+            f"{path}: expected a thermal image of one channel or three equal ones, got "
+            f"{channels(thermal)} channels{'' if equal else ' that differ'}."
+        )
+    return thermal[..., 0].copy()
+
+
+def decode(path: Path) -> NDArray[Any]:
+    """An image as it lies, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
+
+    Raises:
+        InputError: missing, cut short, not decodable.
+    """
+    return _decoded(read_image(path), path)
+
+
+def channels(image: NDArray[Any]) -> int:
+    """Channels of (H, W) or (H, W, C)."""
+    return 1 if image.ndim == 2 else image.shape[2]
+
+
+def check_values(label: NDArray[Any], num_classes: int, path: Path) -> None:
+    """Refuse values that are neither a class nor 255, naming up to eight of them."""
     wrong = ((label < 0) | (label >= num_classes)) & (label != IGNORE)
     if wrong.any():
         values = ", ".join(str(value) for value in np.unique(label[wrong])[:8])
@@ -134,42 +236,29 @@ def _check_values(label: NDArray[Any], num_classes: int, path: Path) -> None:
         )
 
 
-def _read_thermal(path: Path) -> Array:
-    thermal = _decode(path)
-    if thermal.ndim == 2:
-        return thermal
-    equal = (thermal[..., :1] == thermal[..., 1:]).all()
-    if _channels(thermal) != 3 or not equal:
-        raise InputError(
-            f"{path}: expected a thermal image of one channel or three equal ones, got "
-            f"{_channels(thermal)} channels{'' if equal else ' that differ'}."
-        )
-    return thermal[..., 0].copy()
-
-
 def _decode(path: Path) -> Array:
-    image = _decoded(path)
+    image = decode(path)
     if image.dtype != np.uint8:
         raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
     return np.asarray(image, np.uint8)
 
 
-def _decoded(path: Path) -> NDArray[Any]:
-    """The file as it lies: unchanged means at any depth and with every channel."""
-    if not path.is_file():
-        copies = (
-            "; the list names a mirrored copy: write it, or point dataset.splits to a list without "
-            "such names"
-        )
-        raise InputError(f"{path} is missing{copies if path.stem.endswith('_flip') else ''}.")
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+def _decoded(data: bytes, path: Path) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # a header that asks for more pixels than there can be
+        image = None
     if image is None:
-        raise InputError(
-            f"{path} cannot be decoded, the file is damaged or no image; replace it, or use "
-            "data.on_error=skip to leave it out."
-        )
+        raise InputError(f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}.")
     return np.asarray(image)
 
 
-def _channels(image: Array) -> int:
-    return 1 if image.ndim == 2 else image.shape[2]
+def _palette_indices(data: bytes, path: Path) -> Array:
+    # OpenCV returns the colours of the palette, from which the indices cannot be told.
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return np.array(image, np.uint8)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}."
+        ) from error

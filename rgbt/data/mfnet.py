@@ -5,7 +5,6 @@ A reader only: it never resizes, augments or remaps, and it refuses what it cann
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ from rgbt.checks import InputError, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_channels, read_label, read_packed, within
 from rgbt.data.integrity import read_names
+from rgbt.data.named_files import hash_of_files, sample_of_one_size
 from rgbt.types import Sample
 
 Layout = Literal["auto", "packed", "folders"]
@@ -122,13 +122,9 @@ class MFNet:
         """
         label = self.label(name)
         rgb, thermal = self._read_images(name)
-        if rgb.shape[:2] != label.shape:
-            raise InputError(
-                f"'{name}': the image is {rgb.shape[0]}x{rgb.shape[1]} pixels but its label is "
-                f"{label.shape[0]}x{label.shape[1]}; both must have one size, see "
-                f"{self.label_path(name)}."
-            )
-        return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+        # A packed file stands for both of its images.
+        files = (self.image_paths(name)[0], self.image_paths(name)[-1], self.label_path(name))
+        return sample_of_one_size(name, rgb, thermal, label, files)
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
@@ -172,14 +168,8 @@ class MFNet:
         Nothing is decoded and the root is left out, so that equal copies have equal fingerprints.
         Splits without a list and files that are missing count as such.
         """
-        digest = hashlib.sha256()
-        for split in sorted(self.splits):
-            names = self.names(split) if self.list_path(split).is_file() else ()
-            digest.update(f"{split} {len(names)}\n".encode())
-            for name in names:
-                sizes = [path.stat().st_size if path.is_file() else -1 for path in self.files(name)]
-                digest.update(f"{name} {sizes}\n".encode())
-        return digest.hexdigest()
+        listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
+        return hash_of_files(listed, self.files)
 
     def list_path(self, split: str) -> Path:
         """The list file of `split`; InputError where the split is unknown."""
@@ -216,13 +206,7 @@ class MFNet:
         paths = tuple(within(path, self.root) for path in self.image_paths(name))
         if self.layout == "packed":
             return read_packed(paths[0])
-        rgb, thermal = read_channels(*paths)
-        if rgb.shape[:2] != thermal.shape:
-            raise InputError(
-                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but thermal is "
-                f"{thermal.shape[0]}x{thermal.shape[1]}; both must have one size, see {paths[1]}."
-            )
-        return rgb, thermal
+        return read_channels(*paths)
 
 
 def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:

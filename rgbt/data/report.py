@@ -1,7 +1,7 @@
 """What a data set holds and what is wrong with it, as values.
 
 Reads every listed sample once, in threads. Printing is in `rgbt.data.check`; what depends on the
-layout of the files in `rgbt.data.report_mfnet` and `rgbt.data.report_freiburg`.
+kind of data set in `rgbt.data.report_mfnet` and its like.
 """
 
 from __future__ import annotations
@@ -10,15 +10,22 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
+from rgbt.data.folder import Folder
 from rgbt.data.freiburg import Freiburg
+from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
+from rgbt.data.pst900 import PST900
+from rgbt.data.report_folder import FolderLayout
 from rgbt.data.report_freiburg import FreiburgLayout
+from rgbt.data.report_kp import KPLayout
 from rgbt.data.report_mfnet import MFNetLayout
+from rgbt.data.report_pst900 import PST900Layout
 from rgbt.data.report_values import Counts, Layout, Lists, Report, SplitReport, Thermal
 from rgbt.types import IGNORE
 
@@ -32,15 +39,25 @@ class _Content:
     thermal: Thermal | None
 
 
+LAYOUTS: tuple[tuple[type, Callable[[Any], Layout]], ...] = (
+    (MFNet, MFNetLayout),
+    (PST900, PST900Layout),
+    (KP, KPLayout),
+    (Freiburg, FreiburgLayout),
+    (Folder, FolderLayout),
+)
+"""Kinds of data sets, and what is to be known about each."""
+
+
 def layout_of(dataset: LabelledDataset) -> Layout:
     """What is particular about the data set; InputError where nothing is known about its kind."""
-    if isinstance(dataset, MFNet):
-        return MFNetLayout(dataset)
-    if isinstance(dataset, Freiburg):
-        return FreiburgLayout(dataset)
+    for kind, layout in LAYOUTS:
+        if isinstance(dataset, kind):
+            return layout(dataset)
     raise InputError(
-        f"dataset: expected a data set in the layout of MFNet or of Freiburg Thermal, got "
-        f"{type(dataset).__name__}; choose dataset=mfnet, freiburg, synth or synth_freiburg."
+        "dataset: expected a data set whose layout is known "
+        f"({', '.join(kind.__name__ for kind, _ in LAYOUTS)}), got {type(dataset).__name__}; "
+        "choose dataset=mfnet, freiburg, synth or another file of conf/dataset."
     )
 
 

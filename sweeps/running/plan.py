@@ -75,7 +75,7 @@ class Planner:
                 {
                     name: value
                     for name, value in vars(each).items()
-                    if name not in ("frames", "head") or value != plain[name]
+                    if name in ("modality", "regions") or value != plain[name]
                 }
                 for each in point.evaluations
             ]

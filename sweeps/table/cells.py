@@ -93,7 +93,13 @@ def evaluation_of(column: Column, table: Table) -> Evaluation | None:
     """What the column is counted from; None: the evaluation that every run makes itself."""
     if column.frames is not None:
         return Evaluation(frames=column.frames)
-    asked = Evaluation(column.modality, table.regions, head=column.head)
+    asked = Evaluation(
+        column.modality,
+        table.regions,
+        head=column.head,
+        degradation=column.degradation,
+        severity=column.severity,
+    )
     return None if asked == Evaluation() else asked
 
 

@@ -6,8 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from omegaconf import OmegaConf
+
 from rgbt.checks import InputError, check_choice
-from rgbt.config import conf_dir
+from rgbt.config import build, conf_dir
 from rgbt.metrics.named import OF_PAIRS
 
 if TYPE_CHECKING:
@@ -67,6 +69,7 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], place:
         check_choice(f"{place}, {given[0]}", other, [each.name for each in table.columns])
     _check_frames(column, place)
     _check_head(column, place)
+    _check_degradation(column, place)
     _check_sources(column, table, before, f"{place}, {given[0]}")
 
 
@@ -93,6 +96,33 @@ def _check_head(column: Column, place: str) -> None:
         raise InputError(
             f"{place}: 'head' is for scores of single frames alone; remove head: {column.head}."
         )
+
+
+def _check_degradation(column: Column, place: str) -> None:
+    """Refuse a degradation of what is not predicted, an unknown one, or a severity it has not."""
+    if column.degradation is None:
+        if column.severity is not None:
+            raise InputError(
+                f"{place}: 'severity' is of a degradation; add degradation: NAME, or remove it."
+            )
+        return
+    if column.metric is None or column.frames is not None:
+        raise InputError(
+            f"{place}: 'degradation' is for scores of single frames alone; remove degradation: "
+            f"{column.degradation}."
+        )
+    check_choice(f"{place}, degradation", column.degradation, _files("degradation"))
+    # Below its key, as in a configuration: sentences about it name degradation.severities.
+    file = conf_dir() / "degradation" / f"{column.degradation}.yaml"
+    kind = build(OmegaConf.create({"degradation": OmegaConf.load(file)}).degradation)
+    if column.severity is None and len(kind.severities) > 1:
+        known = ", ".join(f"{each:g}" for each in kind.severities)
+        raise InputError(f"{place}: {kind.title} needs a severity ({kind.unit}); one of {known}.")
+    if column.severity is not None:
+        try:
+            kind.check(column.severity)
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from None
 
 
 def _check_frames(column: Column, place: str) -> None:

@@ -76,7 +76,7 @@ def test_every_kind_of_problem_in_one_line(write_mfnet, expected_pair, png, caps
         "labels/00011D.png is missing",
         "images/00012D.png cannot be decoded",
         "labels/00013D.png: label value 9 is out of range",
-        "'00014D': the image is 24x32 pixels but its label is 12x32",
+        "'00014D': RGB is 24x32 pixels but its label is 12x32",
         "images/00015D.png: expected 4 channels",
         "split train: 'odd' is not five digits and D or N",
         "split val lists '00003N' 2 times",

@@ -175,7 +175,7 @@ def test_refuses_sizes_that_differ(write_mfnet, png) -> None:
     root = write_mfnet({"train": ["00001D"]})
     png(root / "labels" / "00001D.png", np.zeros((12, 16), np.uint8))
     with pytest.raises(
-        InputError, match="'00001D': the image is 24x32 pixels but its label is 12x"
+        InputError, match="'00001D': RGB is 24x32 pixels but its label is 12x"
     ):
         MFNet(str(root)).read("00001D")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data.synth import dataset, scene, sheet, writer
+from rgbt.data.synth import cache, dataset, scene, sheet, writer
 from rgbt.data.synth.camera import Camera, camera_of, flow_between, ground_homography
 from rgbt.data.synth.dataset import cached, plan_key, synth
 from rgbt.data.synth.facets import sorted_for_drawing
@@ -407,9 +407,9 @@ def test_synth_returns_a_reader_of_its_folder(tmp_path: Path) -> None:
 
 def test_the_cache_lies_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert dataset.default_cache() == Path("/somewhere/rgbt")
+    assert cache.default_cache() == Path("/somewhere/rgbt")
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert dataset.default_cache() == Path.home() / ".cache/rgbt"
+    assert cache.default_cache() == Path.home() / ".cache/rgbt"
 
 
 @pytest.mark.parametrize(

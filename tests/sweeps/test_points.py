@@ -25,6 +25,22 @@ def test_a_head_that_is_asked_for_has_a_file_of_its_own() -> None:
     assert Evaluation(head="own").command[-1] == "head=own"
 
 
+def test_failing_images_have_a_file_of_their_own() -> None:
+    noisy = Evaluation("rgbt", "ring9", degradation="noise", severity=16.0)
+    words = ("modality=rgbt", "regions=ring9", "degradation=noise", "severity=16")
+    assert noisy.command == ("rgbt.evaluate", *words)
+    assert noisy.path == "evaluations/table_rgbt_ring9_noise-16.npz"
+    assert noisy.label == "rgbt, ring9, noise-16"
+    assert {word.partition("=")[0] for word in words} <= set(OF_EVALUATE)
+    removed = Evaluation(head="own", degradation="rgb_removed")
+    assert removed.command[-2:] == ("head=own", "degradation=rgb_removed")
+    assert removed.path == "evaluations/table_default_as-trained_own-head_rgb_removed.npz"
+    assert removed.label == "default, as trained, own head, rgb_removed"
+    share = Evaluation(degradation="occluded", severity=0.25)
+    assert share.path.endswith("as-trained_occluded-0.25.npz")
+    assert share.command[-1] == "severity=0.25"
+
+
 def test_of_virtual_views_one_call_makes_two_files() -> None:
     aligned, released = Evaluation(frames="aligned"), Evaluation(frames="released")
     assert aligned.command == released.command == ("rgbt.consistency", "frames=virtual")

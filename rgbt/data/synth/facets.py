@@ -31,6 +31,7 @@ class Facets:
         warmth: (N,) see `Placed`.
         lit: (N,) see `Placed`; for buildings the style of the windows.
         on_ground: (N,) bool, receives shadows and lies flat.
+        owner: (N,) index of the object that it is a part of; -1 for the ground.
     """
 
     corners: Floats
@@ -42,6 +43,7 @@ class Facets:
     warmth: Floats
     lit: Floats
     on_ground: NDArray[np.bool_]
+    owner: NDArray[np.intp]
 
 
 def sorted_for_drawing(placed: Sequence[Placed]) -> list[Placed]:
@@ -85,6 +87,7 @@ def facets_of(ground: Quads, placed: Sequence[Placed]) -> Facets:
         warmth=np.concatenate([no_heat, numbers[:, 4]]),
         lit=np.concatenate([no_heat, numbers[:, 5]]),
         on_ground=np.arange(num_ground + len(meta)) < num_ground,
+        owner=np.concatenate([np.full(num_ground, -1), owner]),
     )
 
 

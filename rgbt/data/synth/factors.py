@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
+from typing import Any, TypeVar
 
 from rgbt.checks import check_range
+
+Made = TypeVar("Made")
 
 _RANGES: dict[str, tuple[float, float]] = {
     "height": (32, 2048),
@@ -88,3 +94,46 @@ class EgoMotion:
         """Raise InputError where a motion is larger than between two frames of a video."""
         check_range("ego_forward_m", self.forward_m, -3, 3)
         check_range("ego_yaw_deg", self.yaw_deg, -15, 15)
+
+
+def with_factors(
+    *left_out: str, **defaults: float
+) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
+    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
+
+    The keys of a data set in the configuration are the arguments of the function that makes it, so
+    its signature shows every factor without naming it a second time.
+
+    Args:
+        left_out: factors that the data set decides itself; they keep their default.
+        defaults: of factors that have another one in this data set.
+
+    Returns:
+        decorator; what it makes takes keywords alone.
+    """
+
+    def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:
+        own = inspect.signature(function)
+        added = [
+            inspect.Parameter(
+                factor.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=defaults.get(factor.name, factor.default),
+                annotation=factor.type,
+            )
+            for factor in fields(SceneFactors)
+            if factor.name not in left_out
+        ]
+
+        @wraps(function)
+        def made(**settings: Any) -> Made:
+            chosen = {each.name: settings.pop(each.name, each.default) for each in added}
+            return function(factors=SceneFactors(**chosen), **settings)
+
+        kept = [each for each in own.parameters.values() if each.name != "factors"]
+        made.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
+        made.__annotations__ = {each.name: each.annotation for each in [*kept, *added]}
+        made.__annotations__["return"] = own.return_annotation
+        return made
+
+    return with_keywords

@@ -1,8 +1,4 @@
-"""The class ids of Freiburg Thermal of what a scene shows: by material, and by label where one is.
-
-Curbs, fences, poles, plants, sky have materials of their own; tyres and glass belong to a car or a
-bike, which only the label tells.
-"""
+"""The class ids of Freiburg Thermal of what a scene shows."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.data.freiburg import CLASSES
-from rgbt.data.synth.materials import INDEX
+from rgbt.data.synth.classes import class_table, ids_in
 from rgbt.data.synth.shapes import (
     BIKE,
     BUMP,
@@ -20,7 +16,6 @@ from rgbt.data.synth.shapes import (
     CURVE,
     GUARDRAIL,
     PERSON,
-    UNLABELED,
 )
 
 BY_LABEL = {
@@ -47,21 +42,7 @@ OF_SCENERY = {
 }
 """Materials of what MFNet leaves unlabelled, by class."""
 
-_ELSEWHERE = 255
-"""Of materials that only labelled objects are made of."""
-
-
-def _table() -> NDArray[np.uint8]:
-    """(labels, materials) -> class id."""
-    table = np.full((len(BY_LABEL) + 1, len(INDEX)), _ELSEWHERE, np.uint8)
-    for name, materials in OF_SCENERY.items():
-        table[UNLABELED, [INDEX[material] for material in materials]] = CLASSES.index(name)
-    for label, name in BY_LABEL.items():
-        table[label] = CLASSES.index(name)
-    return table
-
-
-_TABLE = _table()
+_TABLE = class_table(CLASSES, BY_LABEL, OF_SCENERY)
 
 
 def class_ids(label: NDArray[np.uint8], material: NDArray[np.intp]) -> NDArray[np.uint8]:
@@ -74,6 +55,4 @@ def class_ids(label: NDArray[np.uint8], material: NDArray[np.intp]) -> NDArray[n
     Returns:
         (H, W) uint8, 0 to 12.
     """
-    ids = _TABLE[label, material]
-    assert (ids != _ELSEWHERE).all(), "every material of the scenery has a class"
-    return ids
+    return ids_in(_TABLE, label, material)

@@ -24,7 +24,7 @@ from rgbt.data.synth.camera import Floats
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.freiburg_classes import class_ids
 from rgbt.data.synth.scene import Scene, render_scene
-from rgbt.data.synth.writer import advancing, for_each, write_png
+from rgbt.data.synth.writer import write_each, write_png
 
 VAL_SEQUENCE = "seq_04_day"
 _DAY_SEQUENCES, _NIGHT_SEQUENCES = 4, 3
@@ -112,9 +112,7 @@ def write(plan: FreiburgPlan, folder: Path) -> None:
         OSError: the files cannot be written.
     """
     shots = plan.shots()
-    with advancing(len(shots)) as advance:
-        for _ in for_each(partial(_write_numbered, plan, shots, folder), range(len(shots))):
-            advance()
+    write_each(partial(_write_numbered, plan, shots, folder), len(shots))
 
 
 def _write_numbered(plan: FreiburgPlan, shots: tuple[Shot, ...], folder: Path, number: int) -> None:

@@ -34,6 +34,8 @@ class Scene:
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
         grey: (H, W) float32, `thermal` before it became bytes: 1 = full scale, and not clipped.
         material: (H, W) index into `MATERIALS` of what each pixel shows.
+        owner: (H, W) index into `placed` of the object that it shows; -1 for ground and sky.
+        placed: the objects of the scene, far ones before near ones.
         is_night: whether it is night.
         camera: where the frame was taken from.
     """
@@ -44,6 +46,8 @@ class Scene:
     depth: Floats
     grey: Floats
     material: NDArray[np.intp]
+    owner: NDArray[np.intp]
+    placed: tuple[Placed, ...]
     is_night: bool
     camera: Camera
 
@@ -133,6 +137,8 @@ def _frame(
         depth=surface.depth,
         grey=grey,
         material=surface.material,
+        owner=np.take(np.concatenate([[-1], facets.owner]), drawing.ids),
+        placed=tuple(world.placed),
         is_night=light.is_night,
         camera=camera,
     )

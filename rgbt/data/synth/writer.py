@@ -88,9 +88,7 @@ def write(plan: Plan, folder: Path) -> None:
     for root in roots:
         for sub in ("images", "labels", *(["flow"] if root != folder else [])):
             (root / sub).mkdir(parents=True)
-    with advancing(plan.num_scenes) as advance:
-        for _ in for_each(partial(write_index, plan, folder), range(plan.num_scenes)):
-            advance()
+    write_each(partial(write_index, plan, folder), plan.num_scenes)
     for root in roots:
         _write_lists(plan, root)
 
@@ -136,8 +134,14 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
     path.write_bytes(encoded.tobytes())
 
 
-def for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
-    """``work(index)`` for every index, on all cores where there are many."""
+def write_each(work: partial[None], num: int) -> None:
+    """``work(index)`` for every scene, on all cores where there are many, with a progress bar."""
+    with _advancing(num) as advance:
+        for _ in _for_each(work, range(num)):
+            advance()
+
+
+def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if len(indices) < _WORTH_A_POOL or cores == 1:
         yield from map(work, indices)
@@ -149,7 +153,7 @@ def for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
 
 
 @contextmanager
-def advancing(total: int) -> Iterator[partial[None]]:
+def _advancing(total: int) -> Iterator[partial[None]]:
     """A progress bar on stderr, gone when done; none for what takes less than about a second."""
     hidden = total < _WORTH_A_BAR
     with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:

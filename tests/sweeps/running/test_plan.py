@@ -73,6 +73,16 @@ def test_points_without_frames_keep_the_keys_of_studies_from_before_there_were_a
         for frames in (None, "aligned", "released")
     ]
     assert len({plan.key for plan in framed}) == 3
+    failing = [
+        planner.plan(Point("p", ("seed=1",), evaluations=(asked,)))
+        for asked in (
+            Evaluation(),
+            Evaluation(degradation="noise", severity=8),
+            Evaluation(degradation="noise", severity=16),
+        )
+    ]
+    assert len({plan.key for plan in failing}) == 3
+    assert failing[0].key == framed[0].key
 
 
 def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> None:

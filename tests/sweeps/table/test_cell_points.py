@@ -110,6 +110,22 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
     assert alone.models() == set()
 
 
+def test_failing_images_are_evaluated_apart() -> None:
+    columns = (
+        Column(name="mIoU", metric="mIoU"),
+        Column(name="no thermal", metric="mIoU", degradation="thermal_removed"),
+        Column(name="noisy", metric="mIoU", degradation="noise", severity=16),
+        Column(name="noisier", metric="Var", degradation="noise", severity=32),
+        Column(name="loss", minus=("noisier", "noisy")),
+    )
+    asked = Wanted("own/t", table(ROWS, columns), "demo", (0,))
+    assert asked.points()[0].evaluations == (
+        Evaluation(degradation="thermal_removed"),
+        Evaluation(degradation="noise", severity=16),
+        Evaluation(degradation="noise", severity=32),
+    )
+
+
 def test_outcomes_go_back_to_their_cells() -> None:
     asked = wanted()
     outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]

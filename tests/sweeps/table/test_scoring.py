@@ -129,6 +129,14 @@ def test_each_head_has_its_counts() -> None:
     assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]
 
 
+def test_failing_images_have_counts_of_their_own() -> None:
+    noisy = Column(name="noisy", metric="pixel_accuracy", degradation="noise", severity=16)
+    made = {None: right(50), Evaluation(degradation="noise", severity=16.0): right(30)}
+    runs = {("a", 0): outcome("k", made)}
+    scored = score("t", table((Row(label="a"),), (ACC, noisy)), runs, scale="demo")
+    assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]
+
+
 def test_sizes_stand_beside_what_was_run_and_have_ranks() -> None:
     size = Column(name="size", parameters=True, best="lowest")
     rows = tuple(

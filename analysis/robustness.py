@@ -1,0 +1,180 @@
+"""Counts of failing images, as ``python -m rgbt.robustness`` leaves them beside a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from analysis.results import Stored, open_counts, split_words
+from rgbt.checks import InputError, nearest
+from rgbt.metrics.counts import Counts
+
+FOLDER = Path("evaluations") / "robustness"
+FORMAT = "rgbt robustness 1"
+CLEAN = "clean"
+
+
+@dataclass(frozen=True)
+class Level:
+    """One severity of one degradation.
+
+    Attributes:
+        mark: name of its file, e.g. "noise-16".
+        row: the degradation: "clean", "noise", "rgb_removed", "features-thermal", ...
+        title: what people call it.
+        unit: of the severity; "" where there is one alone.
+        severity: 0 is the clean image.
+        counts: the counts.
+    """
+
+    mark: str
+    row: str
+    title: str
+    unit: str
+    severity: float
+    counts: Counts
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training with its levels, the clean images first.
+
+    Attributes:
+        label: what its method is called.
+        place: folder of the counts.
+        levels: clean, then by row and rising severity.
+    """
+
+    label: str
+    place: Path
+    levels: tuple[Level, ...]
+
+    @property
+    def clean(self) -> Counts:
+        """Of the images as they are."""
+        return self.levels[0].counts
+
+    def of(self, row: str) -> tuple[Level, ...]:
+        """The severities of one row, rising; () where it was not measured."""
+        return tuple(level for level in self.levels if level.row == row)
+
+
+def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
+    """The trainings that `text` names, with all their levels.
+
+    Args:
+        text: runs or groups (see `analysis.results.open_counts`), or folders that
+            ``python -m rgbt.robustness out=...`` wrote, with commas.
+        runs_dir: where runs lie.
+        split: "": test.
+
+    Raises:
+        InputError: there is no such thing, or it was not measured.
+    """
+    found = []
+    for word in split_words(text):
+        place = Path(word).expanduser()
+        if (place / f"{CLEAN}.json").is_file():
+            found.append(Training(place.name, place, levels_of(place)))
+            continue
+        for stored in open_counts(word, runs_dir, split):
+            place = folder_of(stored)
+            found.append(Training(stored.label, place, levels_of(place)))
+    return found
+
+
+def folder_of(stored: Stored) -> Path:
+    """Where the counts of a run's failing images lie.
+
+    Raises:
+        InputError: it is no run, or was not measured.
+    """
+    folder = stored.path.parent / FOLDER / stored.counts.split
+    if not stored.key or not folder.is_dir():
+        what = f"{stored.path} is no run" if not stored.key else f"{folder} is not there"
+        split = "" if stored.counts.split == "test" else f" split={stored.counts.split}"
+        run = stored.path.parent if stored.key else "..."
+        raise InputError(f"{what}; python -m rgbt.robustness run={run}{split} makes the counts.")
+    return folder
+
+
+def levels_of(folder: Path) -> tuple[Level, ...]:
+    """Every level in a folder: clean first, then what has no severity, then by title.
+
+    Raises:
+        InputError: no clean images, or a file that is damaged or of another kind.
+    """
+    found = [_level(path) for path in sorted(folder.glob("*.json"))]
+    if CLEAN not in {level.row for level in found}:
+        raise InputError(
+            f"{folder} holds no counts of clean images ({CLEAN}.json); python -m rgbt.robustness "
+            "measures them first."
+        )
+    return tuple(sorted(found, key=_place))
+
+
+def _place(level: Level) -> tuple[bool, bool, str, str, float]:
+    return (level.row != CLEAN, level.unit != "", level.title, level.row, level.severity)
+
+
+def under(stored: Sequence[Stored], degradation: str, severity: str) -> tuple[Stored, ...]:
+    """The same trainings on failing images.
+
+    Args:
+        stored: runs.
+        degradation: a row, e.g. "noise" or "features-thermal".
+        severity: as text; "" where the row has one alone.
+
+    Raises:
+        InputError: no runs, not measured, or measured at other severities.
+    """
+    return tuple(_under(each, degradation, severity) for each in stored)
+
+
+def _under(stored: Stored, degradation: str, severity: str) -> Stored:
+    folder = folder_of(stored)
+    levels = levels_of(folder)
+    of_row = [level for level in levels if level.row == degradation]
+    if not of_row:
+        known = nearest(degradation, {level.row for level in levels})
+        raise InputError(f"degradation={degradation} was not measured in {folder}; {known}.")
+    chosen = [each for each in of_row if f"{each.severity:g}" == severity]
+    chosen = of_row if not severity and len(of_row) == 1 else chosen
+    if len(chosen) != 1:
+        known = ", ".join(f"{each.severity:g}" for each in of_row)
+        raise InputError(
+            f"severity={severity}: {folder} holds {degradation} at {known}; give one of these."
+        )
+    (level,) = chosen
+    path = folder / f"{level.mark}.npz"
+    return replace(stored, path=path, counts=level.counts)
+
+
+def _level(path: Path) -> Level:
+    made = _read(path)
+    try:
+        of_level = {key: made[key] for key in ("row", "title", "unit")}
+        severity = float(made["severity"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} does not say what was measured ({error}); python -m rgbt.robustness makes it "
+            "again."
+        ) from error
+    counts = Counts.load(path.with_suffix(".npz"))
+    return Level(path.stem, severity=severity, counts=counts, **of_level)
+
+
+def _read(path: Path) -> Any:
+    try:
+        made = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); remove it, and python -m rgbt.robustness makes it "
+            "again."
+        ) from error
+    if not isinstance(made, dict) or made.get("format") != FORMAT:
+        raise InputError(f"{path} is not of python -m rgbt.robustness; name another folder.")
+    return made

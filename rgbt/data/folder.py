@@ -1,0 +1,332 @@
+"""Anybody's own RGB-thermal data, described by one YAML: patterns of files, splits, label values.
+
+A reader only: it maps values to classes and to grey levels as the configuration says, never resizes
+or aligns, and refuses what it cannot read exactly. docs/datasets.md has a worked example.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, check_choice, check_range, nearest
+from rgbt.data.dataset import check_lengths
+from rgbt.data.files import read_packed, read_rgb, within
+from rgbt.data.folder_frames import Frame, find_frames, patterns_of
+from rgbt.data.folder_pattern import SPLIT
+from rgbt.data.folder_splits import FOLDERS, ByFolder, ByList, ByShare, Rule
+from rgbt.data.folder_values import (
+    Colour,
+    Range,
+    check_limits,
+    each_colour,
+    grey,
+    label_codes,
+    painted,
+    read_values,
+)
+from rgbt.data.integrity import is_there
+from rgbt.data.named_files import hash_of_files
+from rgbt.types import IGNORE, Sample
+
+Array = NDArray[np.uint8]
+
+
+class Folder:
+    """RGB-thermal pairs in any folder whose paths follow patterns.
+
+    A pattern is a path below the root with words in braces (`rgbt.data.folder_pattern`): {name}
+    stands for a frame, {split} for the split it is of, {sequence} for frames that follow one
+    another, any other word for whatever differs. What the words stand for in the path of the RGB
+    image, joined by "_", is the name of a sample; thermal image and label are found with the same
+    words.
+
+    Args:
+        root: folder that the patterns are relative to.
+        name: what the data set is called in messages and tables.
+        num_classes: number of classes; other nodes of the configuration interpolate it.
+        classes: their names, in order of the class index.
+        rgb: pattern of the RGB images, 8 bit, three channels.
+        thermal: pattern of the thermal images, one channel or three equal ones, of the size of the
+            RGB image; the same as `rgb` for files of four channels R, G, B, thermal.
+        label: pattern of the labels, images or `.npy`; None: the data set has no labels.
+        palette: (red, green, blue) of each class, 0..255; None: those of `colours`, or colours
+            that differ.
+        unscored: classes that are counted but left out of every mean over classes.
+        folders: split -> what stands for {split}; None: train, val and test are called so.
+        lists: split -> list file in `root`, in the place of `folders`.
+        shares: split -> share of the frames, together 1, in the place of `folders`.
+        shares_seed: of the draw of `shares`.
+        block: neighbouring frames that stay together in the draw; None: whole sequences do.
+        unlabelled: splits whose frames have no labels; no file is looked for.
+        ids: label value -> class; None: values are class indices.
+        colours: class -> its colour in label images, or several; in the place of `ids`.
+        ignored: label values, or colours, that do not count.
+        thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
+        night: pattern of the names of night images, with * and ?; None: the data does not say.
+
+    Raises:
+        InputError: no such root, patterns that match nothing, or settings that cannot be.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        root: str,
+        *,
+        num_classes: int,
+        classes: tuple[str, ...],
+        rgb: str,
+        thermal: str,
+        label: str | None,
+        name: str = "folder",
+        palette: tuple[Colour, ...] | None = None,
+        unscored: tuple[str, ...] = (),
+        folders: dict[str, str] | None = None,
+        lists: dict[str, str] | None = None,
+        shares: dict[str, float] | None = None,
+        shares_seed: int = 0,
+        block: int | None = None,
+        unlabelled: tuple[str, ...] = (),
+        ids: dict[int, str] | None = None,
+        colours: dict[str, Colour | tuple[Colour, ...]] | None = None,
+        ignored: tuple[int | Colour, ...] = (),
+        thermal_range: Range | None = None,
+        night: str | None = None,
+    ) -> None:
+        self.root = Path(root).expanduser()
+        self.name = name
+        self.num_classes = num_classes
+        self.classes = classes
+        self.palette = _palette(num_classes, classes, palette, colours)
+        self.unscored = unscored
+        self.thermal_range = thermal_range
+        self.night = night
+        check_range("dataset.num_classes", num_classes, 1, IGNORE)
+        check_lengths(num_classes, classes, self.palette)
+        for word in classes:
+            if classes.count(word) > 1:
+                raise InputError(f"dataset.classes: '{word}' stands there twice; rename one.")
+        for word in unscored:
+            check_choice("dataset.unscored", word, classes)
+        check_limits(thermal_range)
+        self.codes = label_codes(classes, ids, colours, ignored)
+        if not self.root.is_dir():
+            raise InputError(
+                f"dataset.root: there is no folder '{root}'; give the one that dataset.rgb='{rgb}' "
+                "begins in."
+            )
+        self.patterns = patterns_of(rgb, thermal, label)
+        self.frames: Mapping[str, Frame] = find_frames(self.root, self.patterns)
+        self._rule = self._rule_of(folders, lists, shares, (shares_seed, block))
+        self._names: dict[str, tuple[str, ...]] = {}
+        self.unlabelled = unlabelled
+        for split in unlabelled:
+            check_choice("dataset.unlabelled", split, self.splits)
+        self._check_night()
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> the pattern, list or share that it is made of."""
+        return self._rule.splits
+
+    def has(self, split: str) -> bool:
+        """Whether anything of `split` is there; InputError where the split is unknown."""
+        self._check_split(split)
+        return self._rule.has(split)
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split: in the order of its list, or by their text and numbers.
+
+        Raises:
+            InputError: unknown split, no frame of it, no list.
+        """
+        self._check_split(split)
+        if split not in self._names:
+            self._names[split] = self._rule.names(split)
+        return self._names[split]
+
+    def read(self, name: str) -> Sample:
+        """The frame called `name`, decoded, thermal values as grey levels, label values as classes.
+
+        Returns:
+            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8; the label is None
+            where the data set, or the split of the frame, has none.
+
+        Raises:
+            InputError: no such name, a file is missing, cut short, outside the root, cannot be
+                decoded, has other channels, bits or size than expected, or a label holds a value
+                that no key names.
+        """
+        frame = self.frame(name)
+        rgb, thermal = self._images(frame)
+        label = self.label(name)
+        for what, image, path in (
+            ("thermal", thermal, frame.thermal),
+            ("label", label, frame.label),
+        ):
+            if image is not None and image.shape != rgb.shape[:2]:
+                raise InputError(
+                    f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
+                    f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels, "
+                    f"align them first: {path}."
+                )
+        return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+
+    def label(self, name: str) -> Array | None:
+        """The label of `read` alone, (H, W) uint8; None where there is none; errors as there."""
+        frame = self.frame(name)
+        if frame.label is None or name in self._without_labels:
+            return None
+        return self.codes.read(self._there("label", frame.label, name))
+
+    def values(self, name: str) -> NDArray[Any]:
+        """Values of the thermal camera before they are grey levels, (H, W); errors as of `read`."""
+        frame = self.frame(name)
+        path = self._there("thermal image", frame.thermal, name)
+        return read_packed(path)[1] if self.packed else read_values(path)
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
+        frame = self.frame(name)
+        label = None if name in self._without_labels else frame.label
+        paths = (frame.rgb, frame.thermal, label)
+        return tuple(dict.fromkeys(path for path in paths if path is not None))
+
+    def decoding(self) -> dict[str, Any]:
+        """What decides, beside the files, what `read` makes of them."""
+        return {
+            "packed": self.packed,
+            "thermal_range": self.thermal_range,
+            "codes": sorted(self.codes.codes.items()),
+            "of_colours": self.codes.of_colours,
+            "num_classes": self.num_classes,
+        }
+
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
+        """Whether each name is one of the night; None where `night` is not given."""
+        if self.night is None:
+            return None
+        return tuple(fnmatchcase(name, self.night) for name in names)
+
+    def fingerprint(self) -> str:
+        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+
+        What labels look like belongs to it. Nothing is decoded and the root is left out, so that
+        equal copies have equal fingerprints; files that are missing count as such.
+        """
+        listed = {
+            split: tuple(name for name in self.names(split) if name in self.frames)
+            if self.has(split)
+            else ()
+            for split in self.splits
+        }
+        meaning = json.dumps([sorted(self.codes.codes.items()), self.codes.of_colours])
+        files = hash_of_files(listed, self.files)
+        return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
+
+    def frame(self, name: str) -> Frame:
+        """The files of `name`; InputError where there is no such frame."""
+        if name not in self.frames:
+            raise InputError(
+                f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
+                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or take the name off "
+                "the list."
+            )
+        return self.frames[name]
+
+    @property
+    def packed(self) -> bool:
+        """Whether thermal is the fourth channel of the file of the RGB image."""
+        return self.patterns.thermal.text == self.patterns.rgb.text
+
+    @cached_property
+    def _without_labels(self) -> frozenset[str]:
+        return frozenset(name for split in self.unlabelled for name in self.names(split))
+
+    def _images(self, frame: Frame) -> tuple[Array, Array]:
+        path = self._there("RGB image", frame.rgb, frame.name)
+        if self.packed:
+            rgb, values = read_packed(path, "give dataset.thermal its own pattern")
+        else:
+            advice = "dataset.thermal with the same pattern reads a fourth channel as thermal"
+            rgb, values = read_rgb(path, advice), self.values(frame.name)
+        return rgb, grey(values, self.thermal_range, frame.thermal)
+
+    def _there(self, what: str, path: Path, name: str) -> Path:
+        if not is_there(path):
+            raise InputError(
+                f"'{name}': its {what} {path} is missing; restore it, or use data.on_error=skip to "
+                "leave the frame out."
+            )
+        return within(path, self.root)
+
+    def _rule_of(
+        self,
+        folders: dict[str, str] | None,
+        lists: dict[str, str] | None,
+        shares: dict[str, float] | None,
+        draw: tuple[int, int | None],
+    ) -> Rule:
+        given = {"folders": folders, "lists": lists, "shares": shares}
+        told = [f"dataset.{key}" for key, value in given.items() if value is not None]
+        in_path = SPLIT in self.patterns.rgb.words
+        if len(told) > 1 or (in_path and told not in ([], ["dataset.folders"])):
+            braces = [f"{{{SPLIT}}} in dataset.rgb"] if in_path else []
+            raise InputError(
+                f"dataset: {' and '.join([*told, *braces])} both say what the splits are; keep one "
+                f"(a folder that says something else needs another word, such as {{part}})."
+            )
+        if shares is None and draw != (0, None):
+            raise InputError(
+                "dataset.shares_seed and dataset.block are for dataset.shares, which is null; give "
+                "shares, or leave both away."
+            )
+        if shares is not None:
+            return ByShare(self.frames, shares, *draw)
+        if lists is not None:
+            return ByList(self.frames, self.root, lists)
+        if not in_path:
+            raise InputError(
+                f"dataset: nothing says what the splits are; write {{{SPLIT}}} in dataset.rgb "
+                "where train, val and test stand, or give dataset.lists or dataset.shares."
+            )
+        return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
+
+    def _check_split(self, split: str) -> None:
+        if split not in self.splits:
+            raise InputError(
+                f"dataset has no split '{split}' (folders, lists or shares); "
+                f"{nearest(split, self.splits)}."
+            )
+
+    def _check_night(self) -> None:
+        if self.night is not None and not any(self.nights(tuple(self.frames)) or ()):
+            raise InputError(
+                f"dataset.night: none of {len(self.frames)} names matches '{self.night}', the "
+                f"first is '{next(iter(self.frames))}'; correct it, or set it to null."
+            )
+
+
+def _palette(
+    num_classes: int,
+    classes: tuple[str, ...],
+    palette: tuple[Colour, ...] | None,
+    colours: dict[str, Colour | tuple[Colour, ...]] | None,
+) -> tuple[Colour, ...]:
+    if palette is not None:
+        return palette
+    generated = painted(num_classes)
+    if colours is None:
+        return generated
+    return tuple(
+        each_colour(colours[word])[0] if word in colours else colour
+        for word, colour in zip(classes, generated, strict=False)
+    )

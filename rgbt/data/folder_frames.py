@@ -1,0 +1,138 @@
+"""Which files of a folder belong to one frame, as patterns say; nothing is opened here."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.folder_pattern import NAME, Pattern, Values, in_order, what_is_in
+
+
+class Frame(NamedTuple):
+    """One pair of images and its label.
+
+    Attributes:
+        name: what stands for the words of the RGB pattern, joined by "_".
+        values: what stands for each of them.
+        rgb: file that is there.
+        thermal: file that should be there; the same one where it is the fourth channel.
+        label: file that should be there; None where the data set has no labels.
+    """
+
+    name: str
+    values: Values
+    rgb: Path
+    thermal: Path
+    label: Path | None
+
+
+class Patterns(NamedTuple):
+    """Where the three images of a frame lie; `label` is None for a data set without labels."""
+
+    rgb: Pattern
+    thermal: Pattern
+    label: Pattern | None
+
+
+def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
+    """The patterns of the configuration.
+
+    Raises:
+        InputError: a text that is no pattern, no {name} in the first, words that only the others
+            have, or labels in a format that changes values.
+    """
+    found = Patterns(
+        Pattern(rgb, "dataset.rgb"),
+        Pattern(thermal, "dataset.thermal"),
+        None if label is None else Pattern(label, "dataset.label"),
+    )
+    if NAME not in found.rgb.words:
+        raise InputError(
+            f"dataset.rgb: '{rgb}' says {', '.join(found.rgb.words)} but no {NAME}; write "
+            f"{{{NAME}}} where the names of frames stand."
+        )
+    for pattern in [each for each in found if each is not None]:
+        for word in pattern.words:
+            if word not in found.rgb.words:
+                raise InputError(
+                    f"{pattern.key}: '{pattern.text}' needs {{{word}}}, which dataset.rgb='{rgb}' "
+                    f"does not tell; {nearest(word, found.rgb.words)}."
+                )
+    if label is not None and label.lower().endswith((".jpg", ".jpeg")):
+        raise InputError(
+            f"dataset.label: '{label}' are JPEG files, which change values and colours; save "
+            "labels as PNG."
+        )
+    return found
+
+
+def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
+    """Name -> frame, of every RGB image, in the order of the names (9 before 10).
+
+    Args:
+        root: what the patterns are relative to.
+        patterns: of the three images.
+
+    Raises:
+        InputError: no RGB image, no partner at all of one kind, two frames of one name, or two
+            that would share a partner.
+    """
+    rgb, thermal, label = patterns
+    frames: dict[str, Frame] = {}
+    for frame in _candidates(root, patterns):
+        if frame.name in frames:
+            raise InputError(
+                f"dataset.rgb: {frames[frame.name].rgb} and {frame.rgb} would both be called "
+                f"'{frame.name}'; rename one of them."
+            )
+        frames[frame.name] = frame
+    if not frames:
+        raise InputError(
+            f"dataset.rgb: '{rgb.text}' matches no file in {root}: {rgb.why_nothing(root)}; "
+            "correct the pattern or dataset.root."
+        )
+    found = {name: frames[name] for name in sorted(frames, key=in_order)}
+    for pattern in (thermal, label):
+        if pattern is not None:
+            _check_partners(pattern, found, root)
+    return found
+
+
+def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
+    """What the RGB pattern matches, but for thermal images and labels of what it matches.
+
+    Where all lie in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    """
+    rgb, thermal, label = patterns
+    found = [
+        Frame(
+            name="_".join(values[word] for word in rgb.words),
+            values=values,
+            rgb=path,
+            thermal=thermal.path(root, values),
+            label=None if label is None else label.path(root, values),
+        )
+        for path, values in rgb.files(root)
+    ]
+    partners = {path for each in found for path in (each.thermal, each.label) if path != each.rgb}
+    return [frame for frame in found if frame.rgb not in partners]
+
+
+def _check_partners(pattern: Pattern, frames: dict[str, Frame], root: Path) -> None:
+    partners: dict[Path, str] = {}
+    for name, frame in frames.items():
+        path = pattern.path(root, frame.values)
+        if path in partners:
+            raise InputError(
+                f"{pattern.key}: '{partners[path]}' and '{name}' would share {path}; use every "
+                "word of dataset.rgb that tells them apart."
+            )
+        partners[path] = name
+    if not any(os.path.lexists(path) for path in partners):
+        first = next(iter(partners))
+        raise InputError(
+            f"{pattern.key}: '{pattern.text}' names no file that is there: the first would be "
+            f"{first}, {first.parent.name} holds {what_is_in(first.parent)}; correct the pattern."
+        )

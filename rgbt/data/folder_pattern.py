@@ -1,0 +1,162 @@
+"""Patterns of files such as "{split}/rgb/{name}.png": which files match, and what they are called.
+
+Part of `rgbt.data.folder`; nothing is opened here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from rgbt.checks import InputError
+
+NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
+"""Words that mean something: a frame, the split it is of, frames that follow one another."""
+
+Values = Mapping[str, str]
+"""Word -> what stands for it in the path of a file."""
+
+
+class Found(NamedTuple):
+    """A file, or a folder on the way to one, and what its path says."""
+
+    path: Path
+    values: Values
+
+
+class Pattern:
+    """Paths below a root in which words in braces stand for any text without a slash.
+
+    A word that occurs twice stands for the same text in both places. Of two words in one piece of
+    the path the first takes as much as it can: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
+
+    Args:
+        text: pieces joined by "/", relative to the root; such as "{split}/ir/{name}_ir.tif".
+        key: of the configuration, for messages.
+
+    Attributes:
+        words: what stands in braces, in order.
+
+    Raises:
+        InputError: an absolute path, "..", a brace without its partner, two words with nothing
+            between them, or no word at all.
+    """
+
+    def __init__(self, text: str, key: str) -> None:
+        self.text = text
+        self.key = key
+        self.pieces = tuple(text.split("/"))
+        self.words = tuple(dict.fromkeys(re.findall(r"\{(\w+)\}", text)))
+        if not text or not set(self.pieces).isdisjoint(("", ".", "..")):
+            raise InputError(
+                f"{key}: expected a path below dataset.root such as {{split}}/rgb/{{name}}.png, "
+                f"without '..' and doubled slashes, got '{text}'."
+            )
+        if re.search(r"[{}]", re.sub(r"\{[^\W\d]\w*\}", "", text)) or "}{" in text:
+            raise InputError(
+                f"{key}: expected words in braces, such as {{name}}, with something between each "
+                f"two of them, got '{text}'."
+            )
+        if not self.words:
+            raise InputError(
+                f"{key}: '{text}' is one file; write {{{NAME}}} where the names of frames stand, "
+                f"such as rgb/{{{NAME}}}.png."
+            )
+
+    def path(self, root: Path, values: Values) -> Path:
+        """The file of `values`, which hold every word."""
+        return root / _filled(self.text, values)
+
+    def files(self, root: Path) -> Iterator[Found]:
+        """What matches below `root`: files, and anything else of such a name.
+
+        Files whose names begin with a dot are left out: systems write them beside others.
+
+        Raises:
+            InputError: a folder may not be listed.
+        """
+        return _walk(Found(root, {}), self.pieces)
+
+    def why_nothing(self, root: Path) -> str:
+        """Where the first piece that matches nothing should be, and what is there instead."""
+        reached = [Found(root, {})]
+        for piece in self.pieces:
+            further = [found for folder in reached for found in _matching(folder, piece)]
+            if not further:
+                break
+            reached = further
+        else:
+            return "it matches"
+        folder = reached[0].path
+        return f"in {folder} nothing matches '{piece}', {folder.name} holds {what_is_in(folder)}"
+
+
+def what_is_in(folder: Path) -> str:
+    """The first few names in `folder`, for a message."""
+    names = [name for name in _listed(folder) if not name.startswith(".")]
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return ", ".join(names[:4]) + more if names else "nothing"
+
+
+def in_order(text: str) -> list[tuple[bool, int, str]]:
+    """Key to sort names by, numbers in them by their value: frame_9 comes before frame_10."""
+    pieces = re.split(r"([0-9]+)", text)
+    return [
+        (index % 2 == 0, int(piece) if index % 2 else 0, piece)
+        for index, piece in enumerate(pieces)
+    ]
+
+
+def _walk(start: Found, pieces: tuple[str, ...]) -> Iterator[Found]:
+    piece, *rest = pieces
+    for found in _matching(start, piece):
+        if rest:
+            yield from _walk(found, tuple(rest))
+        else:
+            yield found
+
+
+def _matching(start: Found, piece: str) -> Iterator[Found]:
+    folder, values = start
+    filled = _filled(piece, values)
+    if "{" not in filled:
+        # A link that leads nowhere is there: whoever opens it says where it should lead.
+        if os.path.lexists(folder / filled):
+            yield Found(folder / filled, values)
+        return
+    expression = _expression(filled)
+    for name in _listed(folder):
+        match = expression.fullmatch(name)
+        if match and (not name.startswith(".") or filled.startswith(".")):
+            yield Found(folder / name, {**values, **match.groupdict()})
+
+
+def _filled(text: str, values: Values) -> str:
+    """`text` with words replaced whose values are known."""
+    return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
+
+
+def _expression(piece: str) -> re.Pattern[str]:
+    seen: set[str] = set()
+    parts = []
+    for index, part in enumerate(re.split(r"\{(\w+)\}", piece)):
+        if index % 2 == 0:
+            parts.append(re.escape(part))
+        else:
+            parts.append(f"(?P={part})" if part in seen else f"(?P<{part}>.+)")
+            seen.add(part)
+    return re.compile("".join(parts), re.DOTALL)
+
+
+def _listed(folder: Path) -> list[str]:
+    try:
+        return sorted(os.listdir(folder))  # noqa: PTH208 - names alone, of thousands of files
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except PermissionError:
+        raise InputError(
+            f"{folder} may not be listed, permission is denied; allow it (chmod a+rx)."
+        ) from None

@@ -1,0 +1,253 @@
+"""Which frames of a folder are trained on, chosen with and tested on: three ways to say so.
+
+Part of `rgbt.data.folder`: by a folder that the path names, by list files, or by shares that are
+drawn.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+from rgbt.checks import InputError
+from rgbt.data.folder_frames import Frame
+from rgbt.data.folder_pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
+from rgbt.data.integrity import is_there, read_names
+from rgbt.randomness import numpy_generator
+
+FOLDERS = {split: split for split in ("train", "val", "test")}
+"""What {split} stands for where the configuration does not say so."""
+
+Frames = Mapping[str, Frame]
+
+
+class Rule(Protocol):
+    """How splits are told."""
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> what it is made of."""
+        ...
+
+    def has(self, split: str) -> bool:
+        """Whether anything of a known split is there."""
+        ...
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a known split; InputError where it is missing or empty."""
+        ...
+
+
+@dataclass(frozen=True)
+class ByFolder:
+    """A split is what stands for {split} in the path of its RGB images.
+
+    Attributes:
+        frames: all.
+        pattern: of the RGB images.
+        folders: split -> what stands for {split}; two splits may have one folder.
+    """
+
+    frames: Frames
+    pattern: Pattern
+    folders: dict[str, str]
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> the pattern of its files."""
+        braces = f"{{{SPLIT}}}"
+        return {
+            split: self.pattern.text.replace(braces, word) for split, word in self.folders.items()
+        }
+
+    def has(self, split: str) -> bool:
+        """Whether there is a frame in its folder."""
+        return bool(self._of(split))
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names in its folder; InputError where there are none."""
+        names = self._of(split)
+        if not names:
+            known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
+            raise InputError(
+                f"dataset.folders: split '{split}' is empty, dataset.rgb='{self.pattern.text}' has "
+                f"no file with '{self.folders[split]}' for {{{SPLIT}}}; it has {', '.join(known)}: "
+                f"name one of them in dataset.folders, {{{split}: ...}}."
+            )
+        return names
+
+    def _of(self, split: str) -> tuple[str, ...]:
+        word = self.folders[split]
+        return tuple(name for name, frame in self.frames.items() if frame.values[SPLIT] == word)
+
+
+@dataclass(frozen=True)
+class ByList:
+    """A split is a file of one line per frame.
+
+    A line is the name of the frame; or what stands for the words of the RGB pattern, joined by
+    "/"; or {name} alone where no two frames share it; or the path of the RGB image below the root.
+    Each may end in a suffix.
+
+    Attributes:
+        frames: all.
+        root: of the frames, and of the lists where these are relative.
+        lists: split -> file.
+    """
+
+    frames: Frames
+    root: Path
+    lists: dict[str, str]
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> its list."""
+        return dict(self.lists)
+
+    def has(self, split: str) -> bool:
+        """Whether its list is there."""
+        return is_there(self._path(split))
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names in the order of the list.
+
+        A line that is no frame stays as it is, so that reading it says so; InputError where none
+        is, or there is no such list.
+        """
+        path, key = self._path(split), f"dataset.lists.{split}"
+        if not is_there(path):
+            raise InputError(f"{key}: there is no list '{path}'; write it (one name per line).")
+        lines = read_names(path, key)
+        forms = self._forms()
+        names = tuple(forms.get(line) or forms.get(_stem(line)) or line for line in lines)
+        if set(names).isdisjoint(self.frames):
+            raise InputError(
+                f"{key}: none of the {len(lines)} lines of {path} is a frame: the first is "
+                f"'{lines[0]}', expected names such as '{next(iter(self.frames))}' or paths such "
+                f"as '{_below(self.root, next(iter(self.frames.values())))}'."
+            )
+        return names
+
+    def _path(self, split: str) -> Path:
+        return self.root / Path(self.lists[split]).expanduser()
+
+    def _forms(self) -> dict[str, str]:
+        """Everything that a line may be -> the name of the frame; names come before all else."""
+        shared = Counter(frame.values[NAME] for frame in self.frames.values())
+        forms = {name: name for name in self.frames}
+        for name, frame in self.frames.items():
+            path = _below(self.root, frame)
+            alone = frame.values[NAME]
+            for form in ("/".join(frame.values.values()), path, _stem(path)):
+                forms.setdefault(form, name)
+            if shared[alone] == 1:
+                forms.setdefault(alone, name)
+        return forms
+
+
+@dataclass(frozen=True)
+class ByShare:
+    """Splits are drawn once, by a seed of their own; neighbouring frames stay together.
+
+    What is drawn are units: the frames of one {sequence}, or of the whole folder where the pattern
+    has no such word, cut into blocks of `block` neighbours. In the order drawn, each unit goes to
+    the split that lacks most frames of its share.
+
+    Attributes:
+        frames: all.
+        shares: split -> its share, above 0; together 1.
+        seed: of the draw.
+        block: frames of a unit; None: sequences stay whole.
+
+    Raises:
+        InputError: shares that are not positive or not 1 together, a block that is not positive,
+            nothing that can be drawn, or a split that would get no frame.
+    """
+
+    frames: Frames
+    shares: dict[str, float]
+    seed: int
+    block: int | None
+
+    def __post_init__(self) -> None:
+        if not all(share > 0 for share in self.shares.values()) or (
+            abs(sum(self.shares.values()) - 1) > 1e-6
+        ):
+            raise InputError(
+                "dataset.shares: expected shares above 0 that are 1 together, such as {train: 0.8, "
+                f"val: 0.1, test: 0.1}}, got {self.shares}."
+            )
+        if self.block is not None and self.block < 1:
+            raise InputError(f"dataset.block: expected at least 1 frame, got {self.block}.")
+        units = self.units
+        if len(units) < len(self.shares):
+            raise InputError(
+                f"dataset.shares: {len(self.shares)} splits are to be drawn from {len(units)} "
+                f"{'sequence' if self.block is None else 'block'}(s), and neighbouring frames stay "
+                "together; give dataset.block, the number of neighbours that do (seconds of a "
+                "drive, not single frames), or fewer splits."
+            )
+        empty = [split for split in self.shares if not self.drawn[split]]
+        if empty:
+            raise InputError(
+                f"dataset.shares: split '{empty[0]}' gets no frame, as {len(units)} units of up to "
+                f"{max(map(len, units))} frames stay together; give a smaller dataset.block, a "
+                "larger share, or another dataset.shares_seed."
+            )
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> its share."""
+        return {split: f"{share:g} of the frames" for split, share in self.shares.items()}
+
+    def has(self, split: str) -> bool:
+        """Every split has frames."""
+        return split in self.shares
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split in the order of all frames."""
+        drawn = set(self.drawn[split])
+        return tuple(name for name in self.frames if name in drawn)
+
+    @cached_property
+    def units(self) -> list[list[str]]:
+        """Names that stay together."""
+        sequences: dict[str, list[Frame]] = defaultdict(list)
+        for frame in self.frames.values():
+            sequences[frame.values.get(SEQUENCE, "")].append(frame)
+        units = []
+        for sequence in sorted(sequences, key=in_order):
+            # Two cameras of one moment are neighbours, whatever word comes first in the path.
+            names = [frame.name for frame in sorted(sequences[sequence], key=_moment)]
+            size = self.block or len(names)
+            units += [names[start : start + size] for start in range(0, len(names), size)]
+        return units
+
+    @cached_property
+    def drawn(self) -> dict[str, list[str]]:
+        """Split -> its names."""
+        lacking = {split: share * len(self.frames) for split, share in self.shares.items()}
+        found: dict[str, list[str]] = {split: [] for split in self.shares}
+        for index in numpy_generator(self.seed, "shares").permutation(len(self.units)):
+            split = max(lacking, key=lambda each: lacking[each])
+            found[split] += self.units[index]
+            lacking[split] -= len(self.units[index])
+        return found
+
+
+def _moment(frame: Frame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
+    return in_order(frame.values[NAME]), in_order(frame.name)
+
+
+def _below(root: Path, frame: Frame) -> str:
+    return frame.rgb.relative_to(root).as_posix()
+
+
+def _stem(line: str) -> str:
+    """`line` without what follows the last dot of its last piece."""
+    folder, slash, last = line.rpartition("/")
+    return f"{folder}{slash}{last.rpartition('.')[0] or last}"

@@ -1,0 +1,48 @@
+"""What a name of KP says: its recording, and with it the time of day and the split."""
+
+from __future__ import annotations
+
+import re
+
+from rgbt.checks import InputError
+
+SETS = {"train": (0, 1, 2, 3, 4, 5), "val": (6, 10), "test": (7, 8, 9, 11)}
+"""Recordings of each split, as the lists of the CRM release divide the labelled images."""
+
+NIGHT_SETS = (3, 4, 5, 9, 10, 11)
+TIMES = ("day", "night")
+SPLITS = {
+    split: f"{split}.txt"
+    for base in SETS
+    for split in (base, *(f"{base}_{time}" for time in TIMES))
+}
+NAME = re.compile(r"set(0\d|1[01])_V(\d{3})_I(\d{5})")
+FORM = "a name such as set00_V000_I00050 with a set from 00 to 11"
+MODALITY = re.compile("_(visible|lwir)_")
+"""What names in the lists of MS-UDA hold beside."""
+
+
+def set_of(name: str) -> int:
+    """Number of the recording of `name`; InputError where it is not a name."""
+    return int(parts_of(name)[0].removeprefix("set"))
+
+
+def is_night(name: str) -> bool:
+    """Whether `name` was recorded at night, by its set; InputError where it is not a name."""
+    return set_of(name) in NIGHT_SETS
+
+
+def sets_of(split: str) -> tuple[int, ...]:
+    """Recordings that `split` is made of where no list says; it is one of `SPLITS`."""
+    base, _, time = split.partition("_")
+    return tuple(
+        number for number in SETS[base] if not time or (number in NIGHT_SETS) == (time == "night")
+    )
+
+
+def parts_of(name: str) -> tuple[str, str, str]:
+    """Set, video and frame, as ("set00", "V000", "I00050"); InputError where it is not a name."""
+    if NAME.fullmatch(name) is None:
+        raise InputError(f"'{name}' is not {FORM}; it says neither its files nor the time of day.")
+    recording, video, frame = name.split("_")
+    return recording, video, frame

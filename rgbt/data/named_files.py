@@ -1,0 +1,94 @@
+"""What readers of named files share: folders, samples of one size, fingerprints, roots nearby.
+
+Part of the readers of data sets; nothing here knows the layout of a data set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.types import Sample
+
+Array = NDArray[np.uint8]
+
+
+def names_in(folder: Path) -> tuple[str, ...]:
+    """Sorted names of the PNG files of a folder, without ending and without those of archivers."""
+    return tuple(sorted(path.stem for path in folder.glob("*.png") if path.name[0] != "."))
+
+
+def sample_of_one_size(
+    name: str, rgb: Array, thermal: Array, label: Array, files: tuple[Path, ...]
+) -> Sample:
+    """The sample of three arrays.
+
+    Args:
+        name: of the sample.
+        rgb: (H, W, 3).
+        thermal: (H, W).
+        label: (H, W).
+        files: where they come from, in this order; for messages.
+
+    Raises:
+        InputError: heights or widths differ.
+    """
+    for what, image, path in (("thermal", thermal, files[1]), ("its label", label, files[2])):
+        if image.shape != rgb.shape[:2]:
+            raise InputError(
+                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
+                f"{image.shape[0]}x{image.shape[1]}; both must have one size, see {path}."
+            )
+    return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+
+
+def hash_of_files(
+    splits: Mapping[str, tuple[str, ...]], files: Callable[[str], Iterable[Path]]
+) -> str:
+    """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+
+    Nothing is decoded and folders are left out, so that equal copies have equal fingerprints.
+
+    Args:
+        splits: split -> its names; () where the split is not there.
+        files: name -> its files; those that are missing count as such.
+    """
+    sizes: dict[str, list[int]] = {}
+    digest = hashlib.sha256()
+    for split in sorted(splits):
+        digest.update(f"{split} {len(splits[split])}\n".encode())
+        for name in splits[split]:
+            if name not in sizes:
+                sizes[name] = [_size(path) for path in files(name)]
+            digest.update(f"{name} {sizes[name]}\n".encode())
+    return digest.hexdigest()
+
+
+def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
+    """The folder just above or below `root` that is one; None where there is none.
+
+    Args:
+        root: a folder that is no root.
+        holds: whether a folder is the root of a data set.
+    """
+
+    def is_one(folder: Path) -> bool:
+        try:
+            return holds(folder)
+        except OSError:  # a neighbour that may not be looked into is nothing to point to
+            return False
+
+    return next(filter(is_one, (root.absolute().parent, *sorted(root.iterdir()))), None)
+
+
+def _size(path: Path) -> int:
+    # A name that leads through a file instead of a folder is missing as well.
+    try:
+        return path.stat().st_size
+    except (FileNotFoundError, NotADirectoryError):
+        return -1

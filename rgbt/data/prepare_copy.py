@@ -1,0 +1,179 @@
+"""Writing what was planned: whole files or none, again and again until all are there.
+
+Part of `rgbt.data.prepare`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from rgbt.checks import InputError
+from rgbt.data.prepare_source import Entry
+
+PLAN = ".prepare.json"
+"""In the folder that is written: what from, so that an interrupted command goes on."""
+
+SPARE = 2**24
+"""Bytes left free on the disk beside what is copied."""
+
+
+class Item(NamedTuple):
+    """A file to be written.
+
+    Attributes:
+        target: where to, in the folder that is written, with "/".
+        content: a file of the download, or its bytes.
+    """
+
+    target: str
+    content: Entry | bytes
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self.content) if isinstance(self.content, bytes) else self.content.size
+
+    def chunks(self) -> Iterator[bytes]:
+        """Its bytes in pieces."""
+        return iter((self.content,)) if isinstance(self.content, bytes) else self.content.chunks()
+
+    def is_at(self, path: Path) -> bool:
+        """Whether `path` has been written: files get their names when they are whole."""
+        if not path.is_file() or path.stat().st_size != self.size:
+            return False
+        return not isinstance(self.content, bytes) or path.read_bytes() == self.content
+
+
+def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> None:
+    """Refuse a folder that is not ours to write; nothing is written yet.
+
+    Args:
+        out: new, empty, or begun by the same command.
+        sources: what must not be written into.
+        plan: what identifies the command.
+
+    Raises:
+        InputError: it lies in one of `sources`, holds other things, or was begun by another
+            command.
+    """
+    for source in sources:
+        if out.resolve().is_relative_to(source.resolve()):
+            raise InputError(
+                f"out: {out} lies in {source}, which is only read; name a folder outside of it."
+            )
+    path = out / PLAN
+    if not path.is_file():
+        # Killed before anything else, a command leaves its note half written.
+        others = [each for each in _listed(out) if not each.name.startswith(PLAN)]
+        if others:
+            raise InputError(
+                f"out: {out} is not empty and was not begun by this command; name another folder."
+            )
+        return
+    try:
+        begun = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        begun = None
+    if begun != plan:
+        raise InputError(
+            f"out: {out} was begun from something else ({path} says what); give the same arguments "
+            "again, name another folder, or remove this one."
+        )
+
+
+@contextmanager
+def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
+    """`out`, made, and ours alone until the end.
+
+    Args:
+        out: that passed `check_out`.
+        plan: kept in it.
+
+    Raises:
+        InputError: it is being written by another process, or cannot be written.
+    """
+    path = out / PLAN
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not path.is_file():
+            temporary = path.with_name(f"{PLAN}.{os.getpid()}")
+            temporary.write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8")
+            temporary.replace(path)
+        with path.open("r+") as file:
+            _lock(file.fileno(), out)
+            yield
+    except OSError as error:
+        raise InputError(
+            f"out: cannot write {error.filename or out} ({error.strerror or error}); free some "
+            "space, or name a folder that can be written. What was copied stays: the same command "
+            "goes on."
+        ) from error
+
+
+def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) -> None:
+    """Write those of `items` that are not there yet.
+
+    Args:
+        items: with different targets.
+        out: of `claimed`.
+        advance: called with the bytes of every file that is there or has been written.
+
+    Raises:
+        InputError: too little space, or a file of the download that cannot be read or is shorter
+            or longer than it said.
+        OSError: `out` cannot be written.
+    """
+    missing = []
+    for item in items:
+        if item.is_at(out / item.target):
+            advance(item.size)
+        else:
+            missing.append(item)
+    needed, free = sum(item.size for item in missing) + SPARE, shutil.disk_usage(out).free
+    if needed > free:
+        raise InputError(
+            f"out: {needed / 1e9:.2f} GB are to be copied to {out}, and its disk has "
+            f"{free / 1e9:.2f} GB left; free some, or name a folder on another disk."
+        )
+    for item in missing:
+        _write(item, out / item.target)
+        advance(item.size)
+
+
+def _listed(out: Path) -> list[Path]:
+    """What lies in a folder; a file lies in itself."""
+    return list(out.iterdir()) if out.is_dir() else [path for path in (out,) if path.exists()]
+
+
+def _lock(descriptor: int, out: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(
+            f"out: another process is preparing {out}; wait for it, or name another folder."
+        ) from error
+
+
+def _write(item: Item, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Not flushed to the disk one by one, which takes longer than copying: what a failure of power
+    # leaves is found by its length, or by the check that reads everything afterwards.
+    temporary = path.with_name(f".{path.name}.part")
+    size = 0
+    with temporary.open("wb") as file:
+        for chunk in item.chunks():
+            file.write(chunk)
+            size += len(chunk)
+    if size != item.size:
+        raise InputError(
+            f"{item.content!s} holds {size} bytes and not {item.size}, as was listed; is it still "
+            "being downloaded? Give the same command again when it is complete."
+        )
+    temporary.replace(path)

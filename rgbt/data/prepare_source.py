@@ -1,0 +1,194 @@
+"""Files of a download, whether they lie in folders or in zip archives; nothing is ever changed.
+
+Part of `rgbt.data.prepare`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from rgbt.checks import InputError
+
+CHUNK = 2**20
+"""Bytes read at a time."""
+
+BROKEN = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError)
+"""What a damaged, encrypted or unknown archive raises when it is read."""
+
+ENCRYPTED = 1
+"""Bit of the flags of a member."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of the download.
+
+    Attributes:
+        path: where it lies in the download, with "/"; archives count as folders.
+        size: bytes.
+        file: itself, or the archive that holds it.
+        archive: the same, opened; None: it is no member of one.
+        member: its name in the archive.
+    """
+
+    path: str
+    size: int
+    file: Path
+    archive: zipfile.ZipFile | None = None
+    member: str = ""
+
+    def chunks(self) -> Iterator[bytes]:
+        """Its bytes in pieces; InputError where they cannot be read."""
+        try:
+            opened = self.file.open("rb") if self.archive is None else self._member(self.archive)
+            with opened as stream:
+                while chunk := stream.read(CHUNK):
+                    yield chunk
+        except BROKEN as error:
+            raise InputError(
+                f"{self} cannot be read ({error}); allow it, or download the file again."
+            ) from error
+
+    def lines(self) -> tuple[str, ...]:
+        """Lines that are not empty, without what surrounds them; InputError where it is no text."""
+        try:
+            text = b"".join(self.chunks()).decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self}: expected a list in UTF-8, one name per line.") from error
+        return tuple(line.strip() for line in text.splitlines() if line.strip())
+
+    def __str__(self) -> str:
+        return str(self.file) if self.archive is None else f"{self.member} of {self.file}"
+
+    def _member(self, archive: zipfile.ZipFile) -> zipfile.ZipExtFile:
+        return archive.open(self.member)  # type: ignore[return-value]
+
+
+class Source:
+    """Everything that a download holds, listed once. A context: archives are closed at its end.
+
+    Hidden files and what archivers of other systems leave (__MACOSX) are left out. A file that lies
+    in a folder comes before one of the same path in an archive beside it.
+
+    Args:
+        path: a folder, or a zip archive.
+        key: what the path is called in messages.
+        archives: names of archives that are opened where they lie in a folder.
+
+    Attributes:
+        path: the same.
+        key: the same.
+        entries: path -> entry, sorted.
+
+    Raises:
+        InputError: nothing is there, it is neither a folder nor a whole archive, or an archive
+            holds a name that leads out of the folder into which it is unpacked.
+    """
+
+    def __init__(self, path: Path, key: str, archives: str = r"$^") -> None:
+        self.path = path
+        self.key = key
+        self._opened = ExitStack()
+        found: dict[str, Entry] = {}
+        if path.is_dir():
+            self._add_folder(path, re.compile(archives, re.IGNORECASE), found)
+        elif path.is_file():
+            self._add_archive(path, "", found)
+        else:
+            raise InputError(
+                f"{key}: there is no file or folder '{path}'; give the downloaded archive, or the "
+                "folder into which it was unpacked."
+            )
+        self.entries = dict(sorted(found.items()))
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._opened.close()
+
+    def folders(self) -> frozenset[str]:
+        """Every folder that holds something, "" for the download itself."""
+        parents = {parent for path in self.entries for parent in PurePosixPath(path).parents}
+        return frozenset("" if str(parent) == "." else str(parent) for parent in parents)
+
+    def _add_folder(self, root: Path, archives: re.Pattern[str], found: dict[str, Entry]) -> None:
+        packed = []
+        try:
+            for file in _files(root):
+                relative = file.relative_to(root).as_posix()
+                found[relative] = Entry(relative, file.stat().st_size, file)
+                if archives.fullmatch(file.name):
+                    packed.append(file)
+        except OSError as error:
+            raise InputError(
+                f"{self.key}: {error.filename} cannot be listed ({error.strerror}); allow it, or "
+                "give another folder."
+            ) from error
+        for file in packed:
+            inside = file.relative_to(root).parent.as_posix()
+            self._add_archive(file, "" if inside == "." else f"{inside}/", found)
+
+    def _add_archive(self, file: Path, place: str, found: dict[str, Entry]) -> None:
+        """List an archive as if it were unpacked into `place`, into a folder of its own name."""
+        try:
+            archive = self._opened.enter_context(zipfile.ZipFile(file))
+            members = archive.infolist()
+        except BROKEN as error:
+            raise InputError(
+                f"{self.key}: {file} is no whole zip archive ({error}); download it again, or give "
+                "the folder into which it was unpacked."
+            ) from error
+        paths = {self._checked(member, file): member for member in members}
+        tops = {path.partition("/")[0] for path in paths}
+        own = place if tops <= {file.stem} else f"{place}{file.stem}/"
+        for path, member in paths.items():
+            is_link = stat.S_ISLNK(member.external_attr >> 16)
+            if not (member.is_dir() or is_link or _is_hidden(path)):
+                entry = Entry(own + path, member.file_size, file, archive, member.filename)
+                found.setdefault(entry.path, entry)
+
+    def _checked(self, member: zipfile.ZipInfo, file: Path) -> str:
+        path = member.filename.replace("\\", "/")
+        if path.startswith("/") or ":" in path.partition("/")[0] or ".." in path.split("/"):
+            raise InputError(
+                f"{self.key}: {file} holds '{member.filename}', which leads out of the folder that "
+                "it is unpacked into; this is not the original archive, download it again."
+            )
+        if member.flag_bits & ENCRYPTED:
+            raise InputError(
+                f"{self.key}: {file} asks for a password; unpack it and give the folder."
+            )
+        return path
+
+
+def _files(root: Path) -> Iterator[Path]:
+    """Every file below `root`; links to folders are followed unless they lead back up."""
+
+    def stop(error: OSError) -> None:
+        raise error
+
+    for folder, subfolders, names in os.walk(root, onerror=stop, followlinks=True):
+        here = Path(folder)
+        subfolders[:] = sorted(
+            name for name in subfolders if not (_is_hidden(name) or _leads_back(here / name))
+        )
+        for name in names:
+            if not _is_hidden(name) and (here / name).is_file():
+                yield here / name
+
+
+def _leads_back(path: Path) -> bool:
+    return path.is_symlink() and path.parent.resolve().is_relative_to(path.resolve())
+
+
+def _is_hidden(path: str) -> bool:
+    return any(part.startswith(".") or part == "__MACOSX" for part in path.split("/"))

@@ -1,0 +1,302 @@
+"""PST900: pictures of mines and tunnels, RGB and thermal, with four objects of search and rescue.
+
+A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.dataset import check_lengths
+from rgbt.data.files import read_label, read_rgb
+from rgbt.data.grey import read_grey
+from rgbt.data.integrity import read_names, within
+from rgbt.data.named_files import (
+    hash_of_files,
+    names_in,
+    root_nearby,
+    sample_of_one_size,
+)
+from rgbt.types import Sample
+
+CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
+PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
+FOLDERS = ("rgb", "thermal", "labels")
+PARTS = ("train", "test")
+SPLITS = ("train", "val", "test")
+
+BAG = re.compile(r"(?:^|_)bag(\d+)_")
+"""Which recording a picture was taken from: 58_bag21_rect_rgb_frame0000000440 is of bag 21."""
+
+ADVICE = (
+    "the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the counts of "
+    "the camera and is not read"
+)
+
+
+def bag_of(name: str) -> int | None:
+    """Number of the recording that `name` says; None where it says none."""
+    found = BAG.search(name)
+    return int(found[1]) if found else None
+
+
+class PST900:
+    """Underground RGB-thermal pairs with labels, as the PST900 archive lays them out.
+
+    Layouts (NAME as in 58_bag21_rect_rgb_frame0000000440, the same in each folder):
+        folders: {train,test}/{rgb,thermal,labels}/NAME.png, the archive's own; thermal_raw and
+            depth are left alone
+        lists:   {rgb,thermal,labels}/NAME.png with train.txt, test.txt and, if there is one,
+            val.txt, as the LASNet release has it; read where there is neither train nor test
+
+    Splits: "train", "val", "test". The archive has no validation part. As in the CRM and
+    SpatialSeg releases "val" is the test part, so that the best checkpoint is chosen on what is
+    reported; `val_bags` takes recordings out of training instead. A list val.txt is "val".
+
+    Class indices are those of the files, in the order of the authors' toolkit. Two traps of
+    published material: the authors' colours are in OpenCV's order, so that id 1 is red there; here
+    they are (red, green, blue) as the LASNet and CRM releases save them, id 1 being blue. And many
+    tables print their columns as hand drill, backpack, fire extinguisher, some with the values of
+    drill and extinguisher exchanged: compare by name with care, the mean is not affected.
+
+    Thermal images are grey levels of 8 bits in which pixels without a measurement are 0.
+
+    Source: PST900 (Shivakumar et al., ICRA 2020). Nothing is ignored, 255 is accepted.
+
+    Args:
+        root: folder that holds `train` and `test`, or `rgb`, `thermal`, `labels` and the lists.
+        name: what the data set is called in messages and tables.
+        num_classes: number of classes; other nodes of the configuration interpolate it.
+        classes: their names, in order of the class index.
+        palette: their (red, green, blue) colours, 0..255.
+        val_bags: recordings of the training part that form "val" and leave "train"; () keeps
+            "val" as described above.
+
+    Raises:
+        InputError: no such root, neither layout in it, numbers of classes, names and colours
+            differ.
+    """
+
+    unscored: tuple[str, ...] = ()
+    """Every class counts in the means, as in the published tables."""
+
+    def __init__(  # noqa: PLR0913 - each is a key of the configuration
+        self,
+        root: str,
+        *,
+        name: str = "pst900",
+        num_classes: int = len(CLASSES),
+        classes: tuple[str, ...] = CLASSES,
+        palette: tuple[tuple[int, int, int], ...] = PALETTE,
+        val_bags: tuple[int, ...] = (),
+    ) -> None:
+        self.root = Path(root).expanduser()
+        self.name = name
+        self.num_classes = num_classes
+        self.classes = classes
+        self.palette = palette
+        self.val_bags = val_bags
+        if not self.root.is_dir():
+            raise InputError(
+                f"dataset.root: there is no folder '{root}'; give the one that holds train and "
+                "test of PST900."
+            )
+        check_lengths(num_classes, classes, palette)
+        self.has_lists = _has_lists(self.root)
+        self._parts: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def splits(self) -> Mapping[str, str]:
+        """Split -> the files or the list that it is made of."""
+        made_of = {split: self._made_of(self.part_of(split)) for split in SPLITS}
+        if self.val_bags:
+            bags = list(self.val_bags)
+            made_of["train"] += f" without the bags {bags}"
+            made_of["val"] += f" of the bags {bags}"
+        return made_of
+
+    def part_of(self, split: str) -> str:
+        """The part of the archive, or the list, that `split` is taken from.
+
+        Raises:
+            InputError: unknown split.
+        """
+        if split not in SPLITS:
+            raise InputError(f"dataset: there is no split '{split}'; {nearest(split, SPLITS)}.")
+        if split != "val":
+            return split
+        if self.val_bags:
+            return "train"
+        return "val" if self.has_lists and (self.root / "val.txt").is_file() else "test"
+
+    def has(self, split: str) -> bool:
+        """Whether anything of `split` is there; InputError where the split is unknown."""
+        part = self.part_of(split)
+        if self.has_lists:
+            return self._list(part).is_file()
+        return bool(self._part(part, split)) and bool(self._chosen(split))
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, sorted, or in the order of its list.
+
+        Raises:
+            InputError: unknown split, nothing of it, or a bag of `val_bags` that is not there.
+        """
+        part = self.part_of(split)
+        if self.val_bags and part == "train":
+            self._check_bags()
+        names = self._chosen(split)
+        if not names:
+            raise InputError(self._why_empty(split))
+        return names
+
+    def read(self, name: str) -> Sample:
+        """The triple called `name`, decoded.
+
+        Returns:
+            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
+
+        Raises:
+            InputError: no such name, or one of both parts, a file is missing, cannot be decoded,
+                has other channels, bits or size than expected, or the label holds a value that is
+                neither a class nor 255.
+        """
+        files = self.files(name)
+        rgb = read_rgb(within(files[0], self.root))
+        return sample_of_one_size(name, rgb, self.thermal(name), self.label(name), files)
+
+    def thermal(self, name: str) -> NDArray[np.uint8]:
+        """The thermal image called `name` alone, (H, W) uint8; InputError as in `read`."""
+        return read_grey(within(self.files(name)[1], self.root), advice=ADVICE)
+
+    def label(self, name: str) -> NDArray[np.uint8]:
+        """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
+        return read_label(within(self.files(name)[2], self.root), self.num_classes)
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """RGB, thermal and label of `name`; InputError where no part or both have it."""
+        folders = self._folders(name)
+        if len(folders) != 1:
+            reason = "both train and test have" if folders else "neither train nor test has"
+            raise InputError(
+                f"{self.name} ({self.root}): {reason} an image called '{name}'; use the original "
+                "archive, in which every name is in one part."
+            )
+        return _files_in(folders[0], name)
+
+    def decoding(self) -> dict[str, Any]:
+        """What decides, beside the files, what `read` makes of them."""
+        return {"num_classes": self.num_classes}
+
+    def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
+        """None: it is dark underground at any time."""
+
+    def fingerprint(self) -> str:
+        """SHA-256 in hexadecimal over the names of every split and the sizes of their files."""
+        splits = {split: self._chosen(split) if self.has(split) else () for split in SPLITS}
+        return hash_of_files(
+            splits,
+            lambda name: [
+                path for folder in self._folders(name) for path in _files_in(folder, name)
+            ],
+        )
+
+    def folders(self) -> tuple[Path, ...]:
+        """Every folder that holds rgb, thermal and labels."""
+        if self.has_lists:
+            return (self.root,)
+        return tuple(self.root / part for part in PARTS if (self.root / part).is_dir())
+
+    def _made_of(self, part: str) -> str:
+        return f"{part}.txt" if self.has_lists else f"{part}/rgb/*.png"
+
+    def _list(self, part: str) -> Path:
+        return self.root / f"{part}.txt"
+
+    def _part(self, part: str, split: str) -> tuple[str, ...]:
+        """Names of a part; those of folders are listed once, later changes are not seen."""
+        if part not in self._parts:
+            if self.has_lists:
+                lines = read_names(self._list(part), f"split '{split}' of {self.name}")
+                self._parts[part] = tuple(line.removesuffix(".png") for line in lines)
+            else:
+                self._parts[part] = names_in(self.root / part / FOLDERS[0])
+        return self._parts[part]
+
+    def _chosen(self, split: str) -> tuple[str, ...]:
+        names = self._part(self.part_of(split), split)
+        if not self.val_bags or split == "test":
+            return names
+        return tuple(name for name in names if (bag_of(name) in self.val_bags) == (split == "val"))
+
+    def _folders(self, name: str) -> tuple[Path, ...]:
+        """Where the three files of `name` are: one folder, or several, or none."""
+        return (self.root,) if self.has_lists else self._folders_of.get(name, ())
+
+    @cached_property
+    def _folders_of(self) -> dict[str, tuple[Path, ...]]:
+        found: dict[str, tuple[Path, ...]] = {}
+        for part in PARTS:
+            for name in self._part(part, part):
+                found[name] = (*found.get(name, ()), self.root / part)
+        return found
+
+    def _check_bags(self) -> None:
+        known = {str(bag_of(name)) for name in self._part("train", "train")} - {"None"}
+        for bag in self.val_bags:
+            if str(bag) not in known:
+                listed = ", ".join(sorted(known, key=int)) or "none"
+                raise InputError(
+                    f"dataset.val_bags: the training part of {self.root} has no bag {bag}; its "
+                    f"bags are {listed}."
+                )
+
+    def _why_empty(self, split: str) -> str:
+        part = self.part_of(split)
+        advice = f"unpack the folder '{part}' of the archive there"
+        if self.val_bags and part == "train":
+            advice = "every image is of a bag in dataset.val_bags, leave one out of it"
+        return (
+            f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
+            f"{self.root}; {advice}."
+        )
+
+
+def _files_in(folder: Path, name: str) -> tuple[Path, ...]:
+    return tuple(folder / kind / f"{name}.png" for kind in FOLDERS)
+
+
+def _has_parts(root: Path) -> bool:
+    return any((root / part / FOLDERS[0]).is_dir() for part in PARTS)
+
+
+def _is_flat(root: Path) -> bool:
+    return all((root / kind).is_dir() for kind in FOLDERS)
+
+
+def _has_lists(root: Path) -> bool:
+    """Whether `root` is laid out in lists and not in folders; InputError where it is neither."""
+    if _has_parts(root):
+        return False
+    if _is_flat(root) and any((root / f"{part}.txt").is_file() for part in PARTS):
+        return True
+    near = root_nearby(root, _has_parts)
+    advice = "give the folder into which the archive was unpacked"
+    if near is not None:
+        advice = f"give {near}, which does"
+    elif _is_flat(root):
+        advice = (
+            "it holds rgb, thermal and labels themselves, but neither train.txt nor test.txt says "
+            "which image belongs to which part; write these lists (one name per line)"
+        )
+    raise InputError(
+        f"dataset.root: '{root}' does not hold train/rgb or test/rgb of PST900; {advice}."
+    )

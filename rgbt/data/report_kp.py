@@ -1,0 +1,132 @@
+"""What is checked of KP alone: where its splits come from, days and nights, published numbers."""
+
+from __future__ import annotations
+
+from rgbt.data.kp import KP
+from rgbt.data.kp_names import NAME, TIMES, is_night, set_of
+from rgbt.data.report_lists import listed_twice, other_sizes, other_times, shared
+from rgbt.data.report_values import Lists, SplitReport, Times
+
+OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
+"""Day and night images of each split of the CRM release: 499, 140 and 311."""
+
+HW = (512, 640)
+
+
+class KPLayout:
+    """See `rgbt.data.report_values.Layout`."""
+
+    def __init__(self, dataset: KP) -> None:
+        self.dataset = dataset
+
+    @property
+    def title(self) -> str:
+        """Which layout images and labels have, and who divides them."""
+        images = "the CRM release" if self.dataset.has_images else "MS-UDA"
+        origin = "list files" if self.dataset.lists == "files" else "set numbers"
+        return f"KP as {images} has it, splits from {origin}"
+
+    def repeats(self, split: str) -> bool:
+        """Splits by time of day only repeat names of others."""
+        return split.endswith(("_day", "_night"))
+
+    def times(self, names: tuple[str, ...]) -> Times:
+        """By the sets."""
+        nights = sum(self.dataset.nights(names))
+        return Times(len(names) - nights, nights)
+
+    def thermal(self, name: str) -> None:
+        """Thermal images come as grey levels."""
+
+    def problems(self, lists: Lists) -> list[str]:
+        """Names listed twice, in two splits or at the wrong time; labels that are in no split."""
+        return [
+            *listed_twice(lists),
+            *shared(lists, self._share_a_list),
+            *_wrong_times(lists),
+            *_lists_that_disagree(lists),
+            *self._unlisted(lists),
+        ]
+
+    def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
+        """Who divides the images, and how the numbers differ from the published split."""
+        notes = [self._division()]
+        if self.dataset.name != "kp":
+            return notes
+        if self._is_ms_uda(splits):
+            notes.append(
+                "training holds days and validation nights alone, as MS-UDA divides KP: scores do "
+                "not compare with those of CRM, which trains on both; dataset.lists=sets is CRM's "
+                "division."
+            )
+        return [*notes, *other_times(splits, OFFICIAL_DAY_NIGHT), *other_sizes(splits, HW)]
+
+    def _division(self) -> str:
+        if self.dataset.lists == "sets":
+            return (
+                "no list is read: splits are all labels on disk, divided by set numbers as in the "
+                "CRM release."
+            )
+        files = [path for split in self.dataset.splits for path in self.dataset.list_files(split)]
+        return f"splits are read from the lists {', '.join(dict.fromkeys(files)) or '(none)'}."
+
+    def _share_a_list(self, one: str, other: str) -> bool:
+        """Whether the configuration reads both from one file, as for a set without a test list."""
+        return not set(self.dataset.list_files(one)).isdisjoint(self.dataset.list_files(other))
+
+    def _is_ms_uda(self, splits: tuple[SplitReport, ...]) -> bool:
+        """Whether training is by day, with sets that CRM tests on, and validation at night."""
+        of = {split.split: split for split in splits}
+        if not {"train", "val"} <= set(of):
+            return False
+        train, val = of["train"], of["val"]
+        is_divided = train.num_night == val.num_day == 0 and train.num_day and val.num_night
+        sets = {set_of(name) for name in self.dataset.names("train")} if is_divided else set()
+        return not sets.isdisjoint({6, 7, 8})
+
+    def _unlisted(self, lists: Lists) -> list[str]:
+        listed = set().union(*lists.values())
+        unlisted = [name for name in self.dataset.labels_on_disk if name not in listed]
+        strange = [name for name in unlisted if NAME.fullmatch(name) is None]
+        problems = []
+        if strange:
+            problems.append(
+                f"{len(strange)} labels have names that say no set, the first is "
+                f"'{strange[0]}.png'."
+            )
+        if len(unlisted) > len(strange):
+            first = next(name for name in unlisted if name not in set(strange))
+            problems.append(
+                f"no split names {len(unlisted) - len(strange)} labels on disk, the first is "
+                f"'{first}.png'."
+            )
+        return problems
+
+
+def _wrong_times(lists: Lists) -> list[str]:
+    problems = []
+    for split, names in lists.items():
+        time = split.rpartition("_")[2]
+        wrong = [name for name in names if time in TIMES and is_night(name) != (time == "night")]
+        problems += [
+            f"split {split} lists '{name}', which was recorded "
+            f"{'at night' if is_night(name) else 'by day'} (set{set_of(name):02d})."
+            for name in wrong
+        ]
+    return problems
+
+
+def _lists_that_disagree(lists: Lists) -> list[str]:
+    """Where all three are listed, a split is its day and its night."""
+    problems = []
+    for split, names in lists.items():
+        parts = [f"{split}_{time}" for time in TIMES]
+        if not all(part in lists for part in parts):
+            continue
+        differ = sorted(set(names) ^ {name for part in parts for name in lists[part]})
+        if differ:
+            problems.append(
+                f"split {split} is not {parts[0]} and {parts[1]} together: {len(differ)} names are "
+                f"in one of them alone, the first is '{differ[0]}'."
+            )
+    return problems

@@ -1,0 +1,78 @@
+"""What is checked of any lists of names, and how numbers of days and nights are compared."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from itertools import combinations
+
+from rgbt.data.report_values import Lists, SplitReport
+
+
+def listed_twice(lists: Lists) -> list[str]:
+    """Names that one split lists several times."""
+    return [
+        f"split {split} lists '{name}' {count} times."
+        for split, names in lists.items()
+        for name, count in Counter(names).items()
+        if count > 1
+    ]
+
+
+def shared(lists: Lists, may_share: Callable[[str, str], bool] = lambda *_: False) -> list[str]:
+    """Names in two splits, unless one is a part of the other by name.
+
+    Args:
+        lists: split -> names.
+        may_share: whether two splits that are no parts of each other may have names in common.
+    """
+    problems = []
+    for one, other in combinations(lists, 2):
+        if is_part(one, other) or may_share(one, other):
+            continue
+        in_other = set(lists[other])
+        both = [name for name in lists[one] if name in in_other]
+        if both:
+            problems.append(
+                f"splits {one} and {other} share {len(both)} names, the first is '{both[0]}'."
+            )
+    return problems
+
+
+def is_part(one: str, other: str) -> bool:
+    """Whether one of two splits is a part of the other by name, as "test_day" is of "test"."""
+    words, other_words = set(one.split("_")), set(other.split("_"))
+    return words <= other_words or other_words <= words
+
+
+def other_times(
+    splits: tuple[SplitReport, ...], official: Mapping[str, tuple[int, int]]
+) -> list[str]:
+    """How numbers of day and night images differ from the official ones.
+
+    Args:
+        splits: what was read.
+        official: split -> (day, night), of the splits that are compared.
+    """
+    notes = []
+    for split in splits:
+        found = (split.num_day, split.num_night)
+        expected = official.get(split.split, found)
+        if found != expected:
+            notes.append(
+                f"split {split.split} has {found[0]} day and {found[1]} night images, the "
+                f"official list has {expected[0]} and {expected[1]} ({sum(expected)} in all)."
+            )
+    return notes
+
+
+def other_sizes(splits: tuple[SplitReport, ...], official: tuple[int, int]) -> list[str]:
+    """Which sizes images have beside the official (height, width)."""
+    others = sorted({size for split in splits for size in split.sizes} - {official})
+    if not others:
+        return []
+    listed = ", ".join(f"{height}x{width}" for height, width in others)
+    return [
+        f"images are {listed}, the original ones {official[0]}x{official[1]}: scores of resized "
+        "images do not compare with those of whole ones."
+    ]

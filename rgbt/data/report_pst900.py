@@ -1,0 +1,132 @@
+"""What is checked of PST900 alone: the two parts, their recordings, pixels without thermal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from rgbt.data.named_files import names_in
+from rgbt.data.pst900 import FOLDERS, PST900, bag_of
+from rgbt.data.report_lists import listed_twice, other_sizes, shared
+from rgbt.data.report_values import Lists, SplitReport, Thermal, Times
+
+NUM_TRAIN = 597
+"""Pairs of the training part on disk; the data set's page says 606."""
+
+TEST_BAGS = {21: 40, 22: 59, 23: 28, 24: 72, 25: 89}
+"""Recording -> pairs of the test part, 288 in all."""
+
+HW = (720, 1280)
+
+
+class PST900Layout:
+    """See `rgbt.data.report_values.Layout`."""
+
+    def __init__(self, dataset: PST900) -> None:
+        self.dataset = dataset
+
+    @property
+    def title(self) -> str:
+        """Which of the two layouts it is."""
+        return f"PST900 in {'lists' if self.dataset.has_lists else 'folders'}"
+
+    def repeats(self, split: str) -> bool:
+        """The validation split is the test part, unless it has a list or bags of its own."""
+        return self._is_test(split) and split != "test"
+
+    def times(self, names: tuple[str, ...]) -> Times:  # noqa: ARG002 - as every layout
+        """There is no day underground."""
+        return Times(0, 0)
+
+    def thermal(self, name: str) -> Thermal:
+        """Grey levels; those of 0 were not measured."""
+        thermal = self.dataset.thermal(name)
+        filled = thermal[thermal > 0]
+        return Thermal(
+            pixels=thermal.size,
+            empty=thermal.size - filled.size,
+            below=0,
+            above=0,
+            lowest=int(filled.min(initial=np.iinfo(np.uint8).max)) if filled.size else 0,
+            highest=int(thermal.max()),
+        )
+
+    def problems(self, lists: Lists) -> list[str]:
+        """Names listed twice or in two parts, files that belong to no image of a split."""
+        own = {split: names for split, names in lists.items() if not self.repeats(split)}
+        return [*listed_twice(own), *shared(own), *self._unused(own)]
+
+    def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
+        """What "val" is, how the parts differ from the archive's, pixels without thermal."""
+        notes = [self._of_val()] if self._is_test("val") else []
+        if self.dataset.name == "pst900":
+            notes += [*self._other_numbers(splits), *self._other_bags(), *other_sizes(splits, HW)]
+        return [*notes, *(note for split in splits for note in self._holes(split))]
+
+    def _is_test(self, split: str) -> bool:
+        return self.dataset.part_of(split) == "test"
+
+    def _of_val(self) -> str:
+        return (
+            "split val is the test part, as in the CRM release: a checkpoint chosen on it is "
+            "chosen on what is reported; dataset.val_bags takes recordings out of training instead."
+        )
+
+    def _unused(self, lists: Lists) -> list[str]:
+        """Files that no image of a split opens."""
+        unused: list[Path] = []
+        for folder in self.dataset.folders():
+            with_rgb = names_in(folder / FOLDERS[0])
+            used = set().union(*lists.values()) if self.dataset.has_lists else set(with_rgb)
+            for kind in FOLDERS:
+                names = names_in(folder / kind)
+                unused += [folder / kind / f"{name}.png" for name in names if name not in used]
+        if not unused:
+            return []
+        return [f"{len(unused)} files belong to no image of a split, the first is {unused[0]}."]
+
+    def _other_numbers(self, splits: tuple[SplitReport, ...]) -> list[str]:
+        expected = {"train": NUM_TRAIN, "test": sum(TEST_BAGS.values())}
+        if self.dataset.val_bags:
+            del expected["train"]
+        return [
+            f"split {split.split} has {split.num_names} images, the archive has "
+            f"{expected[split.split]}."
+            for split in splits
+            if split.num_names != expected.get(split.split, split.num_names)
+        ]
+
+    def _other_bags(self) -> list[str]:
+        bags = {part: self._bags(part) for part in ("train", "test")}
+        listed = ", ".join(f"{count} of bag {bag}" for bag, count in TEST_BAGS.items())
+        notes = []
+        tested = sum(bags["train"][bag] for bag in TEST_BAGS)
+        if tested:
+            part = "is" if tested == bags["train"].total() else "holds"
+            notes.append(
+                f"split train {part} {tested} images of the bags 21 to 25, which the archive has "
+                "for testing: the folders train and test seem to be exchanged, as in the drawing "
+                "on the data set's page; exchange them back."
+            )
+        if bags["test"] and bags["test"] != Counter(TEST_BAGS):
+            found = ", ".join(
+                f"{count} of {'no bag' if bag is None else f'bag {bag}'}"
+                for bag, count in sorted(bags["test"].items(), key=lambda item: item[0] or -1)
+            )
+            notes.append(f"split test has {found}; the archive has {listed}.")
+        return notes
+
+    def _bags(self, split: str) -> Counter[int | None]:
+        names = self.dataset.names(split) if self.dataset.has(split) else ()
+        return Counter(bag_of(name) for name in names)
+
+    def _holes(self, split: SplitReport) -> list[str]:
+        if split.thermal is None or self.repeats(split.split):
+            return []
+        pixels, empty, _, _, lowest, highest = split.thermal
+        return [
+            f"split {split.split}: {empty / pixels:.2%} of the thermal pixels are 0, which those "
+            f"without a measurement are; others run from {lowest} to {highest}."
+        ]

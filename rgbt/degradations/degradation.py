@@ -1,0 +1,111 @@
+"""What a degradation is: a failure of a camera with a severity, in one of two forms.
+
+Severity 0 is no failure and never reaches a degradation: `dataset.Degraded` hands such samples on
+as they are. Lengths are given in pixels of an image of `REFERENCE_HEIGHT` rows and scaled to the
+height of the file, so that one ladder serves MFNet (480), PST900 (720) and the embedded data (120).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from rgbt.checks import InputError
+from rgbt.types import Sample
+
+REFERENCE_HEIGHT = 480
+"""Rows of the images that lengths in pixels are given for: MFNet's."""
+
+Image = Literal["rgb", "thermal"]
+Images = Literal["rgb", "thermal", "both"]
+"""Which image of a pair fails."""
+
+IMAGES: dict[Images, tuple[Image, ...]] = {
+    "rgb": ("rgb",),
+    "thermal": ("thermal",),
+    "both": ("rgb", "thermal"),
+}
+NAMES: dict[Images, str] = {"rgb": "RGB", "thermal": "thermal", "both": "RGB and thermal"}
+"""What tables and figures call them."""
+
+RngOf = Callable[[str], np.random.Generator]
+"""Purpose -> generator of a sample. It does not depend on the severity: a higher one hides the
+same blocks and more, so that the severities of a ladder differ in nothing else."""
+
+
+class Kind(Protocol):
+    """What every degradation says of itself.
+
+    Attributes:
+        title: what tables and figures call it, e.g. "noise, RGB".
+        unit: of the severity, e.g. "grey levels (std)"; "" where there is one severity alone.
+        severities: its ladder, rising; what `rgbt.robustness` goes through.
+    """
+
+    title: str
+    unit: str
+    severities: tuple[float, ...]
+
+    def check(self, severity: float) -> None:
+        """InputError where `severity` (> 0) is out of range."""
+        ...
+
+
+@runtime_checkable
+class OfPixels(Kind, Protocol):
+    """A failure that changes the pixels of one pair."""
+
+    def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
+        """`sample` under the failure, uint8 as before; the label and the name stay.
+
+        Raises:
+            InputError: the severity changes nothing of an image of this size.
+        """
+        ...
+
+
+@runtime_checkable
+class OfTime(Kind, Protocol):
+    """A failure that shows the thermal image of another frame."""
+
+    def shown(self, place: int, severity: float) -> int:
+        """Place of the frame whose thermal image is shown at `place`; 0 is the first frame."""
+        ...
+
+
+Degradation = OfPixels | OfTime
+
+
+def check_ladder(kind: Kind) -> None:
+    """Refuse an empty ladder, one that does not rise, and severities that are out of range.
+
+    Raises:
+        InputError: naming what is wrong.
+    """
+    ladder = kind.severities
+    if not ladder or any(low >= high for low, high in zip((0.0, *ladder), ladder, strict=False)):
+        raise InputError(
+            "degradation.severities must rise from above 0 (0 is the clean image and always "
+            f"measured), got {list(ladder)}."
+        )
+    for severity in ladder:
+        kind.check(severity)
+
+
+def check_whole(severity: float) -> None:
+    """Refuse what is no whole number of frames of at least 1."""
+    if not (math.isfinite(severity) and severity >= 1 and severity == math.floor(severity)):
+        raise InputError(f"severity counts frames: expected 1, 2, 3, ..., got {severity:g}.")
+
+
+def at_height(pixels: float, height: int) -> float:
+    """A length of the reference height as a length of an image of `height` rows."""
+    return pixels * height / REFERENCE_HEIGHT
+
+
+def nearest_whole(value: float) -> int:
+    """The nearest whole number; halves go up."""
+    return math.floor(value + 0.5)

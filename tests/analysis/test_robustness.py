@@ -1,0 +1,145 @@
+"""Counts of failing images, found beside runs; two methods compared on them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from analysis.compare import OWN, main
+from analysis.results import open_counts
+from analysis.robustness import levels_of, trainings, under
+from rgbt.checks import InputError
+from rgbt.command import plain_command
+from rgbt.metrics.named import value
+from rgbt.robustness import CLEAN, FOLDER, FORMAT
+from tests.analysis import robust_runs
+from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
+from tests.commands import Call
+
+ENTRY = plain_command(OWN, main)
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    write_run(tmp_path, "k0", "crm", 0, SCORES)
+    write_run(tmp_path, "k1", "crm", 1, less(10))
+    write_run(tmp_path, "k2", "none", 0, less(5))
+    return tmp_path
+
+
+def test_is_read_as_the_command_writes_it() -> None:
+    from analysis import robustness
+
+    assert (robustness.CLEAN, robustness.FORMAT) == (CLEAN, FORMAT)
+    assert robustness.FOLDER.name == FOLDER
+
+
+def test_levels_by_title_and_rising_severity(runs: Path) -> None:
+    found = levels_of(runs / "k0" / "evaluations" / "robustness" / "test")
+    assert [(level.mark, level.severity) for level in found] == [
+        ("clean", 0.0),
+        ("rgb_removed-1", 1.0),
+        ("features-thermal", 1.0),
+        ("noise-8", 8.0),
+        ("noise-16", 16.0),
+    ]
+    mious = [value("mIoU", level.counts, "released") for level in found]
+    assert mious == pytest.approx([80, 20, 30, 60, 40], abs=1e-3)
+
+
+def test_runs_groups_and_folders_are_trainings(runs: Path) -> None:
+    of_group = trainings("crm", runs)
+    assert [each.label for each in of_group] == ["crm", "crm"]
+    assert value("mIoU", of_group[1].clean, "released") == pytest.approx(70, abs=1e-3)
+    assert [level.severity for level in of_group[0].of("noise")] == [8.0, 16.0]
+    assert of_group[0].of("frozen") == ()
+    folder = write_levels(runs / "elsewhere", SCORES)
+    assert [each.label for each in trainings(f"{folder},k2", runs)] == ["elsewhere", "none"]
+
+
+def test_the_same_trainings_on_failing_images(runs: Path) -> None:
+    stored = open_counts("crm", runs)
+    noisy = under(stored, "noise", "16")
+    assert [value("mIoU", each.counts, "released") for each in noisy] == pytest.approx(
+        [40, 30], abs=1e-3
+    )
+    assert [each.seed for each in noisy] == [0, 1]
+    assert noisy[0].path.name == "noise-16.npz"
+    (black, _) = under(stored, "rgb_removed", "")
+    assert value("mIoU", black.counts, "released") == pytest.approx(20, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("degradation", "severity", "sentence"),
+    [
+        ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
+        ("noise", "12", r"severity=12: .* holds noise at 8, 16; give one of these"),
+        ("noise", "", r"severity=: .* holds noise at 8, 16"),
+    ],
+)
+def test_what_was_not_measured_is_told(
+    runs: Path, degradation: str, severity: str, sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        under(open_counts("k0", runs), degradation, severity)
+
+
+def test_what_is_no_measured_run_is_told(runs: Path) -> None:
+    place = runs / "k0" / "evaluations" / "robustness"
+    with pytest.raises(InputError, match=r"counts_test.npz is no run; .*robustness run=\.\.\."):
+        under(open_counts(str(runs / "k0" / "counts_test.npz")), "noise", "8")
+    (place / "test" / "noise-8.npz").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
+        trainings("k0", runs)
+    (place / "test" / "noise-8.json").write_text("{}")
+    with pytest.raises(InputError, match=r"noise-8.json is not of python -m rgbt.robustness"):
+        trainings("k0", runs)
+    (place / "test" / "noise-8.json").write_text("{")
+    with pytest.raises(InputError, match=r"noise-8.json cannot be read"):
+        trainings("k0", runs)
+    (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
+    with pytest.raises(InputError, match=r"noise-8.json does not say what was measured \('row'\)"):
+        trainings("k0", runs)
+    (place / "test" / "noise-8.json").unlink()
+    (place / "test" / "clean.json").unlink()
+    with pytest.raises(InputError, match=r"holds no counts of clean images"):
+        trainings("k0", runs)
+    place.rename(place.with_name("gone"))
+    with pytest.raises(InputError, match=r"robustness/test is not there; python -m .* run="):
+        trainings("k0", runs)
+
+
+def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
+    where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
+    code, out, err = call(ENTRY, "a=k2", "b=k0", "degradation=noise", "severity=16", *where)
+    assert code == 0, err
+    # 40 against 35 on noisy images (80 against 75 on clean ones).
+    assert "crm (noise 16) less none (noise 16)" in out
+    assert "35.00" in out
+    assert "40.00" in out
+    code, out, err = call(ENTRY, "a=k2", "b=k0", "degradation=rgb_removed", *where)
+    assert code == 0, err
+    assert "15.00" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["severity=3"], "'severity' has no effect without degradation=..."),
+        (["degradation=noise", "frames=next"], "is of single frames; leave frames= out"),
+        (["degradation=noise", "severity=3"], "holds noise at 8, 16; give one of these"),
+    ],
+)
+def test_compare_refuses(call: Call, runs: Path, words: list[str], sentence: str) -> None:
+    code, out, err = call(ENTRY, "a=k2", "b=k0", f"runs_dir={runs}", *words)
+    assert (code, out) == (2, "")
+    assert sentence in err
+
+
+def test_scores_by_hand() -> None:
+    # 75,000 of 100,000 right in both classes: 75 / (200 - 75) = 60 percent.
+    (matrix,) = robust_runs.right(60, images=1).counts[0].tolist()
+    assert matrix == [[75_000, 25_000], [25_000, 75_000]]
+    assert value("mIoU", robust_runs.right(60), "released") == pytest.approx(60)

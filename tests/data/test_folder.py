@@ -1,0 +1,744 @@
+"""Somebody's own data set, described by one YAML."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config import build, check_node
+from rgbt.data.folder import Folder
+from rgbt.data.folder_frames import Frame
+from rgbt.data.folder_pattern import Pattern, in_order
+from rgbt.data.folder_splits import ByShare
+from rgbt.data.folder_values import grey, label_codes, painted
+from rgbt.data.freiburg import _grey_levels
+from rgbt.data.report import check_dataset, layout_of
+from tests.conftest import write_png
+from tests.data.folder_files import (
+    CLASSES,
+    HW,
+    PATTERNS,
+    RANGE,
+    contents,
+    folder,
+    write_folder,
+    write_frame,
+    write_tiff,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_folder(tmp_path / "mine")
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for tests that write nothing."""
+    return write_folder(tmp_path_factory.mktemp("sound") / "mine")
+
+
+def refused(make: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as told:
+        make()
+    assert "\n" not in str(told.value)
+    return str(told.value)
+
+
+# Reading
+
+
+def test_reads_what_the_patterns_name(sound: Path) -> None:
+    dataset = folder(sound)
+    assert dataset.names("train") == ("train_1", "train_2", "train_3")
+    assert dataset.splits["val"] == "val/rgb/{name}.png"
+    sample = dataset.read("test_2")
+    rgb, counts, label = contents("test_2")
+    np.testing.assert_array_equal(sample.rgb, rgb)
+    np.testing.assert_array_equal(sample.label, label)
+    # Levels are 4000 / 255 counts wide; to the nearest one.
+    exact = (counts.astype(float) - 20000) / 4000 * 255
+    assert np.abs(sample.thermal - exact).max() <= 0.5 + 1e-9
+    assert [sample.rgb.dtype, sample.thermal.dtype, sample.label.dtype] == [np.uint8] * 3
+    assert sample.name == "test_2"
+    np.testing.assert_array_equal(dataset.label("test_2"), label)
+    np.testing.assert_array_equal(dataset.values("test_2"), counts)
+    assert dataset.files("test_2") == (
+        sound / "test/rgb/2.png",
+        sound / "test/ir/2_ir.tif",
+        sound / "test/mask/2.png",
+    )
+    assert pickle.loads(pickle.dumps(dataset)).read("test_2").name == "test_2"
+
+
+def test_grey_levels_by_hand() -> None:
+    """255 (v - 100) / 200: 200 is 127.5, which goes up; 101 is 1.275 and 102 is 2.55."""
+    expected = [0, 0, 1, 3, 128, 255, 255]
+    for dtype in (np.uint16, np.int16, np.float32, np.float64):
+        values = np.array([[0, 100, 101, 102, 200, 300, 999]], dtype)
+        assert grey(values, (100, 300), Path("x")).tolist() == [expected]
+    real = np.array([[19.99, 20.0, 25.0, 29.98, 30.5]], np.float32)
+    assert grey(real, (20.0, 30.0), Path("x")).tolist() == [[0, 0, 128, 254, 255]]
+    assert grey(np.array([[-5]], np.int16), (-10, 0), Path("x")).tolist() == [[128]]
+
+
+def test_grey_levels_are_those_of_freiburg() -> None:
+    counts = np.arange(2**16, dtype=np.uint16)[None]
+    found = grey(counts, (21800, 23700), Path("x"))
+    np.testing.assert_array_equal(found[0], _grey_levels(21800, 23700))
+
+
+def test_thermal_of_eight_bits(root: Path) -> None:
+    level = np.arange(48, dtype=np.uint8).reshape(HW)
+    for index in range(1, 4):
+        write_tiff(root / "train" / "ir" / f"{index}_ir.tif", np.dstack([level] * 3))
+    dataset = folder(root, thermal_range=None)
+    np.testing.assert_array_equal(dataset.read("train_1").thermal, level)
+    # A range widens grey levels too: 0 to 51 become 0 to 255.
+    stretched = folder(root, thermal_range=(0, 51)).read("train_1").thermal
+    np.testing.assert_array_equal(stretched, level * 5)
+    said = refused(lambda: dataset.read("val_1"))
+    assert said.startswith(f"{root / 'val/ir/1_ir.tif'}: expected 8 bits per pixel, got uint16")
+    assert "give dataset.thermal_range=[low, high]" in said
+    said = refused(lambda: folder(root).read("train_1"))
+    assert "dataset.thermal_range=[20000, 24000], got 8 bits; use the original file" in said
+
+
+def test_thermal_of_real_numbers(root: Path) -> None:
+    path = root / "train" / "ir" / "1_ir.tif"
+    celsius = np.full(HW, 25.0, np.float32)
+    write_tiff(path, celsius)
+    dataset = folder(root, thermal_range=(20, 30))
+    assert (dataset.read("train_1").thermal == 128).all()
+    celsius[2, 3:5] = (np.nan, np.inf)
+    write_tiff(path, celsius)
+    assert refused(lambda: dataset.read("train_1")).startswith(
+        f"{path}: 2 thermal values are NaN or infinite; write a temperature there"
+    )
+
+
+def test_thermal_as_arrays(root: Path) -> None:
+    for split, name in (
+        ("train", "1"),
+        ("train", "2"),
+        ("train", "3"),
+        ("val", "1"),
+        ("test", "1"),
+    ):
+        target = root / split / "ir" / f"{name}.npy"
+        np.save(target, np.full(HW, 20.0 if split == "train" else 30.0))
+    dataset = folder(root, thermal="{split}/ir/{name}.npy", thermal_range=(20, 30))
+    assert (dataset.read("train_1").thermal == 0).all()
+    assert (dataset.read("val_1").thermal == 255).all()
+    for wrong in (np.zeros(HW, complex), np.zeros(48), np.zeros(HW, bool)):
+        np.save(root / "train/ir/2.npy", wrong)
+        assert "expected thermal values of shape (rows, columns)" in refused(
+            lambda: dataset.read("train_2")
+        )
+
+
+def test_packed_files(tmp_path: Path) -> None:
+    image = np.arange(192, dtype=np.uint8).reshape(*HW, 4)
+    for split in ("train", "val", "test"):
+        write_png(tmp_path / split / "7.png", image)
+        write_png(tmp_path / split / "7_mask.png", np.ones(HW, np.uint8))
+    keys: dict[str, Any] = {
+        **{"rgb": "{split}/{name}.png", "thermal": "{split}/{name}.png"},
+        **{"label": "{split}/{name}_mask.png", "thermal_range": None},
+    }
+    dataset = folder(tmp_path, **keys)
+    sample = dataset.read("train_7")
+    np.testing.assert_array_equal(sample.rgb, image[..., :3])
+    np.testing.assert_array_equal(sample.thermal, image[..., 3])
+    assert dataset.files("train_7") == (tmp_path / "train/7.png", tmp_path / "train/7_mask.png")
+    assert dataset.decoding()["packed"]
+    assert layout_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
+    write_png(tmp_path / "train" / "7.png", image[..., :3])
+    assert "got 3; use the original file, or give dataset.thermal its own pattern" in refused(
+        lambda: dataset.read("train_7")
+    )
+
+
+def test_all_in_one_folder(tmp_path: Path) -> None:
+    """What "{name}.png" matches besides: thermal images and labels of the frames themselves."""
+    for name in ("train_9", "train_10", "val_1", "test_1"):
+        write_png(tmp_path / f"{name}.png", np.zeros((*HW, 3), np.uint8))
+        for kind in ("ir", "mask"):
+            write_png(tmp_path / f"{name}_{kind}.png", np.zeros(HW, np.uint8))
+    dataset = folder(
+        tmp_path,
+        **{"rgb": "{split}_{name}.png", "thermal": "{split}_{name}_ir.png"},
+        **{"label": "{split}_{name}_mask.png", "thermal_range": None},
+    )
+    assert list(dataset.frames) == ["test_1", "train_9", "train_10", "val_1"]
+    assert check_dataset(dataset).problems == ()
+
+
+def test_sizes_that_differ(root: Path) -> None:
+    write_png(root / "train" / "mask" / "1.png", np.zeros((3, 4), np.uint8))
+    write_tiff(root / "train" / "ir" / "2_ir.tif", np.zeros((3, 4), np.uint16))
+    dataset = folder(root)
+    assert refused(lambda: dataset.read("train_1")) == (
+        "'train_1': RGB is 6x8 pixels but label is 3x4; both must show the same pixels, align them "
+        f"first: {root / 'train/mask/1.png'}."
+    )
+    assert "RGB is 6x8 pixels but thermal is 3x4" in refused(lambda: dataset.read("train_2"))
+
+
+def test_unlabelled(root: Path) -> None:
+    for path in (root / "val" / "mask").iterdir():
+        path.unlink()
+    dataset = folder(root, unlabelled=("val",))
+    assert dataset.read("val_1").label is None
+    assert dataset.label("val_1") is None
+    assert len(dataset.files("val_1")) == 2
+    assert dataset.read("test_1").label is not None
+    nothing = folder(root, label=None)
+    assert nothing.read("test_1").label is None
+    assert len(nothing.files("test_1")) == 2
+    assert "dataset.unlabelled: 'vall' is not a choice" in refused(
+        lambda: folder(root, unlabelled=("vall",))
+    )
+
+
+# Patterns
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("/rgb/{name}.png", "expected a path below dataset.root"),
+        ("../{name}.png", "without '..'"),
+        ("rgb//{name}.png", "doubled slashes"),
+        ("", "expected a path below dataset.root"),
+        ("rgb/{name.png", "expected words in braces"),
+        ("rgb/{}.png", "expected words in braces"),
+        ("rgb/{1}.png", "expected words in braces"),
+        ("rgb/{sequence}{name}.png", "with something between"),
+        ("rgb/1.png", "is one file; write {name}"),
+        ("rgb/{frame}.png", "says frame but no name; write {name}"),
+    ],
+)
+def test_texts_that_are_no_patterns(sound: Path, text: str, said: str) -> None:
+    sentence = refused(lambda: folder(sound, rgb=text))
+    assert sentence.startswith("dataset.rgb: ")
+    assert said in sentence
+
+
+def test_words_of_a_pattern(tmp_path: Path) -> None:
+    for name in ("a_b_7.png", "a_b_x.jpg", "._a_b_7.png", "c.png"):
+        (tmp_path / "s1" / "rgb").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "s1" / "rgb" / name).touch()
+    (tmp_path / ".hidden" / "rgb").mkdir(parents=True)
+    (tmp_path / ".hidden" / "rgb" / "a_9.png").touch()
+    (tmp_path / "file").touch()
+    pattern = Pattern("{sequence}/rgb/{part}_{name}.png", "dataset.rgb")
+    assert pattern.words == ("sequence", "part", "name")
+    (found,) = pattern.files(tmp_path)
+    assert dict(found.values) == {"sequence": "s1", "part": "a_b", "name": "7"}
+    assert found.path == tmp_path / "s1" / "rgb" / "a_b_7.png"
+    assert pattern.path(tmp_path, found.values) == found.path
+
+
+def test_a_word_that_is_there_twice(tmp_path: Path) -> None:
+    for name in ("s1/s1_7.png", "s1/s2_8.png", "s2/s2_s2_9.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = Pattern("{sequence}/{sequence}_{name}.png", "dataset.rgb").files(tmp_path)
+    assert [dict(each.values) for each in found] == [
+        {"sequence": "s1", "name": "7"},
+        {"sequence": "s2", "name": "s2_9"},
+    ]
+
+
+def test_letters_that_mean_something_elsewhere(tmp_path: Path) -> None:
+    for name in ("a+b (1)/7.png", "a+b (1)/7xpng"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (found,) = Pattern("a+b (1)/{name}.png", "dataset.rgb").files(tmp_path)
+    assert found.values == {"name": "7"}
+    (found,) = Pattern("{sequence}/{name}.png", "dataset.rgb").files(tmp_path)
+    assert found.values == {"sequence": "a+b (1)", "name": "7"}
+
+
+def test_order_of_names() -> None:
+    names = ["f10", "f9", "f9_2", "f009", "e100", "f"]
+    assert sorted(names, key=in_order) == ["e100", "f", "f009", "f9", "f9_2", "f10"]
+
+
+def test_a_pattern_that_matches_nothing(root: Path) -> None:
+    assert refused(lambda: folder(root, rgb="{split}/colour/{name}.png")) == (
+        f"dataset.rgb: '{{split}}/colour/{{name}}.png' matches no file in {root}: in {root}/test "
+        "nothing matches 'colour', test holds ir, mask, rgb; correct the pattern or dataset.root."
+    )
+    assert "nothing matches '{name}.jpg', rgb holds 1.png, 2.png;" in refused(
+        lambda: folder(root, rgb="{split}/rgb/{name}.jpg")
+    )
+    (root / "empty").mkdir()
+    assert "empty holds nothing" in refused(lambda: folder(root / "empty"))
+    assert refused(lambda: folder(root / "none")).startswith(
+        f"dataset.root: there is no folder '{root / 'none'}'; give the one that dataset.rgb="
+    )
+
+
+def test_partners_that_are_not_there(root: Path) -> None:
+    assert refused(lambda: folder(root, thermal="{split}/ir/{name}.tif")) == (
+        "dataset.thermal: '{split}/ir/{name}.tif' names no file that is there: the first would be "
+        f"{root}/test/ir/1.tif, ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
+    )
+    assert refused(lambda: folder(root, label="{split}/labels/{name}.png")).endswith(
+        "labels holds nothing; correct the pattern."
+    )
+    assert "needs {scene}, which dataset.rgb='{split}/rgb/{name}.png' does not tell" in refused(
+        lambda: folder(root, thermal="{scene}/ir/{name}.tif")
+    )
+    assert refused(lambda: folder(root, label="test/mask/{name}.png")) == (
+        f"dataset.label: 'test_1' and 'train_1' would share {root}/test/mask/1.png; use every word "
+        "of dataset.rgb that tells them apart."
+    )
+    assert "are JPEG files, which change values and colours; save labels as PNG" in refused(
+        lambda: folder(root, label="{split}/mask/{name}.JPG")
+    )
+    # One that is missing among others is told where it is read.
+    (root / "train" / "ir" / "2_ir.tif").unlink()
+    assert refused(lambda: folder(root).read("train_2")) == (
+        f"'train_2': its thermal image {root}/train/ir/2_ir.tif is missing; restore it, or use "
+        "data.on_error=skip to leave the frame out."
+    )
+
+
+def test_two_files_of_one_name(root: Path) -> None:
+    for path in ("a/b_c.png", "a_b/c.png"):
+        write_png(root / path, np.zeros((*HW, 3), np.uint8))
+    keys = {"thermal": "{sequence}/{name}.png", "label": None, "shares": {"train": 1.0}}
+    assert refused(lambda: folder(root, rgb="{sequence}/{name}.png", **keys)) == (
+        f"dataset.rgb: {root}/a/b_c.png and {root}/a_b/c.png would both be called 'a_b_c'; rename "
+        "one of them."
+    )
+
+
+def test_a_folder_that_may_not_be_listed(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def deny(_: object) -> list[str]:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("rgbt.data.folder_pattern.os.listdir", deny)
+    assert refused(lambda: folder(sound)) == (
+        f"{sound} may not be listed, permission is denied; allow it (chmod a+rx)."
+    )
+
+
+# Splits
+
+
+def test_splits_by_folder(sound: Path) -> None:
+    dataset = folder(sound, folders={"train": "train", "val": "test", "test": "test"})
+    assert dataset.names("val") == dataset.names("test") == ("test_1", "test_2")
+    missing = folder(sound, folders={"train": "training", "test": "test"})
+    assert not missing.has("train")
+    assert missing.has("test")
+    assert refused(lambda: missing.names("train")) == (
+        "dataset.folders: split 'train' is empty, dataset.rgb='{split}/rgb/{name}.png' has no file "
+        "with 'training' for {split}; it has test, train, val: name one of them in "
+        "dataset.folders, {train: ...}."
+    )
+    for ask in (dataset.names, dataset.has):
+        said = refused(lambda ask=ask: ask("tset"))
+        assert said.startswith("dataset has no split 'tset'")
+        assert "did you mean 'test'" in said
+
+
+def test_who_says_what_a_split_is(sound: Path) -> None:
+    lists, shares = {"train": "train.txt"}, {"train": 1.0}
+    assert refused(lambda: folder(sound, lists=lists)).startswith(
+        "dataset: dataset.lists and {split} in dataset.rgb both say what the splits are; keep one"
+    )
+    plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
+    assert "dataset.lists and dataset.shares both say" in refused(
+        lambda: folder(sound, lists=lists, shares=shares, **plain)
+    )
+    assert "nothing says what the splits are; write {split} in dataset.rgb" in refused(
+        lambda: folder(sound, **plain)
+    )
+    assert "nothing says what the splits are" in refused(
+        lambda: folder(sound, folders={"train": "train"}, **plain)
+    )
+    for key in ({"shares_seed": 1}, {"block": 3}):
+        assert "dataset.shares_seed and dataset.block are for dataset.shares" in refused(
+            lambda key=key: folder(sound, **key)
+        )
+
+
+def listed(root: Path, *lines: str, **keys: Any) -> Folder:
+    (root / "list.txt").write_text("\n".join(lines))
+    plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
+    return folder(root, **{**plain, "lists": {"train": "list.txt", "val": "val.txt"}, **keys})
+
+
+def test_lines_of_a_list(root: Path) -> None:
+    """The name, its words, the path of the image, each with or without suffix; in this order."""
+    lines = ("test_2", "train/3", "train/rgb/1.png", "val/rgb/1", "train_2.png", "test/1.png")
+    dataset = listed(root, *lines)
+    assert dataset.names("train") == (
+        *("test_2", "train_3", "train_1", "val_1", "train_2", "test_1"),
+    )
+    assert dataset.splits == {"train": "list.txt", "val": "val.txt"}
+    assert dataset.has("train")
+    assert not dataset.has("val")
+    assert refused(lambda: dataset.names("val")) == (
+        f"dataset.lists.val: there is no list '{root}/val.txt'; write it (one name per line)."
+    )
+
+
+def test_bare_names_in_a_list(root: Path) -> None:
+    """{name} alone will do where it is the name of one frame; 1 is that of three."""
+    dataset = listed(root, "3", "1")
+    assert dataset.names("train") == ("train_3", "1")
+    assert refused(lambda: dataset.read("1")).startswith(
+        f"folder ({root}) has no frame called '1': there is no such RGB image"
+    )
+    assert refused(lambda: listed(root, "frame_1 label_1", "x").names("train")) == (
+        f"dataset.lists.train: none of the 2 lines of {root}/list.txt is a frame: the first is "
+        "'frame_1 label_1', expected names such as 'test_1' or paths such as 'test/rgb/1.png'."
+    )
+
+
+def test_a_list_elsewhere(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("test_1\n")
+    dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})
+    assert dataset.names("train") == ("test_1",)
+
+
+def frames_of(*paths: str) -> dict[str, Frame]:
+    """Frames of {sequence}/{name}, or {camera}/{sequence}/{name}; nothing is on the disk."""
+    words = ("camera", "sequence", "name")
+    frames = {}
+    for path in paths:
+        pieces = path.split("/")
+        values = dict(zip(words[-len(pieces) :], pieces, strict=True))
+        name = "_".join(pieces)
+        frames[name] = Frame(name, values, Path(path), Path(path), None)
+    return frames
+
+
+def drawn(frames: dict[str, Frame], **keys: Any) -> ByShare:
+    shares = {"train": 0.5, "val": 0.25, "test": 0.25}
+    return ByShare(frames, **{"shares": shares, "seed": 0, "block": None, **keys})
+
+
+def test_shares_of_sequences() -> None:
+    frames = frames_of(*(f"s{index}/{number}" for index in range(8) for number in range(3)))
+    rule = drawn(frames)
+    parts = {split: rule.names(split) for split in rule.splits}
+    assert [len(parts[split]) for split in ("train", "val", "test")] == [12, 6, 6]
+    assert sorted(sum(parts.values(), ())) == sorted(frames)
+    sequences = [{name.split("_")[0] for name in names} for names in parts.values()]
+    assert sum(map(len, sequences)) == len(set.union(*sequences)) == 8
+    assert rule.splits["val"] == "0.25 of the frames"
+    assert {split: drawn(frames).names(split) for split in rule.splits} == parts
+    assert len({drawn(frames, seed=seed).names("val") for seed in range(6)}) > 1
+
+
+def test_shares_of_blocks() -> None:
+    rule = drawn(frames_of(*(f"s/{number}" for number in range(22))), block=5)
+    blocks = [
+        {f"s_{number}" for number in range(start, min(start + 5, 22))} for start in range(0, 22, 5)
+    ]
+    for split in ("train", "val", "test"):
+        names = set(rule.names(split))
+        assert names == set().union(*(block for block in blocks if block & names))
+        assert list(rule.names(split)) == sorted(names, key=in_order)
+        assert rule.has(split)
+
+
+def test_two_cameras_of_one_moment_stay_together() -> None:
+    sides = ("left", "right")
+    frames = frames_of(*(f"{side}/s/{number}" for side in sides for number in range(1, 7)))
+    rule = drawn(frames, block=4, shares={"train": 0.4, "val": 0.3, "test": 0.3})
+    for split in rule.splits:
+        moments = [name.rpartition("_")[2] for name in rule.names(split)]
+        assert len(moments) == 4
+        assert sorted(moments[:2]) == sorted(moments[2:])  # left before right
+
+
+def test_shares_in_a_folder(root: Path) -> None:
+    """Without the word {sequence} the whole folder is one."""
+    plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
+    shares = {"train": 0.5, "val": 0.5}
+    dataset = folder(root, **plain, shares=shares, block=2)
+    assert [len(dataset.names(split)) for split in shares] == [4, 2]
+    others = [folder(root, **plain, shares=shares, block=2, shares_seed=seed) for seed in range(8)]
+    assert len({other.names("val") for other in others}) > 1
+    by_part = {key: text.replace("{split}", "{sequence}") for key, text in PATTERNS.items()}
+    dataset = folder(root, **by_part, shares=shares)
+    assert {len(dataset.names(split)) for split in shares} == {3}
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"shares": {"train": 0.5, "val": 0.4}}, "expected shares above 0 that are 1 together"),
+        ({"shares": {"train": 1.5, "val": -0.5}}, "expected shares above 0 that are 1 together"),
+        ({"shares": {"train": float("nan"), "val": 1.0}}, "expected shares above 0"),
+        ({"block": 0}, "dataset.block: expected at least 1 frame, got 0"),
+        ({}, "3 splits are to be drawn from 1 sequence(s), .* give dataset.block"),
+        ({"block": 10}, "3 splits are to be drawn from 2 block(s)"),
+        (
+            {"block": 4, "shares": {"train": 0.9, "val": 0.05, "test": 0.05}},
+            "gets no frame, as 5 units of up to 4 frames stay together",
+        ),
+    ],
+)
+def test_shares_that_cannot_be(keys: dict[str, Any], said: str) -> None:
+    frames = frames_of(*(f"s/{number}" for number in range(20)))
+    sentence = refused(lambda: drawn(frames, **keys))
+    assert sentence.startswith("dataset.")
+    for words in said.split(" .* "):
+        assert words in sentence
+
+
+# Labels
+
+
+def test_label_values(root: Path) -> None:
+    path = root / "train" / "mask" / "1.png"
+    label = np.zeros(HW, np.uint16)
+    label[0, :5] = (7, 24, 26, 400, 255)
+    write_png(path, label)
+    ids = {0: "background", 24: "person", 26: "car", 400: "car"}
+    dataset = folder(root, ids=ids, ignored=(7,))
+    found = dataset.label("train_1")
+    assert found is not None
+    assert found[0].tolist() == [255, 1, 2, 2, 255, 0, 0, 0]
+    assert not found[1:].any()
+    label[1, :3] = (9, 9, 30)
+    write_png(path, label)
+    assert refused(lambda: dataset.label("train_1")) == (
+        f"{path}: label value 9 (2 pixels, most frequent of 2 unknown ones) stands neither in "
+        "dataset.ids nor in dataset.ignored (known: 0, 7, 24, 26, 255, 400); name it there."
+    )
+    # 255 may be a class, where it is said.
+    whole = folder(root, ids={**ids, 255: "person", 9: "car", 30: "car"}, ignored=(7,))
+    found = whole.label("train_1")
+    assert found is not None
+    assert found[0, 4] == 1
+
+
+def test_label_values_are_class_indices_unless_said_otherwise(root: Path) -> None:
+    path = root / "train" / "mask" / "1.png"
+    label = np.full(HW, 2, np.uint8)
+    label[0, 0] = 255
+    write_png(path, label)
+    np.testing.assert_array_equal(folder(root).label("train_1"), label)
+    label[0, 1] = 3
+    write_png(path, label)
+    assert "label value 3 (1 pixels) stands neither in dataset.ids" in refused(
+        lambda: folder(root).label("train_1")
+    )
+
+
+def test_label_arrays(root: Path) -> None:
+    for split, index in (("train", 1), ("train", 2), ("train", 3), ("val", 1), ("test", 1)):
+        np.save(root / split / "mask" / f"{index}.npy", np.full(HW, -1, np.int64))
+    dataset = folder(root, label="{split}/mask/{name}.npy", ids={-1: "car"})
+    found = dataset.label("train_1")
+    assert found is not None
+    assert (found == 2).all()
+    for wrong in (np.zeros(HW), np.zeros((*HW, 3), int)):
+        np.save(root / "train" / "mask" / "2.npy", wrong)
+        assert "expected whole numbers of shape (rows, columns), got" in refused(
+            lambda: dataset.label("train_2")
+        )
+
+
+def test_label_colours(root: Path) -> None:
+    colours = {"background": (0, 0, 0), "person": (220, 20, 60), "car": ((0, 0, 142), (0, 0, 70))}
+    image = np.zeros((*HW, 3), np.uint8)
+    image[0, :4] = [(220, 20, 60), (0, 0, 142), (0, 0, 70), (255, 255, 255)]
+    path = root / "train" / "mask" / "1.png"
+    write_png(path, image)
+    dataset = folder(root, colours=colours, ignored=((255, 255, 255),))
+    found = dataset.label("train_1")
+    assert found is not None
+    assert found[0].tolist() == [1, 2, 2, 255, 0, 0, 0, 0]
+    assert dataset.palette == ((0, 0, 0), (220, 20, 60), (0, 0, 142))
+    image[2, :3] = [(60, 20, 220), (60, 20, 220), (1, 2, 3)]
+    write_png(path, image)
+    assert refused(lambda: dataset.label("train_1")) == (
+        f"{path}: colour [60, 20, 220] (2 pixels, most frequent of 2 unknown ones) stands neither "
+        "in dataset.colours nor in dataset.ignored; name it there, or save labels that were never "
+        "resized."
+    )
+
+
+@pytest.mark.parametrize(
+    ("ids", "colours", "ignored", "said"),
+    [
+        ({0: "a"}, {"a": (0, 0, 0)}, (), "labels hold either numbers or colours"),
+        (
+            {0: "a", 1: "bb"},
+            None,
+            (),
+            "dataset.ids: 'bb' is no class; did you mean 'b'\\? known: a, b",
+        ),
+        (None, {"x": (0, 0, 0)}, (), "dataset.colours: 'x' is no class"),
+        ({0: "a"}, None, (0,), "dataset.ids: 0 stands twice"),
+        (None, None, (1,), "dataset.ids: 1 stands twice"),
+        (None, {"a": (1, 2, 3), "b": (1, 2, 3)}, (), r"dataset.colours: \[1, 2, 3\] stands twice"),
+        (None, {"a": (1, 2, 3)}, ((1, 2, 3),), r"\[1, 2, 3\] stands twice"),
+        (None, {"a": (1, 2, 256)}, (), r"levels from 0 to 255, got \[1, 2, 256\]"),
+        ({0: "a"}, None, ((1, 2, 3),), r"dataset.ignored: expected a whole number, .* \[1, 2, 3\]"),
+        (None, {"a": (1, 2, 3)}, (255,), r"dataset.ignored: expected a colour .* got 255"),
+        (None, {}, (), "expected the colour of every class, got none"),
+    ],
+)
+def test_what_labels_cannot_mean(
+    ids: dict[int, str] | None, colours: Any, ignored: tuple[Any, ...], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        label_codes(("a", "b"), ids, colours, ignored)
+
+
+def test_generated_colours() -> None:
+    """By hand: bit 0 is red 128, bit 1 green 128, bit 2 blue 128, bit 3 red 64."""
+    assert painted(10) == (
+        *((0, 0, 0), (128, 0, 0), (0, 128, 0), (128, 128, 0), (0, 0, 128)),
+        *((128, 0, 128), (0, 128, 128), (128, 128, 128), (64, 0, 0), (192, 0, 0)),
+    )
+    assert len(set(painted(256))) == 256
+
+
+# The whole
+
+
+def test_day_and_night(sound: Path) -> None:
+    assert folder(sound).nights(("train_1",)) is None
+    dataset = folder(sound, night="t*_[23]")
+    assert dataset.nights(("train_1", "train_2", "val_2")) == (False, True, False)
+    assert refused(lambda: folder(sound, night="*nite*")) == (
+        "dataset.night: none of 6 names matches '*nite*', the first is 'test_1'; correct it, or "
+        "set it to null."
+    )
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"num_classes": 4}, "num_classes is 4 but dataset.classes has 3"),
+        ({"num_classes": 0, "classes": ()}, "dataset.num_classes must lie in"),
+        ({"palette": ((0, 0, 0),)}, "num_classes is 3 but dataset.palette has 1"),
+        ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a choice"),
+        ({"classes": ("car", "person", "car")}, "dataset.classes: 'car' stands there twice"),
+        ({"thermal_range": (5, 5)}, r"dataset.thermal_range: .* low < high, .* got \[5, 5\]"),
+        ({"thermal_range": (5, float("nan"))}, r"dataset.thermal_range: .* got \[5, nan\]"),
+        ({"thermal_range": (0, float("inf"))}, "dataset.thermal_range: "),
+    ],
+)
+def test_settings_that_cannot_be(sound: Path, keys: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        folder(sound, **keys)
+
+
+def test_fingerprint_and_decoding(tmp_path: Path) -> None:
+    one, other = write_folder(tmp_path / "one"), write_folder(tmp_path / "other")
+    first = folder(one)
+    assert folder(other).fingerprint() == first.fingerprint()
+    assert folder(one, ids={0: "car", 1: "person", 2: "car"}).fingerprint() != first.fingerprint()
+    assert folder(one, folders={"train": "train"}).fingerprint() != first.fingerprint()
+    (other / "val" / "mask" / "1.png").write_bytes(b"other")
+    assert folder(other).fingerprint() != first.fingerprint()
+    assert folder(one, night="*1").fingerprint() == first.fingerprint()
+    decodings = [
+        json.dumps(dataset.decoding(), sort_keys=True)
+        for dataset in (
+            first,
+            folder(one, thermal_range=(1, 2)),
+            folder(one, ids={0: "car", 1: "person", 2: "car"}),
+            folder(one, colours={"car": (0, 0, 1)}),
+        )
+    ]
+    assert len(set(decodings)) == 4
+
+
+def test_a_sound_data_set(sound: Path) -> None:
+    report = check_dataset(folder(sound, night="*_2"))
+    assert report.problems == ()
+    assert [(split.split, split.num_read) for split in report.splits] == [
+        ("train", 3),
+        ("val", 1),
+        ("test", 2),
+    ]
+    assert (report.splits[0].num_day, report.splits[0].num_night) == (2, 1)
+    low, high = RANGE
+    assert report.notes[0] == (
+        "split train: of the thermal pixels 0.00% are 0, 0.00% lie below and 0.00% above "
+        f"dataset.thermal_range=[{low}, {high}]."
+    )
+
+
+def test_every_kind_of_problem_in_one_line(root: Path) -> None:
+    write_frame(root, "extra", "1")
+    (root / "test" / "rgb" / "2.png").unlink()
+    (root / "list.txt").write_text("train_1\ntrain_1\nval_1\nlost_1\n")
+    (root / "val.txt").write_text("val_1\ntrain_2\n")
+    report = check_dataset(listed(root, "train_1", "train_1", "val_1", "lost_1"))
+    assert list(report.problems) == [
+        f"folder ({root}) has no frame called 'lost_1': there is no such RGB image "
+        "(dataset.rgb='{part}/rgb/{name}.png'); restore it, or take the name off the list.",
+        "split train lists 'train_1' 2 times.",
+        "splits train and val share 1 names, the first is 'val_1'.",
+        "2 thermal images or labels have no RGB image (dataset.rgb) and are in no split, the first "
+        f"is {root}/test/ir/2_ir.tif.",
+    ]
+    assert report.notes[-1] == "3 frames are in no split, the first is 'extra_1'."
+    # Two splits that are said to be one are no mistake.
+    same = folder(root, folders={"train": "train", "val": "val", "test": "val"})
+    assert not any("share" in line for line in check_dataset(same).problems)
+
+
+def test_a_range_that_misses_the_values(root: Path) -> None:
+    counts = np.full(HW, 30000, np.uint16)
+    counts[0] = 0  # margins, which do not count
+    counts[1, :2] = 29000
+    write_tiff(root / "val" / "ir" / "1_ir.tif", counts)
+    report = check_dataset(folder(root))
+    assert list(report.problems) == [
+        "split val: 100.00% of the thermal values other than 0 lie outside "
+        "dataset.thermal_range=[20000, 24000] and become black or white; they run from 29000 to "
+        "30000, choose a range among them."
+    ]
+    half = counts.copy()
+    half[1:, :4] = 22000  # 20 of 40: not more than half
+    write_tiff(root / "val" / "ir" / "1_ir.tif", half)
+    report = check_dataset(folder(root))
+    assert report.problems == ()
+    assert any("split val: of the thermal pixels 16.67% are 0, 0.00% lie below and 41.67%" in line
+               for line in report.notes)  # fmt: skip
+
+
+def test_the_configuration_names_every_key(sound: Path) -> None:
+    node = OmegaConf.load(ROOT / "conf" / "dataset" / "folder.yaml")
+    parameters = inspect.signature(Folder).parameters
+    assert list(node) == ["_target_", *(key for key in node if key in parameters)]
+    assert set(node) == {"_target_", *parameters}
+    for key, parameter in parameters.items():
+        if OmegaConf.is_missing(node, key):
+            assert parameter.default is parameter.empty, key
+        else:
+            default = list(parameter.default) if parameter.default == () else parameter.default
+            assert node[key] == default, key
+    own = {"root": str(sound), "num_classes": 3, "classes": list(CLASSES), **PATTERNS}
+    own |= {"thermal_range": list(RANGE), "ids": {0: "background", 1: "person", 2: "car"}}
+    config = OmegaConf.create({"dataset": OmegaConf.merge(node, own)})
+    check_node(config.dataset, "dataset")
+    assert build(config.dataset).read("test_1").thermal.shape == HW

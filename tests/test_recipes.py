@@ -1,0 +1,151 @@
+"""Sizes and steps by data set: the released numbers, and what is told where they are others'."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.config import conf_dir
+from rgbt.prepared import _tell_what_is_not_as_published
+from tests.models.golden import compose
+
+FOLDER = conf_dir() / "recipe"
+
+
+def recipe(name: str) -> Any:
+    """A file of the group, merged with those that it builds on."""
+    node = OmegaConf.load(FOLDER / f"{name}.yaml")
+    assert isinstance(node, DictConfig)
+    below = [each for each in node.pop("defaults", []) if each != "_self_"]
+    return OmegaConf.merge(*(recipe(each) for each in below), node)
+
+
+@pytest.mark.parametrize(
+    ("name", "height", "images", "crop"),
+    [("mfnet", 480, 1568, [240, 320]), ("pst900", 720, 597, [224, 320]), ("kp", 512, 499, [256, 320])],
+)  # fmt: skip
+def test_sizes_are_those_of_the_crm_release(
+    name: str, height: int, images: int, crop: list[int]
+) -> None:
+    found = recipe(name)
+    assert found.dataset == name
+    assert list(found.train_sizes) == [int(k * 0.1 * height) for k in range(5, 21)]
+    assert list(found.crop_hw) == crop
+    assert (found.batch_size, found.max_steps) == (14 if name == "mfnet" else 12, 35000)
+    assert found.eval_every == 5 * (images // found.batch_size)
+    assert (found.lr, found.backbone_multiplier, found.clip_norm) == (1e-4, 0.1, 0.01)
+
+
+def test_spatialseg_differs_on_mfnet_alone() -> None:
+    ours, theirs = recipe("mfnet_spatialseg"), recipe("mfnet")
+    differ = {key for key in theirs if ours[key] != theirs[key]}
+    assert differ == {"batch_size", "max_steps", "eval_every"}
+    assert (ours.batch_size, ours.max_steps, ours.eval_every) == (5, 70000, 5 * (1568 // 5))
+
+
+def test_every_recipe_holds_the_crop_of_the_demo_in_images_of_its_data_set() -> None:
+    shapes = {"mfnet": (480, 640), "pst900": (720, 1280), "kp": (512, 640)}
+    for path in FOLDER.glob("*.yaml"):
+        found = recipe(path.stem)
+        height, width = shapes[found.dataset]
+        assert min(found.demo_sizes) >= 120
+        assert min(found.demo_sizes) * width // height >= 160, path.stem
+
+
+def test_an_experiment_on_another_data_set_takes_its_recipe() -> None:
+    found = compose("+experiment=grbm_pst900", "scale=paper", "dataset.root=unused")
+    assert found.recipe.dataset == found.dataset.name == "pst900"
+    assert (found.data.batch_size, found.trainer.max_steps, found.trainer.eval_every) == (
+        *(12, 35000, 245),
+    )
+    assert list(found.transform.crop_hw) == [224, 320]
+    assert found.transform.sizes[-1] == 1440
+    assert (found.transform.max_size, found.masker.patch_size) == (1920, 32)
+    found = compose("+experiment=spatialseg_kp", "scale=paper", "dataset.root=unused")
+    assert found.recipe.dataset == found.dataset.name == "kp"
+    assert (found.data.batch_size, found.masker.patch_size) == (12, 64)
+    assert found.loss.spatial.alpha == 2.0
+
+
+def test_a_recipe_is_chosen_against_that_of_an_experiment() -> None:
+    found = compose("+experiment=grbm", "scale=paper", "dataset=kp", "recipe=kp",
+                    "dataset.root=unused")  # fmt: skip
+    assert (found.data.batch_size, found.trainer.max_steps) == (12, 35000)
+    found = compose("+experiment=crm_kp", "recipe.demo_steps=3")
+    assert list(found.transform.sizes) == [128, 140, 152, 164, 176, 188]
+    assert found.trainer.max_steps == 3
+
+
+# ---- what is told ---------------------------------------------------------------------------
+
+
+@dataclass
+class Told:
+    """A session of a few names, as the remarks look at it."""
+
+    recipe: str = "mfnet"
+    data: str = "mfnet"
+    scale: str = "paper"
+    val: tuple[str, ...] = ("a",)
+    picked: str = "val"
+    tested: str = "best"
+    weights: Any = "file"
+    parts: tuple[str, ...] = ("backbone",)
+    splits: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def session(self) -> Any:
+        splits = {"train": ("t",), "val": self.val, "test": ("x", "y")}
+        return SimpleNamespace(
+            config=OmegaConf.create(
+                {
+                    "scale": {"name": self.scale, "pretrained": self.scale == "paper"},
+                    "recipe": {"dataset": self.recipe},
+                }
+            ),
+            dataset=SimpleNamespace(name=self.data, names=splits.__getitem__),
+            trainer=SimpleNamespace(selection_split=self.picked, tested=self.tested),
+            model=SimpleNamespace(pretrained_parts=self.parts),
+            weights=self.weights,
+        )
+
+
+@pytest.fixture
+def lines(capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
+    def of(**changes: Any) -> list[str]:
+        _tell_what_is_not_as_published(Told(**changes).session())
+        return capsys.readouterr().err.splitlines()
+
+    return of
+
+
+def test_nothing_is_told_of_a_run_as_published(lines: Callable[..., list[str]]) -> None:
+    assert lines() == []
+    assert lines(scale="demo", data="kp", weights=None) == []
+    assert lines(weights=None, parts=()) == []
+
+
+def test_a_recipe_for_other_images_is_told_in_a_line(lines: Callable[..., list[str]]) -> None:
+    (line,) = lines(data="pst900")
+    assert line.startswith("rgbt: sizes, batch and steps of the recipe are those for mfnet, not")
+    assert "choose recipe=pst900, or set recipe.train_sizes" in line
+    (line,) = lines(data="mine", recipe="kp")
+    assert "those for kp, not for mine; set recipe.train_sizes" in line
+    assert lines(data="mine", recipe="mine") == []
+
+
+def test_random_weights_are_told(lines: Callable[..., list[str]]) -> None:
+    (line,) = lines(weights=None)
+    assert "starts from ImageNet weights, this run from random ones" in line
+
+
+def test_a_best_checkpoint_of_the_test_images_is_told(lines: Callable[..., list[str]]) -> None:
+    (line,) = lines(val=("x", "b", "y"), scale="demo")
+    assert "trainer.selection_split=val: 2 of its 3 images are test images" in line
+    # Asked for by name, as the releases do, or not picked at all.
+    assert lines(val=("x",), picked="test") == []
+    assert lines(val=("x",), tested="last") == []
