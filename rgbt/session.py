@@ -150,7 +150,9 @@ def decode_ahead(session: Session, *splits: str) -> None:
     Raises:
         InputError: the cache cannot be written.
     """
-    dataset = session.dataset
+    # A degradation may stand before it.
+    dataset = getattr(session.dataset, "source", None)
+    dataset = session.dataset if isinstance(session.dataset, Decoded) else dataset
     if isinstance(dataset, Decoded):
         names = tuple(name for split in splits for name in dataset.names(split))
         with ExitStack() as shown:

@@ -3,8 +3,8 @@
 Letters, everywhere: ``B`` batch, ``C`` channels, ``H W`` pixels, ``h w`` cells or feature grid,
 ``K`` classes, ``Q`` queries, ``R`` regions, ``P`` stacked passes of one batch, ``L`` prediction
 layers.
-Conventions: RGB order, (row, column) order, labels int64 with 255 = ignore, mask True = hidden,
-resize with ``align_corners=False``.
+Conventions: RGB order, (row, column) order, labels int64 (uint8 until they are on the device) with
+255 = ignore, mask True = hidden, resize with ``align_corners=False``.
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ class Batch:
         rgb: (B, 3, H, W); uint8 or float32 in 0..255 from the loader, float32 in [0, 1] after
             ``to``.
         thermal: (B, 1, H, W), same dtype rule as ``rgb``.
-        label: (B, H', W') int64, 255 = ignore. H' = H and W' = W in training; in evaluation the
-            label keeps the resolution of the file while the images may have been resized.
+        label: (B, H', W') uint8 from the loader, int64 after ``to``; 255 = ignore. H' = H and
+            W' = W in training; in evaluation the label keeps the resolution of the file while the
+            images may have been resized.
         name: B names.
         centre_yx: (B, 2) int64, the pixel of this crop that is nearest to the centre
             (rows // 2, columns // 2) of the original image; the first in row-major order on a tie.
@@ -90,7 +91,7 @@ class Batch:
             self,
             rgb=moved(self.rgb).float() / 255.0,
             thermal=moved(self.thermal).float() / 255.0,
-            label=moved(self.label),
+            label=moved(self.label).long(),
             centre_yx=moved(self.centre_yx),
             position=None if self.position is None else moved(self.position),
             original_hw=moved(self.original_hw),

@@ -120,7 +120,7 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     return Batch(
         rgb=rgb_BHWC.permute(0, 3, 1, 2).contiguous(),
         thermal=thermal_BHW[:, None],
-        label=label.long(),
+        label=label,
         name=tuple(example.name for example in examples),
         centre_yx=torch.tensor([example.centre_yx for example in examples]),
         position=torch.from_numpy(np.stack(positions)) if positions else None,

@@ -69,7 +69,8 @@ def test_shapes_and_dtypes(dataset: MFNet) -> None:
         (4, 2, 12, 16),
     ]
     assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.uint8, torch.uint8)
-    assert (batch.label.dtype, batch.position.dtype) == (torch.int64, torch.float32)
+    assert (batch.label.dtype, batch.position.dtype) == (torch.uint8, torch.float32)
+    assert batch.to("cpu").label.dtype == torch.int64
     assert (batch.centre_yx.dtype, batch.original_hw.dtype) == (torch.int64, torch.int64)
     assert batch.original_hw.tolist() == [[24, 32]] * 4
     assert batch.rgb.is_contiguous()

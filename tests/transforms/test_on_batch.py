@@ -119,6 +119,7 @@ def test_an_example_does_not_depend_on_its_batch() -> None:
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_gpu_gives_the_same_bits() -> None:
     made = transform(colour_probability=1.0)
     drawn = [made.drawn(sample(n), numpy_generator(0, "augment", 0, n)) for n in range(8)]
