@@ -78,6 +78,8 @@ def refuse_others(overrides: Sequence[str], known: Sequence[str], own: Sequence[
     """
     for word in overrides:
         key = word.lstrip("+~").partition("=")[0]
+        if key == "hydra.searchpath":  # where files of a data set of one's own lie
+            continue
         if not any(key == each or key.startswith(f"{each}.") for each in known):
             raise InputError(f"'{key}' has no effect here; {nearest(key, [*own, *known])}.")
 

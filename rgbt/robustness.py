@@ -227,33 +227,48 @@ def _counts(
     session: Session, split: str, asked: Asked, shared: dict[str, Any], folder: Path
 ) -> Counts:
     """Those that are there if they were made of the same, else new ones."""
-    from rgbt.metrics.counts import Counts
     from rgbt.session import evaluate
     from rgbt.tracking.files import write_atomic
 
     counts_file, made_file = folder / f"{asked.mark}.npz", folder / f"{asked.mark}.json"
-    made = _identity(asked, shared)
-    if counts_file.is_file() and _read_json(made_file) == made:
-        try:
-            return Counts.load(counts_file)
-        except InputError:  # a damaged file is made again
-            pass
-    failing = session if asked.failure is None else asked.failure.applied(session, split)
-    counts = evaluate(failing, session.model, split, view=asked.view).counts
-    # What says that the counts are of these weights must not outlive those of others.
-    made_file.unlink(missing_ok=True)
-    counts.save(counts_file)
-    write_atomic(made_file, (json.dumps(made, indent=1) + "\n").encode())
+    identity = _identity(asked, shared)
+    made = {**identity, "row": asked.row, "title": asked.title, "unit": asked.unit}
+    known = _read_json(made_file)
+    counts = _kept(counts_file, known, identity)
+    if counts is None:
+        failing = session if asked.failure is None else asked.failure.applied(session, split)
+        counts = evaluate(failing, session.model, split, view=asked.view).counts
+        # What says that the counts are of these weights must not outlive those of others.
+        made_file.unlink(missing_ok=True)
+        counts.save(counts_file)
+    if known != made:
+        write_atomic(made_file, (json.dumps(made, indent=1) + "\n").encode())
     return counts
 
 
+def _kept(file: Path, known: Any, identity: dict[str, Any]) -> Counts | None:
+    """The counts in `file` if they were made of the same; None where they are missing or damaged.
+
+    Args:
+        file: of counts.
+        known: what is written beside it.
+        identity: see `_identity`.
+    """
+    from rgbt.metrics.counts import Counts
+
+    is_same = isinstance(known, dict) and {key: known.get(key) for key in identity} == identity
+    if not (file.is_file() and is_same):
+        return None
+    try:
+        return Counts.load(file)
+    except InputError:
+        return None
+
+
 def _identity(asked: Asked, shared: dict[str, Any]) -> dict[str, Any]:
-    """What an evaluation was made of, as read back from JSON; and what a figure calls it."""
+    """What decides the counts of an evaluation, as read back from JSON."""
     plain = {
         **shared,
-        "row": asked.row,
-        "title": asked.title,
-        "unit": asked.unit,
         "severity": asked.severity,
         "view": asked.view,
         "failure": None if asked.failure is None else asked.failure.identity(),

@@ -135,6 +135,8 @@ def open_run(
 
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values."""
+    search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
+    pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]
     for key, _ in pairs:
         place = _place(key)
         if not any(place == each or place.startswith(f"{each}.") for each in CHANGEABLE):
@@ -144,7 +146,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     groups = [key for key, _ in pairs if key in GROUPS]
     for group in groups:
         own = [f"{key}={value}" for key, value in pairs if _place(key).split(".")[0] == group]
-        composed = compose(own)[group]
+        composed = compose([*own, *search])[group]
         for name in OmegaConf.missing_keys(composed):
             raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import NODES, build, check, conf_dir, flatten
+from rgbt.config import NODES, build, check, check_node, conf_dir, flatten
 from rgbt.identity import run_key
-from tests.models.golden import compose
+from tests.models.golden import alone, compose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,27 +27,49 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
 
 
-@pytest.mark.parametrize("scale", options("scale"))
+@pytest.mark.parametrize(
+    "scale",
+    # Small, all of them are trained elsewhere, or composed as rows of the tables.
+    [pytest.param("demo", marks=pytest.mark.slow), "paper"],
+)
 @pytest.mark.parametrize("experiment", options("experiment"))
 def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
-    config = compose(f"+experiment={experiment}", f"scale={scale}", "dataset=mfnet",
-                     "dataset.root=unused")  # fmt: skip
+    rooted = ["dataset.root=unused"] if scale == "paper" else []
+    config = compose(f"+experiment={experiment}", f"scale={scale}", *rooted)
     check(config)
     assert config.name == experiment
     assert config.scale.pixel_factor == {"demo": 0.5, "paper": 1.0}[scale]
+    assert config.model.num_classes == config.dataset.num_classes
+    if scale == "paper":
+        assert config.recipe.dataset == config.dataset.name
+
+
+@pytest.fixture(scope="module")
+def default() -> DictConfig:
+    """The whole configuration, of which one node at a time is exchanged."""
+    return compose()
 
 
 @pytest.mark.parametrize(
     ("group", "option"), [(g, o) for g in NODES if (conf_dir() / g).is_dir() for o in options(g)]
 )
-def test_every_option_of_every_group_passes_the_check(group: str, option: str) -> None:
+def test_every_option_of_every_group_passes_the_check(
+    group: str, option: str, default: DictConfig
+) -> None:
+    if group == "scale":  # sets nodes of all groups
+        check(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
+        return
     made = option.startswith("synth") or option.endswith("_demo")
-    rooted = (group == "dataset" and not made) or (group, option) == ("scale", "paper")
-    needed = ["dataset.root=unused"] if rooted else []
+    needed = {} if group != "dataset" or made else {"root": "unused"}
     if option == "folder":
-        said = {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
-        needed += [f"dataset.{key}={value}" for key, value in said.items()]
-    check(compose(f"{group}={option}", *needed))
+        needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
+    chosen = alone(f"{group}/{option}", *(f"dataset.{key}={needed[key]}" for key in needed))
+    usual = default[group]
+    try:
+        default[group] = chosen[group]
+        check_node(default[group], group)
+    finally:
+        default[group] = usual
 
 
 def test_paper_scale_is_the_released_recipe() -> None:
@@ -153,8 +175,6 @@ def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
 )
 def test_wrong_values_are_named_with_their_key(change: dict, sentence: str) -> None:
     good = {"_target_": f"{__name__}.Knob", "size": [1, 2], "kind": "a"}
-    from rgbt.config import check_node
-
     with pytest.raises(InputError, match=sentence):
         check_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
 

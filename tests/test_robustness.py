@@ -194,10 +194,14 @@ def test_other_draws_lie_beside_and_a_damaged_file_is_made_again(
     measure(opened(), "test", noise(seed=1), tmp_path)
     assert evaluator.calls[5:] == [(10.0, "rgbt"), (50.0, "rgbt")]
     assert (tmp_path / "noise-10_seed-1.npz").exists()
+    # Words alone that have changed are written anew.
+    made = json.loads((tmp_path / "clean.json").read_text())
+    (tmp_path / "clean.json").write_text(json.dumps({**made, "title": "before"}))
     (tmp_path / "noise-10.npz").write_bytes(b"half")
     (tmp_path / "noise-50.json").write_text("{")
     measure(opened(), "test", noise(), tmp_path)
     assert len(evaluator.calls) == 9
+    assert json.loads((tmp_path / "clean.json").read_text()) == made
     # Under the same name, but of a file that says otherwise since.
     (own,) = noise()
     of_rgb = choose("noise_rgb", ["degradation.severities=[10,50]"]).degradation

@@ -45,7 +45,8 @@ def print_report(dataset: LabelledDataset, report: Report) -> None:
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
     layout = layout_of(dataset)
-    console.print(f"{dataset.name} ({layout.title}): {dataset.root}", soft_wrap=True)
+    title = f"{dataset.name} ({layout.title}): {dataset.root}"
+    console.print(title, soft_wrap=True, markup=False)
     if report.splits:
         console.print(split_table(report.splits))
         labelled = (split for split in report.splits if split.pixels.any())

@@ -7,7 +7,9 @@ thermal image lies in the alpha slot, so that nothing may treat the four channel
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,12 @@ from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
 Counts = NDArray[np.uint16]
+
+NO_ARRAY = (
+    *(OSError, ValueError, SyntaxError, EOFError, MemoryError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""What NumPy raises on files that are no arrays, or damaged ones."""
 
 
 def read_packed(
@@ -189,7 +197,7 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
     data = read_whole(path)
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except NO_ARRAY as error:
         raise InputError(
             f"{path} cannot be read as an array ({error}): the file is damaged or none; {LEFT_OUT}."
         ) from error

@@ -15,13 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.data.batches import Dataset
-from rgbt.data.files import read_label
+from rgbt.data.files import decode, read_label
 from rgbt.types import Sample
 
 FORMAT = "rgbt pseudo-labels 1"
@@ -115,7 +114,7 @@ def read_pair(
         )
     label = read_label(label_path(folder, name), num_classes)
     path = confidence_path(folder, name)
-    confidence = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    confidence = decode(path) if path.is_file() else None
     if confidence is None or confidence.dtype != np.uint16 or confidence.shape != label.shape:
         found = (
             "none that can be read"

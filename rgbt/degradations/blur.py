@@ -31,7 +31,7 @@ class Blur:
         InputError: a severity out of range.
     """
 
-    unit = "pixels of 480 rows (sigma)"
+    unit = "pixels at 480 rows (sigma)"
 
     def __init__(self, *, image: Images, severities: tuple[float, ...]) -> None:
         self.image: Images = image

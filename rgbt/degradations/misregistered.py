@@ -36,7 +36,7 @@ class Misregistered:
     """
 
     title = "misregistered thermal"
-    unit = "pixels of 480 rows"
+    unit = "pixels at 480 rows"
 
     def __init__(self, *, severities: tuple[float, ...]) -> None:
         self.severities = severities
@@ -52,7 +52,7 @@ class Misregistered:
         distance = nearest_whole(at_height(severity, height))
         if distance == 0:
             raise InputError(
-                f"misregistered by {severity:g} pixels of {REFERENCE_HEIGHT} rows is less than "
+                f"misregistered by {severity:g} pixels at {REFERENCE_HEIGHT} rows is less than "
                 f"half a pixel of an image of {height} rows; give a severity of at least "
                 f"{0.5 * REFERENCE_HEIGHT / height:g}."
             )

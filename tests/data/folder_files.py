@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from rgbt.checks import InputError
 from rgbt.data.folder import Folder
 from rgbt.randomness import numpy_generator
 from tests.conftest import write_png
@@ -57,3 +60,18 @@ def folder(root: Path, **keys: Any) -> Folder:
     """The reader of what `write_folder` writes."""
     values = {**PATTERNS, "num_classes": 3, "classes": CLASSES, "thermal_range": RANGE, **keys}
     return Folder(str(root), **values)
+
+
+def listed(root: Path, *lines: str, **keys: Any) -> Folder:
+    """The reader of what `write_folder` writes, its split "train" being these lines."""
+    (root / "list.txt").write_text("\n".join(lines))
+    plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
+    return folder(root, **{**plain, "lists": {"train": "list.txt", "val": "val.txt"}, **keys})
+
+
+def refused(make: Callable[[], object]) -> str:
+    """The one sentence of the InputError that `make` raises."""
+    with pytest.raises(InputError) as told:
+        make()
+    assert "\n" not in str(told.value)
+    return str(told.value)

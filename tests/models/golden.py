@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import hydra
 import numpy as np
 import pytest
 import torch
@@ -82,11 +83,18 @@ def compose(*overrides: str) -> DictConfig:
     return config.compose(overrides)
 
 
+def alone(name: str, *overrides: str) -> DictConfig:
+    """A file of a group with those that it builds on: a third of the time of the whole."""
+    config.register_resolvers()
+    with config._own_hydra():
+        return hydra.compose(name, list(overrides))
+
+
 def network(yaml: str, num_classes: int = 9, **changed: Any) -> Any:
-    """The network of conf/model/<yaml>.yaml, composed as a user would get it."""
+    """The network of conf/model/<yaml>.yaml."""
     changes = [f"model.{key}={value}" for key, value in changed.items()]
     changes.append(f"model.num_classes={num_classes}")
-    return build(compose(f"model={yaml}", *changes).model)
+    return build(alone(f"model/{yaml}", *changes).model)
 
 
 def fill_network(

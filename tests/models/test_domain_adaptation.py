@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torch.nn import functional as F
 
-from tests.models.golden import compose, network
+from rgbt.config import conf_dir
+from tests.models.golden import alone, network
 from tests.models.plain import generator, images
 
 HW = (96, 192)
@@ -40,8 +42,8 @@ MODELS: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize("scale", ["demo", "paper"])
 def test_names_of_a_scale_stand_for_the_networks(name: str, scale: str) -> None:
-    found = compose(f"model={name}_{scale}").model
-    assert found == compose(f"model={PAIRS[name][scale == 'paper']}").model
+    node = OmegaConf.load(conf_dir() / "model" / f"{name}_{scale}.yaml")
+    assert node == {"defaults": [PAIRS[name][scale == "paper"]]}
 
 
 @pytest.mark.parametrize(("name", "asked"), MODELS)
@@ -78,9 +80,10 @@ def test_small_networks_are_the_large_ones_in_kind(
     name: str, heads: list[str] | None, modalities: str | None
 ) -> None:
     """Only sizes and rates differ, and the dropout that a demo has no channels to spare for."""
-    small, large = compose(f"model={name}").model, compose(f"model={name[:-5]}").model
+    small, large = (alone(f"model/{each}").model for each in (name, name[:-5]))
     sizes = {"depths", "base_width", "decoder_width", "rates", "summed_rates", "dropout"}
-    assert {key for key in large if small[key] != large[key]} <= sizes
+    kept = [key for key in large if key not in ("num_classes", *sizes)]
+    assert [key for key in kept if small[key] != large[key]] == []
     assert small.get("heads") == heads
     assert small.get("modalities") == modalities
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from rgbt.config import compose
 from sweeps.points import Evaluation
 from sweeps.table.cell_points import Wanted
 from sweeps.table.table import Row, load_table
+from tests.sweeps.composed import checked, row_config
 
 NUMBERS = (1, 2, 3, 4, 5)
 TABLES = {number: load_table(f"multihead/table{number}", Path("none")) for number in NUMBERS}
@@ -23,13 +23,13 @@ OURS = [
 
 
 def config_of(number: int, row: Row, scale: str = "demo") -> Any:
-    return compose([*TABLES[number].overrides(row, scale), f"scale={scale}"])
+    return row_config(TABLES[number], row, scale)
 
 
 def first_stage(config: Any) -> Any:
     """The configuration of the stage before, where there is one."""
     before = str(config.model.weights).removeprefix("experiment:").partition("/")[0]
-    return config if before == "None" else compose([f"+experiment={before}"])
+    return config if before == "None" else checked((f"+experiment={before}", "scale=demo"))
 
 
 def row_of(number: int, label: str) -> Row:
@@ -114,6 +114,7 @@ def test_rows_of_a_table_are_different_runs() -> None:
         assert len(wanted.points()) == len(runs)
 
 
+@pytest.mark.slow  # that of its experiment is looked at in tests/test_config.py
 @pytest.mark.parametrize(("number", "row"), OURS)
 def test_at_the_scale_of_the_paper_a_row_is_trained_on_freiburg(number: int, row: Row) -> None:
     config = config_of(number, row, "paper")

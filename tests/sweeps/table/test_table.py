@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.config import build, check, conf_dir, register_resolvers
+from rgbt.config import build
 from rgbt.identity import run_key
 from rgbt.metrics.named import parse
 from sweeps.table.table import Column, Row, Table, load_table, table_names
+from tests.sweeps.composed import row_config
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 ROWS = [
@@ -36,7 +35,6 @@ SMALL: dict[str, Any] = {
         {"label": "large", "settings": {"kind": "a"}, "values": {"mIoU": 61, "Var": None}},
     ],
 }
-Compose = Callable[[Table, Row, str], Any]
 
 
 def write(folder: Path, **changes: Any) -> Path:
@@ -58,25 +56,6 @@ def behind(**keys: Any) -> dict[str, Any]:
     """A difference of a column that stands behind it."""
     columns = column(minus=["mIoU", "c"])["columns"]
     return {"columns": [*columns, {"name": "c", **keys}], "rows": []}
-
-
-@pytest.fixture(scope="module")
-def compose() -> Iterator[Compose]:
-    """The checked configuration of a row; Hydra is initialised once."""
-    made: dict[tuple[str, ...], Any] = {}
-
-    def of_row(table: Table, row: Row, scale: str) -> Any:
-        overrides = (*table.overrides(row, scale), f"scale={scale}")
-        overrides += ("dataset.root=/data",) if scale == "paper" else ()
-        if overrides not in made:
-            config = hydra.compose("config", list(overrides))
-            check(config)
-            made[overrides] = config
-        return made[overrides]
-
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        yield of_row
 
 
 def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
@@ -265,8 +244,8 @@ def test_a_row_leaves_out_columns_and_what_is_computed_from_them() -> None:
 
 
 @pytest.mark.parametrize(("table", "row"), ROWS)
-def test_published_row_composes_and_its_masks_fit(table: Table, row: Row, compose: Compose) -> None:
-    config = compose(table, row, "demo")
+def test_published_row_composes_and_its_masks_fit(table: Table, row: Row) -> None:
+    config = row_config(table, row, "demo")
     grid = build(config.masker).grid_hw(tuple(config.transform.crop_hw))
     assert min(grid) > 1
 
@@ -304,13 +283,11 @@ def test_published_row_composes_and_its_masks_fit(table: Table, row: Row, compos
         [("temporal/table1", "(I)"), ("temporal/table4", "Ours-con-acc")],
     ],
 )
-def test_rows_that_are_printed_twice_are_one_run(
-    cells: list[tuple[str, str]], scale: str, compose: Compose
-) -> None:
+def test_rows_that_are_printed_twice_are_one_run(cells: list[tuple[str, str]], scale: str) -> None:
     keys, printed = set(), set()
     for name, label in cells:
         (row,) = [row for row in TABLES[name].rows if row.label == label]
-        keys.add(run_key(compose(TABLES[name], row, scale)))
+        keys.add(run_key(row_config(TABLES[name], row, scale)))
         miou = row.values.get("mIoU", row.values.get("rgbt_mIoU"))
         assert miou is not None
         printed.add(round(miou, 1))
@@ -324,15 +301,15 @@ def test_rows_that_are_printed_twice_are_one_run(
     + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)]
     + [f"temporal/table{number}" for number in (1, 2, 3)],
 )
-def test_rows_of_an_ablation_are_different_runs(name: str, compose: Compose) -> None:
+def test_rows_of_an_ablation_are_different_runs(name: str) -> None:
     table = TABLES[name]
-    keys = {run_key(compose(table, row, "demo")) for row in table.rows}
+    keys = {run_key(row_config(table, row, "demo")) for row in table.rows}
     assert len(keys) == len(table.rows)
 
 
 @pytest.mark.parametrize(("table", "row"), ROWS)
-def test_settings_say_what_the_overrides_do(table: Table, row: Row, compose: Compose) -> None:
-    masker, loss = (compose(table, row, "demo")[node] for node in ("masker", "loss"))
+def test_settings_say_what_the_overrides_do(table: Table, row: Row) -> None:
+    masker, loss = (row_config(table, row, "demo")[node] for node in ("masker", "loss"))
     printed = {key: value for key, value in row.settings.items() if value is not None}
     found = {
         "patch_size": 2 * (masker.patch_size or 0),  # pixels are halved at demo scale

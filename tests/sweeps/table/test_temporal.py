@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from rgbt.config import compose
 from sweeps.points import Evaluation
 from sweeps.table.cell_points import Wanted
 from sweeps.table.table import Row, load_table
+from tests.sweeps.composed import row_config
 
 NUMBERS = (1, 2, 3, 4, 5)
 TABLES = {number: load_table(f"temporal/table{number}", Path("none")) for number in NUMBERS}
@@ -24,7 +24,7 @@ SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
 
 
 def config_of(number: int, row: Row) -> Any:
-    return compose(TABLES[number].overrides(row, "demo"))
+    return row_config(TABLES[number], row)
 
 
 @pytest.mark.parametrize(("number", "row"), OURS)

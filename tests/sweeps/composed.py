@@ -1,0 +1,42 @@
+"""Configurations of the rows of tables, to be read alone: rows share what they have in common."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from functools import cache
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.config import check, compose
+from sweeps.table.table import Row, Table
+
+
+def row_config(table: Table, row: Row, scale: str = "demo") -> DictConfig:
+    """The checked configuration of a row."""
+    rooted = ("dataset.root=/data",) if scale == "paper" else ()
+    return checked((*table.overrides(row, scale), f"scale={scale}", *rooted))
+
+
+@cache
+def checked(overrides: Sequence[str]) -> DictConfig:
+    """As Hydra composes it: files are put together once, values are set in a copy of that."""
+    values = tuple(word for word in overrides if _sets_a_value(word))
+    config = copy.deepcopy(_composed(tuple(word for word in overrides if word not in values)))
+    parser = OverridesParser.create()
+    for override in parser.parse_overrides(list(values)):
+        OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+    check(config)
+    return config
+
+
+def _sets_a_value(word: str) -> bool:
+    """Whether a word sets one key, as the order of such words among the others is free."""
+    key = word.partition("=")[0]
+    return "." in key and not set(key) & set("+~@/")
+
+
+@cache
+def _composed(overrides: Sequence[str]) -> DictConfig:
+    return compose(overrides)
