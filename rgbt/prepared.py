@@ -158,7 +158,11 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
     if not rehearsal:
-        decode_ahead(session, *(domain.split for domain in domains.named.values()))
+        decode_ahead(
+            session,
+            *(domain.split for domain in domains.named.values()),
+            *(session.trainer.selection_split, "test"),
+        )
     return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
 
 

@@ -210,7 +210,12 @@ class Decoded:
 
         def is_missing(name: str) -> bool:
             placed = store.frames.get(name)
-            return placed is None or not is_fresh(self.source.files(name), placed.frame.stamps)
+            if placed is None:
+                return True
+            try:
+                return not is_fresh(self.source.files(name), placed.frame.stamps)
+            except InputError:  # `_decode` finds out again, and keeps the sentence
+                return True
 
         with ThreadPoolExecutor(self.num_threads) as pool:
             found = pool.map(is_missing, names)
@@ -247,10 +252,11 @@ class Decoded:
             pool.shutdown(cancel_futures=True)
 
     def _decode(self, name: str) -> Fresh | None:
-        # Before decoding: a file that changes meanwhile has another stamp the next time.
-        stamps = tuple(stamp_of(path) for path in self.source.files(name))
         try:
+            # Before decoding: a file that changes meanwhile has another stamp the next time.
+            stamps = tuple(stamp_of(path) for path in self.source.files(name))
             sample = self.source.read(name)
+            _check_kept(sample)
         except InputError as error:
             self._unreadable[name] = str(error)
             return None
@@ -272,6 +278,20 @@ class Decoded:
                 "%s has changed: %s takes what is the same from %s, which stays; "
                 "python -m rgbt.data.decoded ... remove=true removes such caches.",
                 *(self.name, store.folder, latest),
+            )
+
+
+def _check_kept(sample: Sample) -> None:
+    """Refuse what the cache cannot hold; only readers of one's own make such samples."""
+    height, width = sample.thermal.shape[:2]
+    expected = {"rgb": (height, width, 3), "thermal": (height, width), "label": (height, width)}
+    for what, shape in expected.items():
+        image = getattr(sample, what)
+        if image is not None and (image.dtype != np.uint8 or image.shape != shape):
+            raise InputError(
+                f"'{sample.name}': {what} must be uint8 of shape {shape}, like the thermal image, "
+                f"got {image.dtype} {image.shape}; the cache holds nothing else, read without it "
+                "(data.cache=null)."
             )
 
 

@@ -12,16 +12,20 @@ class Stamp(NamedTuple):
 
     Attributes:
         size: bytes, -1 where there was no file.
-        mtime_ns: time of the last change, nanoseconds.
-        crc: CRC-32 of its bytes; tells a copy from a change where the times differ.
+        mtime_ns: time of the last change of the bytes, nanoseconds; copies may keep it.
+        ctime_ns: time of the last change of the file, which nothing but the system sets.
+        inode: number of the file on its disk.
+        crc: CRC-32 of its bytes; tells a copy from a change where one of the others differs.
     """
 
     size: int
     mtime_ns: int
+    ctime_ns: int
+    inode: int
     crc: int
 
 
-NOTHING_THERE = Stamp(-1, 0, 0)
+NOTHING_THERE = Stamp(-1, 0, 0, 0, 0)
 
 
 def stamp_of(path: Path) -> Stamp:
@@ -32,24 +36,25 @@ def stamp_of(path: Path) -> Stamp:
 def is_fresh(paths: tuple[Path, ...], stamps: tuple[Stamp, ...]) -> bool:
     """Whether the files at `paths` are those of `stamps`.
 
-    The system is asked once for every file; opened are those alone that differ in time and not in
-    length.
+    The system is asked once for every file; opened are those alone that are other files, or have
+    other times, and the same length.
     """
     now = [_status(path) for path in paths]
-    if [size for size, _ in now] != [stamp.size for stamp in stamps]:
+    if [status[0] for status in now] != [stamp.size for stamp in stamps]:
         return False
     return all(
-        mtime_ns == stamp.mtime_ns or _crc(path) == stamp.crc
-        for path, (_, mtime_ns), stamp in zip(paths, now, stamps, strict=True)
+        status == stamp[:-1] or _crc(path) == stamp.crc
+        for path, status, stamp in zip(paths, now, stamps, strict=True)
     )
 
 
-def _status(path: Path) -> tuple[int, int]:
+def _status(path: Path) -> tuple[int, int, int, int]:
+    """All of a stamp but the CRC."""
     try:
         status = path.stat()
     except OSError:
-        return NOTHING_THERE.size, NOTHING_THERE.mtime_ns
-    return status.st_size, status.st_mtime_ns
+        return NOTHING_THERE[:4]
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
 
 
 def _crc(path: Path) -> int:

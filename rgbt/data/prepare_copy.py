@@ -45,10 +45,11 @@ class Item(NamedTuple):
         return iter((self.content,)) if isinstance(self.content, bytes) else self.content.chunks()
 
     def is_at(self, path: Path) -> bool:
-        """Whether `path` has been written: files get their names when they are whole."""
+        """Whether `path` holds these bytes: all are compared, a download may have been repaired."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
-        return not isinstance(self.content, bytes) or path.read_bytes() == self.content
+        with path.open("rb") as file:
+            return all(file.read(len(chunk)) == chunk for chunk in self.chunks())
 
 
 def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> None:
@@ -126,10 +127,11 @@ def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) ->
         advance: called with the bytes of every file that is there or has been written.
 
     Raises:
-        InputError: too little space, or a file of the download that cannot be read or is shorter
-            or longer than it said.
+        InputError: other files lie in the folders, too little space, or a file of the download
+            that cannot be read or is shorter or longer than it said.
         OSError: `out` cannot be written.
     """
+    _refuse_others(items, out)
     missing = []
     for item in items:
         if item.is_at(out / item.target):
@@ -145,6 +147,25 @@ def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) ->
     for item in missing:
         _write(item, out / item.target)
         advance(item.size)
+
+
+def _refuse_others(items: list[Item], out: Path) -> None:
+    """Refuse files beside those that are written, which a reader would take for part of the set."""
+    targets = {item.target for item in items}
+    folders = {out / target.rpartition("/")[0] for target in targets if "/" in target}
+    found = (path for folder in sorted(folders) if folder.is_dir() for path in folder.iterdir())
+    others = [
+        path
+        for path in found
+        if path.is_file()
+        and not path.name.startswith(".")
+        and path.relative_to(out).as_posix() not in targets
+    ]
+    if others:
+        raise InputError(
+            f"out: {len(others)} files lie in {out} that the download does not hold, the first is "
+            f"{min(others)}; remove them, or name another folder."
+        )
 
 
 def _listed(out: Path) -> list[Path]:

@@ -42,7 +42,7 @@ class KPLayout:
         """Names listed twice, in two splits or at the wrong time; labels that are in no split."""
         return [
             *listed_twice(lists),
-            *shared(lists, self._is_told_already),
+            *shared(lists, self._share_a_list),
             *_wrong_times(lists),
             *_lists_that_disagree(lists),
             *self._unlisted(lists),
@@ -70,16 +70,9 @@ class KPLayout:
         files = [path for split in self.dataset.splits for path in self.dataset.list_files(split)]
         return f"splits are read from the lists {', '.join(dict.fromkeys(files)) or '(none)'}."
 
-    def _is_told_already(self, one: str, other: str) -> bool:
-        """Whether names that both hold are no news.
-
-        The configuration reads both from one file, as for a set without a test list; or they are
-        the days or nights of two splits, which share them as well.
-        """
-        files = (set(self.dataset.list_files(split)) for split in (one, other))
-        apart = one.partition("_")[0] != other.partition("_")[0]
-        is_part = self.repeats(one) or self.repeats(other)
-        return (apart and is_part) or not next(files).isdisjoint(next(files))
+    def _share_a_list(self, one: str, other: str) -> bool:
+        """Whether the configuration reads both from one file, as for a set without a test list."""
+        return not set(self.dataset.list_files(one)).isdisjoint(self.dataset.list_files(other))
 
     def _is_ms_uda(self, splits: tuple[SplitReport, ...]) -> bool:
         """Whether training is by day, with sets that CRM tests on, and validation at night."""
