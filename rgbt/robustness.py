@@ -7,24 +7,17 @@ file that says what it was made of. What is there already is not made again.
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.command import plain_command
-from rgbt.types import VIEWS, View
 
 if TYPE_CHECKING:
-    from torch import nn
-
-    from rgbt.degraded import Chosen, Failure
-    from rgbt.metrics.counts import Counts
-    from rgbt.session import Session
+    from rgbt.degraded import Chosen
+    from rgbt.failing_images import Measured
     from rgbt.stored import Stored
     from rgbt.tracking.tables import Grid
 
@@ -39,15 +32,6 @@ OWN = {
 }
 FOLDER = "robustness"
 """Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
-
-FORMAT = "rgbt robustness 1"
-CLEAN = "clean"
-FEATURES: dict[View, str] = {
-    "thermal": "thermal alone (features)",
-    "rgb": "RGB alone (features)",
-}
-"""View -> what it is called beside "RGB removed (zeroed)": the network sees both images, and the
-features of one branch alone are decoded."""
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
@@ -68,6 +52,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     weights or the degradation differ. python -m analysis.figures figure=robustness draws it.
     """
     from rgbt.degraded import own_words
+    from rgbt.failing_images import measure
     from rgbt.stored import open_trained
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
@@ -135,185 +120,14 @@ def _check_comparable(
         raise InputError(f"out= is the folder of one run, but run= names {len(runs)}; leave it.")
 
 
-@dataclass(frozen=True)
-class Asked:
-    """One evaluation.
-
-    Attributes:
-        mark: name of its file.
-        row: of the table: a degradation or a view, whose severities share it.
-        title: what people call the row.
-        unit: of the severity; "" where it has none.
-        severity: 0: clean.
-        view: what is predicted from.
-        failure: of the images; None: they are clean.
-    """
-
-    mark: str
-    row: str
-    title: str
-    unit: str
-    severity: float
-    view: View
-    failure: Failure | None = None
-
-
-@dataclass(frozen=True)
-class Measured:
-    """An evaluation with its counts, and the mIoU of each part of them as a fraction."""
-
-    asked: Asked
-    counts: Counts
-    mious: dict[str, float]
-
-
-def asked_of(session: Session, chosen: Sequence[Chosen]) -> tuple[Asked, ...]:
-    """Clean images, single branches as far as the network decodes them, every failure."""
-    from rgbt.degraded import Failure
-    from rgbt.session import view_of
-
-    view = view_of(session)
-    known = getattr(session.model, "views", VIEWS)
-    branches = {each: title for each, title in FEATURES.items() if view == "rgbt" and each in known}
-    found = [Asked(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
-    for branch, title in branches.items():
-        found.append(Asked(f"features-{branch}", f"features-{branch}", title, "", 1.0, branch))
-    for each in chosen:
-        kind = each.degradation
-        for severity in kind.severities:
-            failure = Failure(each, severity)
-            said = (each.row, kind.title, kind.unit, severity)
-            found.append(Asked(failure.mark, *said, view, failure))
-    return tuple(found)
-
-
-def measure(
-    session: Session, split: str, chosen: Sequence[Chosen], folder: Path
-) -> tuple[Measured, ...]:
-    """Evaluate what is missing of a run's robustness; the clean images come first.
-
-    Args:
-        session: with the trained network.
-        split: of its data set.
-        chosen: degradations, each with all severities of its ladder.
-        folder: of the counts; NAME.npz has a NAME.json, written after it, that says what made it.
-
-    Raises:
-        InputError: a severity that does not fit the images, or a file that cannot be read.
-    """
-    from rgbt.engine.progress import progress
-    from rgbt.metrics.scores import miou
-
-    folder.mkdir(parents=True, exist_ok=True)
-    every = asked_of(session, chosen)
-    shared = _shared_identity(session, split)
-    found = []
-    with progress() as display:
-        task = display.add_task(FOLDER, total=len(every), note="")
-        for asked in every:
-            display.update(task, note=asked.mark)
-            counts = _counts(session, split, asked, shared, folder)
-            parts = {"": counts, **{f"{part}/": sub for part, sub in counts.parts().items()}}
-            mious = {
-                f"{part}mIoU": float(miou(sub.whole(), session.regions.absent, sub.scored))
-                for part, sub in parts.items()
-            }
-            found.append(Measured(asked, counts, mious))
-            display.advance(task)
-    return tuple(found)
-
-
-def _counts(
-    session: Session, split: str, asked: Asked, shared: dict[str, Any], folder: Path
-) -> Counts:
-    """Those that are there if they were made of the same, else new ones."""
-    from rgbt.session import evaluate
-    from rgbt.tracking.files import write_atomic
-
-    counts_file, made_file = folder / f"{asked.mark}.npz", folder / f"{asked.mark}.json"
-    identity = _identity(asked, shared)
-    made = {**identity, "row": asked.row, "title": asked.title, "unit": asked.unit}
-    known = _read_json(made_file)
-    counts = _kept(counts_file, known, identity)
-    if counts is None:
-        failing = session if asked.failure is None else asked.failure.applied(session, split)
-        counts = evaluate(failing, session.model, split, view=asked.view).counts
-        # What says that the counts are of these weights must not outlive those of others.
-        made_file.unlink(missing_ok=True)
-        counts.save(counts_file)
-    if known != made:
-        write_atomic(made_file, (json.dumps(made, indent=1) + "\n").encode())
-    return counts
-
-
-def _kept(file: Path, known: Any, identity: dict[str, Any]) -> Counts | None:
-    """The counts in `file` if they were made of the same; None where they are missing or damaged.
-
-    Args:
-        file: of counts.
-        known: what is written beside it.
-        identity: see `_identity`.
-    """
-    from rgbt.metrics.counts import Counts
-
-    is_same = isinstance(known, dict) and {key: known.get(key) for key in identity} == identity
-    if not (file.is_file() and is_same):
-        return None
-    try:
-        return Counts.load(file)
-    except InputError:
-        return None
-
-
-def _identity(asked: Asked, shared: dict[str, Any]) -> dict[str, Any]:
-    """What decides the counts of an evaluation, as read back from JSON."""
-    plain = {
-        **shared,
-        "severity": asked.severity,
-        "view": asked.view,
-        "failure": None if asked.failure is None else asked.failure.identity(),
-    }
-    return dict(json.loads(json.dumps(plain)))
-
-
-def _shared_identity(session: Session, split: str) -> dict[str, Any]:
-    from omegaconf import OmegaConf
-
-    return {
-        "format": FORMAT,
-        "dataset": session.dataset.fingerprint(),
-        "split": split,
-        "partition": session.regions.name,
-        "weights": weights_digest(session.model),
-        "transform": OmegaConf.to_container(session.config.transform, resolve=True),
-        "precision": session.trainer.precision,
-    }
-
-
-def weights_digest(model: nn.Module) -> str:
-    """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
-    import torch
-
-    digest = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
-        digest.update(tensor.cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError):  # not there, or cut short: made again
-        return None
-
-
 def _place(stored: Stored, arguments: dict[str, str]) -> str:
     """Folder of a split's counts: plain where the run is measured as its own evaluation is."""
+    from rgbt.failing_images import read_json
+
     session = stored.session
     regions = [session.regions.name] if arguments["regions"] != OWN["regions"] else []
     last = [] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]]
-    own = _read_json(stored.folder.parent / "dataset.json") or {}
+    own = read_json(stored.folder.parent / "dataset.json") or {}
     found = session.dataset.fingerprint()
     is_other = own.get("files", found) != found
     others = [f"{session.dataset.name}-{found[:8]}"] if is_other else []
@@ -334,6 +148,7 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
         measured: the clean images first.
         title: shown above.
     """
+    from rgbt.failing_images import CLEAN
     from rgbt.tracking.tables import Grid, percent
 
     clean, *others = measured

@@ -19,7 +19,7 @@ from torch import nn
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded import Decoded, decoded_dataset
+from rgbt.data.decoded.dataset import Decoded, decoded_dataset
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches

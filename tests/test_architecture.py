@@ -44,6 +44,7 @@ MEETING_PLACES = {
     "consistency.py",
     "degraded.py",
     "degradations/__main__.py",
+    "failing_images.py",
     "robustness.py",
     "training.py",
     "prepared.py",

@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt import earlier, identity
 from rgbt.checks import InputError, RunError
-from rgbt.config import check, compose, conf_dir
+from rgbt.config import check, conf_dir
 from rgbt.earlier import earlier_runs, finish_earlier, labels_folder
 from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.naming import TAGS
 from rgbt.tracking.files import holding
 from tests.commands import Call, Trained, short
+from tests.composed import composed as configuration
 
 STANDING = (
     *("sh_adversarial", "sh_adversarial_seg", "sh_max_squares"),
@@ -49,19 +49,14 @@ OLD_KEYS = {
 """At scale=demo, and at scale=paper with dataset=mfnet, of before there were domains."""
 
 
-@cache
-def _composed(words: tuple[str, ...]) -> DictConfig:
-    return compose(words)
-
-
 @pytest.fixture(autouse=True)
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Composing is most of the time of these tests, and they compose the same again and again."""
-    monkeypatch.setattr(identity, "compose", lambda words: _composed(tuple(words)).copy())
+    monkeypatch.setattr(identity, "compose", configuration)
 
 
 def composed(experiment: str, *overrides: str) -> DictConfig:
-    config = _composed((f"+experiment={experiment}", *overrides)).copy()
+    config = configuration([f"+experiment={experiment}", *overrides])
     check(config)
     return config
 

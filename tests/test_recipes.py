@@ -27,8 +27,12 @@ def recipe(name: str) -> Any:
 
 @pytest.mark.parametrize(
     ("name", "height", "images", "crop"),
-    [("mfnet", 480, 1568, [240, 320]), ("pst900", 720, 597, [224, 320]), ("kp", 512, 499, [256, 320])],
-)  # fmt: skip
+    [
+        ("mfnet", 480, 1568, [240, 320]),
+        ("pst900", 720, 597, [224, 320]),
+        ("kp", 512, 499, [256, 320]),
+    ],
+)
 def test_sizes_are_those_of_the_crm_release(
     name: str, height: int, images: int, crop: list[int]
 ) -> None:

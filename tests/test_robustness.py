@@ -20,9 +20,10 @@ from rgbt import evaluate, robustness
 from rgbt.checks import InputError
 from rgbt.command import plain_command
 from rgbt.degraded import Failure, choose
+from rgbt.failing_images import Asked, Measured, asked_of, measure, weights_digest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.robustness import Asked, Measured, asked_of, chosen_of, measure, robustness_grid
+from rgbt.robustness import chosen_of, robustness_grid
 from tests.commands import Call, Trained, assert_one_sentence, short
 from tests.degradations.recorded import Recorded
 
@@ -241,13 +242,13 @@ def test_counts_of_other_weights_are_never_taken_for_these(
 
 def test_the_digest_is_of_names_shapes_types_and_bytes() -> None:
     model = Network()
-    first = robustness.weights_digest(model)
-    assert first == robustness.weights_digest(Network())
-    assert first != robustness.weights_digest(model.double())
+    first = weights_digest(model)
+    assert first == weights_digest(Network())
+    assert first != weights_digest(model.double())
     model = Network()
     model.weight = nn.Parameter(torch.arange(4.0).reshape(2, 2))
-    assert first != robustness.weights_digest(model)
-    assert robustness.weights_digest(nn.BatchNorm2d(3))  # holds a scalar
+    assert first != weights_digest(model)
+    assert weights_digest(nn.BatchNorm2d(3))  # holds a scalar
 
 
 def measured_row(row: str, unit: str, *values: tuple[float, float]) -> list[Measured]:

@@ -18,8 +18,8 @@ from rich.table import Table
 from rgbt.command import command
 from rgbt.config import build
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.report import check_dataset, layout_of, num_listed
-from rgbt.data.report_values import Report, SplitReport
+from rgbt.data.report.dataset import check_dataset, layout_of, num_listed
+from rgbt.data.report.values import Report, SplitReport
 
 WIDTH_WITHOUT_TERMINAL = 120
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded import Decoded
+from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.mfnet import MFNet
 
 FOLDER = "next"

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, nearest
 from rgbt.command import built, plain_command
-from rgbt.degraded import known_degradations, own_words
-from rgbt.robustness import chosen_of
 
 if TYPE_CHECKING:
     from rgbt.data.dataset import LabelledDataset
@@ -34,6 +32,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               draws degradation.seed=1
     """
     from rgbt.degradations.sheet import draw, sheet
+    from rgbt.degraded import known_degradations, own_words
+    from rgbt.robustness import chosen_of
 
     path = _path(arguments["out"])
     words, overrides = own_words(overrides)

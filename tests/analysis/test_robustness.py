@@ -12,8 +12,9 @@ from analysis.results import open_counts
 from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
 from rgbt.command import plain_command
+from rgbt.failing_images import CLEAN, FORMAT
 from rgbt.metrics.named import value
-from rgbt.robustness import CLEAN, FOLDER, FORMAT
+from rgbt.robustness import FOLDER
 from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call

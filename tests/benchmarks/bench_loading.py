@@ -26,7 +26,7 @@ from torch.utils.data import DataLoader
 
 from rgbt.config import build, compose
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded import Decoded
+from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.dataset import synth

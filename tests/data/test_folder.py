@@ -14,10 +14,10 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config import build, check_node
-from rgbt.data.folder import Folder
-from rgbt.data.folder_values import grey, label_codes, painted
+from rgbt.data.folder.dataset import Folder
+from rgbt.data.folder.values import grey, label_codes, painted
 from rgbt.data.freiburg import _grey_levels
-from rgbt.data.report import check_dataset, layout_of
+from rgbt.data.report.dataset import check_dataset, layout_of
 from tests.conftest import write_png
 from tests.data.folder_files import (
     CLASSES,

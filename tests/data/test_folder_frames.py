@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.data.folder_frames import Frame
-from rgbt.data.folder_pattern import Pattern, in_order
-from rgbt.data.folder_splits import ByShare
+from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.pattern import Pattern, in_order
+from rgbt.data.folder.splits import ByShare
 from tests.conftest import write_png
 from tests.data.folder_files import (
     HW,
@@ -153,7 +153,7 @@ def test_a_folder_that_may_not_be_listed(sound: Path, monkeypatch: pytest.Monkey
     def deny(_: object) -> list[str]:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("rgbt.data.folder_pattern.os.listdir", deny)
+    monkeypatch.setattr("rgbt.data.folder.pattern.os.listdir", deny)
     assert refused(lambda: folder(sound)) == (
         f"{sound} may not be listed, permission is denied; allow it (chmod a+rx)."
     )

@@ -174,9 +174,7 @@ def test_folders_layout_refuses_a_packed_image(write_mfnet, expected_pair, png) 
 def test_refuses_sizes_that_differ(write_mfnet, png) -> None:
     root = write_mfnet({"train": ["00001D"]})
     png(root / "labels" / "00001D.png", np.zeros((12, 16), np.uint8))
-    with pytest.raises(
-        InputError, match="'00001D': RGB is 24x32 pixels but its label is 12x"
-    ):
+    with pytest.raises(InputError, match="'00001D': RGB is 24x32 pixels but its label is 12x"):
         MFNet(str(root)).read("00001D")
 
 

@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data import prepare, prepare_copy
 from rgbt.data.kp import KP
 from rgbt.data.kp_names import SPLITS
 from rgbt.data.mfnet import MFNet
-from rgbt.data.prepare import main
-from rgbt.data.prepare_kp import plan_kp
-from rgbt.data.prepare_plans import Given
-from rgbt.data.prepare_source import Entry, Source
+from rgbt.data.prepare import __main__ as prepare
+from rgbt.data.prepare import copying as prepare_copy
+from rgbt.data.prepare.__main__ import main
+from rgbt.data.prepare.kp import plan_kp
+from rgbt.data.prepare.plans import Given
+from rgbt.data.prepare.source import Entry, Source
 from rgbt.data.pst900 import PST900
 from tests.conftest import write_data, write_png
 from tests.data import freiburg_files, kp_files, pst900_files

@@ -53,7 +53,9 @@ def test_the_ordinary_reader_reads_it(data: KP) -> None:
     for split, size in (("train", 9), ("val", 4), ("test", 8)):
         names = plain.names(split)
         assert len(names) == size
-        assert names == tuple(sorted({*plain.names(f"{split}_day"), *plain.names(f"{split}_night")}))
+        assert names == tuple(
+            sorted({*plain.names(f"{split}_day"), *plain.names(f"{split}_night")})
+        )
         # The lists say what the set numbers say, which is the split of the CRM release.
         assert names == KP(str(data.root), lists="sets").names(split)
     assert plain.fingerprint() == data.fingerprint()

@@ -19,9 +19,10 @@ from analysis.report.store import Files, StoredRun
 from analysis.report.studies import pareto_front, read_study
 from analysis.report.tables_files import read_recorded, reproduce_command
 from rgbt.checks import InputError
-from rgbt.config import compose, flatten
+from rgbt.config import flatten
 from rgbt.metrics.counts import Counts
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
+from tests.composed import composed as configuration
 
 
 def stored(files: Files, **tags: str) -> StoredRun:
@@ -218,7 +219,7 @@ def test_a_table_is_run_with_its_seeds(seeds: tuple[int, ...], words: str) -> No
 
 def composed(choice: Choice, side: Side) -> dict[str, Any]:
     assert side.setting is not None
-    return flatten(compose([*choice.base, side.setting]))
+    return flatten(configuration([*choice.base, side.setting]))
 
 
 @pytest.mark.parametrize("choice", load_choices(), ids=lambda choice: choice.topic)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError
-from rgbt.data.prepare_source import Entry
+from rgbt.data.prepare.source import Entry
 
 PLAN = ".prepare.json"
 """In the folder that is written: what from, so that an interrupted command goes on."""

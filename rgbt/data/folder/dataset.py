@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, check_choice, check_range, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_packed, read_rgb, within
-from rgbt.data.folder_frames import Frame, find_frames, patterns_of
-from rgbt.data.folder_pattern import SPLIT
-from rgbt.data.folder_splits import FOLDERS, ByFolder, ByList, ByShare, Rule
-from rgbt.data.folder_values import (
+from rgbt.data.folder.frames import Frame, find_frames, patterns_of
+from rgbt.data.folder.pattern import SPLIT
+from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, Rule
+from rgbt.data.folder.values import (
     Colour,
     Range,
     check_limits,
@@ -43,7 +43,7 @@ Array = NDArray[np.uint8]
 class Folder:
     """RGB-thermal pairs in any folder whose paths follow patterns.
 
-    A pattern is a path below the root with words in braces (`rgbt.data.folder_pattern`): {name}
+    A pattern is a path below the root with words in braces (`rgbt.data.folder.pattern`): {name}
     stands for a frame, {split} for the split it is of, {sequence} for frames that follow one
     another, any other word for whatever differs. What the words stand for in the path of the RGB
     image, joined by "_", is the name of a sample; thermal image and label are found with the same

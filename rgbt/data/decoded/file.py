@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.decoded_stamps import Stamp
+from rgbt.data.decoded.stamps import Stamp
 from rgbt.types import Sample
 
 MAGIC = b"rgbtdec1"

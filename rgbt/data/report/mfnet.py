@@ -7,7 +7,7 @@ from collections import Counter
 from itertools import combinations
 
 from rgbt.data.mfnet import FLIPPED, MFNet, base_name
-from rgbt.data.report_values import Lists, SplitReport, Times
+from rgbt.data.report.values import Lists, SplitReport, Times
 
 OFFICIAL_DAY_NIGHT = {"train": (410, 374), "val": (205, 187), "test": (205, 188)}
 """Day and night images of each split of MFNet (784, 392 and 393 names), mirrored copies apart."""
@@ -16,7 +16,7 @@ NAME = re.compile(rf"\d{{5}}[DN]({FLIPPED})?")
 
 
 class MFNetLayout:
-    """See `rgbt.data.report_values.Layout`."""
+    """See `rgbt.data.report.values.Layout`."""
 
     def __init__(self, dataset: MFNet) -> None:
         self.dataset = dataset

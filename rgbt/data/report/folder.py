@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rgbt.data.folder import Folder
-from rgbt.data.folder_values import plain
-from rgbt.data.report_lists import listed_twice, shared
-from rgbt.data.report_values import Lists, SplitReport, Thermal, Times
+from rgbt.data.folder.dataset import Folder
+from rgbt.data.folder.values import plain
+from rgbt.data.report.lists import listed_twice, shared
+from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
 
 MOST_CLIPPED = 0.5
 """Share of the thermal values of a split that may lie outside the range that is read."""
@@ -25,7 +25,7 @@ class _Clipped(NamedTuple):
 
 
 class FolderLayout:
-    """See `rgbt.data.report_values.Layout`."""
+    """See `rgbt.data.report.values.Layout`."""
 
     def __init__(self, dataset: Folder) -> None:
         self.dataset = dataset

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from rgbt.checks import InputError
 from rgbt.data import freiburg_layout as freiburg
 from rgbt.data import mfnet, pst900
-from rgbt.data.prepare_copy import Item
-from rgbt.data.prepare_source import Entry, Source
+from rgbt.data.prepare.copying import Item
+from rgbt.data.prepare.source import Entry, Source
 
 DEPTH = 3
 """How many folders deep a data set is looked for, that of the archive's own name included."""

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.data.folder_frames import Frame
-from rgbt.data.folder_pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
+from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
 from rgbt.data.integrity import is_there, read_names
 from rgbt.randomness import numpy_generator
 

@@ -1,7 +1,7 @@
 """A folder of decoded frames: which are there, which are whole, and adding others.
 
     about.json          what it was decoded from: class, decoding, fingerprint
-    NNNN-XXXXXXXX.frames   `rgbt.data.decoded_file`; of a frame in several of them, the last counts
+    NNNN-XXXXXXXX.frames   `rgbt.data.decoded.file`; of a frame in several of them, the last counts
     verified.json       file -> length and time of change when its checksums were last compared, and
                         the frames that were damaged then
     lock                held while files are added; freed by the system when its process ends
@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rgbt.checks import InputError
-from rgbt.data.decoded_file import Frame, FrameFile, FrameWriter
-from rgbt.data.decoded_stamps import Stamp
+from rgbt.data.decoded.file import Frame, FrameFile, FrameWriter
+from rgbt.data.decoded.stamps import Stamp
 from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)

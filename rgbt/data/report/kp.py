@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rgbt.data.kp import KP
 from rgbt.data.kp_names import NAME, TIMES, is_night, set_of
-from rgbt.data.report_lists import listed_twice, other_sizes, other_times, shared
-from rgbt.data.report_values import Lists, SplitReport, Times
+from rgbt.data.report.lists import listed_twice, other_sizes, other_times, shared
+from rgbt.data.report.values import Lists, SplitReport, Times
 
 OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 """Day and night images of each split of the CRM release: 499, 140 and 311."""
@@ -14,7 +14,7 @@ HW = (512, 640)
 
 
 class KPLayout:
-    """See `rgbt.data.report_values.Layout`."""
+    """See `rgbt.data.report.values.Layout`."""
 
     def __init__(self, dataset: KP) -> None:
         self.dataset = dataset

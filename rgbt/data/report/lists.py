@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from itertools import combinations
 
-from rgbt.data.report_values import Lists, SplitReport
+from rgbt.data.report.values import Lists, SplitReport
 
 
 def listed_twice(lists: Lists) -> list[str]:

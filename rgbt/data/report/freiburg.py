@@ -6,11 +6,11 @@ import numpy as np
 
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.freiburg_layout import unused_files
-from rgbt.data.report_values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
 
 
 class FreiburgLayout:
-    """See `rgbt.data.report_values.Layout`."""
+    """See `rgbt.data.report.values.Layout`."""
 
     def __init__(self, dataset: Freiburg) -> None:
         self.dataset = dataset

@@ -9,8 +9,8 @@ import numpy as np
 
 from rgbt.data.named_files import names_in
 from rgbt.data.pst900 import FOLDERS, PST900, bag_of
-from rgbt.data.report_lists import listed_twice, other_sizes, shared
-from rgbt.data.report_values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.lists import listed_twice, other_sizes, shared
+from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
 
 NUM_TRAIN = 597
 """Pairs of the training part on disk; the data set's page says 606."""
@@ -22,7 +22,7 @@ HW = (720, 1280)
 
 
 class PST900Layout:
-    """See `rgbt.data.report_values.Layout`."""
+    """See `rgbt.data.report.values.Layout`."""
 
     def __init__(self, dataset: PST900) -> None:
         self.dataset = dataset

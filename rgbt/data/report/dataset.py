@@ -1,7 +1,7 @@
 """What a data set holds and what is wrong with it, as values.
 
 Reads every listed sample once, in threads. Printing is in `rgbt.data.check`; what depends on the
-kind of data set in `rgbt.data.report_mfnet` and its like.
+kind of data set in `rgbt.data.report.mfnet` and its like.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 
 from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.folder import Folder
+from rgbt.data.folder.dataset import Folder
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
-from rgbt.data.report_folder import FolderLayout
-from rgbt.data.report_freiburg import FreiburgLayout
-from rgbt.data.report_kp import KPLayout
-from rgbt.data.report_mfnet import MFNetLayout
-from rgbt.data.report_pst900 import PST900Layout
-from rgbt.data.report_values import Counts, Layout, Lists, Report, SplitReport, Thermal
+from rgbt.data.report.folder import FolderLayout
+from rgbt.data.report.freiburg import FreiburgLayout
+from rgbt.data.report.kp import KPLayout
+from rgbt.data.report.mfnet import MFNetLayout
+from rgbt.data.report.pst900 import PST900Layout
+from rgbt.data.report.values import Counts, Layout, Lists, Report, SplitReport, Thermal
 from rgbt.types import IGNORE
 
 

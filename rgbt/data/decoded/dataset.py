@@ -4,9 +4,6 @@
 milliseconds, a view of the map none to speak of, and a cut of it touches only its own pages.
 Nothing is augmented here, and nothing is kept that the data set would not return today: a frame is
 decoded again when one of its files changes, or when its bytes in the cache are damaged.
-
-    python -m rgbt.data.decoded dataset=mfnet dataset.root=... cache=auto    # decode, show the size
-    python -m rgbt.data.decoded dataset=mfnet dataset.root=... remove=true   # and remove it
 """
 
 from __future__ import annotations
@@ -14,34 +11,27 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
-import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress, TaskID
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded_file import bytes_of, crc_of
-from rgbt.data.decoded_stamps import is_fresh, stamp_of
-from rgbt.data.decoded_store import (
+from rgbt.data.decoded.file import bytes_of, crc_of
+from rgbt.data.decoded.stamps import is_fresh, stamp_of
+from rgbt.data.decoded.store import (
     Fresh,
     Placed,
     Store,
     Told,
-    gigabytes,
-    remove,
-    size_of,
     stores_like,
 )
 from rgbt.data.synth.cache import default_cache
@@ -298,51 +288,3 @@ def _check_kept(sample: Sample) -> None:
 def _store_name(about: dict[str, Any]) -> str:
     key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
     return f"{re.sub(r'[^A-Za-z0-9_-]', '_', about['name'])}-{key}"
-
-
-@contextmanager
-def shown() -> Iterator[Told]:
-    """Progress bars on stderr for `Decoded.ensure`, one for each thing that is done."""
-    with Progress(console=Console(stderr=True)) as progress:
-        tasks: dict[str, TaskID] = {}
-
-        def advance(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = progress.add_task(what)
-            progress.update(tasks[what], completed=done, total=total)
-
-        yield advance
-
-
-OWN = {"cache": "auto", "remove": "false"}
-
-
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Decode every split of a data set into a cache and show its size, or remove it.
-
-    cache      auto, or the folder where caches lie
-    remove     true: remove the cache, and those of earlier states of the data set
-    overrides  such as dataset=mfnet dataset.root=/data/MFNet
-    """
-    from rgbt.command import built
-
-    check_choice("remove", arguments["remove"], ("true", "false"))
-    source: LabelledDataset = built("dataset", overrides)
-    dataset = decoded_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
-    assert isinstance(dataset, Decoded)
-    removes = arguments["remove"] == "true"
-    if not removes:
-        splits = [split for split in source.splits if source.has(split)]
-        with shown() as advance:
-            dataset.ensure(tuple(name for split in splits for name in source.names(split)), advance)
-    for cache in dataset.caches():
-        sys.stdout.write(f"{cache}: {gigabytes(size_of(cache))}{' removed' * removes}\n")
-        if removes:
-            remove(cache)
-    return 0
-
-
-if __name__ == "__main__":
-    from rgbt.command import plain_command
-
-    plain_command(OWN, main)()

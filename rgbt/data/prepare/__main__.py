@@ -26,12 +26,12 @@ from rgbt.data.dataset import LabelledDataset
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
-from rgbt.data.prepare_copy import Item, check_out, claimed, write_all
-from rgbt.data.prepare_kp import plan_kp
-from rgbt.data.prepare_plans import Given, plan_freiburg, plan_mfnet, plan_pst900
-from rgbt.data.prepare_source import Source
+from rgbt.data.prepare.copying import Item, check_out, claimed, write_all
+from rgbt.data.prepare.kp import plan_kp
+from rgbt.data.prepare.plans import Given, plan_freiburg, plan_mfnet, plan_pst900
+from rgbt.data.prepare.source import Source
 from rgbt.data.pst900 import PST900
-from rgbt.data.report import check_dataset, num_listed
+from rgbt.data.report.dataset import check_dataset, num_listed
 
 OWN = {"dataset": None, "source": None, "out": None, "labels": "", "lists": ""}
 OPTIONAL = ("labels", "lists")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.folder_pattern import NAME, Pattern, Values, in_order, what_is_in
+from rgbt.data.folder.pattern import NAME, Pattern, Values, in_order, what_is_in
 
 
 class Frame(NamedTuple):

@@ -14,9 +14,9 @@ from typing import NamedTuple
 from rgbt.checks import InputError
 from rgbt.data import kp_names as kp
 from rgbt.data.kp import LABELS_OF
-from rgbt.data.prepare_copy import Item
-from rgbt.data.prepare_plans import Given, add_once, lists_in, text_of
-from rgbt.data.prepare_source import Entry, Source
+from rgbt.data.prepare.copying import Item
+from rgbt.data.prepare.plans import Given, add_once, lists_in, text_of
+from rgbt.data.prepare.source import Entry, Source
 
 KINDS = ("visible", "lwir")
 IMAGE = re.compile(r"(?:^|/)(set\d\d)/(V\d{3})/(visible|lwir)/(I\d{5})\.jpg$")

@@ -1,0 +1,1 @@
+"""Anybody's own RGB-thermal data, described by one YAML."""
