@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -108,11 +109,12 @@ def open_run(
     config = OmegaConf.load(folder / "config.yaml")
     assert isinstance(config, DictConfig), "a stored configuration is a mapping"
     defaults = compose([])
-    for key in defaults:
+    for key, value in _plain(defaults).items():
         if key not in config:  # a run of before there was any
-            value = defaults[key]
-            plain = OmegaConf.is_config(value)
-            config[key] = OmegaConf.to_container(value, resolve=True) if plain else value
+            config[key] = value
+    for key, value in _plain(defaults.data).items():
+        if key not in config.data:
+            config.data[key] = value
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
     check(config)
@@ -133,13 +135,19 @@ def open_run(
     return Stored(session, step, folder / "evaluations", config.name)
 
 
+def _plain(node: DictConfig) -> dict[str, Any]:
+    """Values, with every reference to others replaced; those that must be given are left out."""
+    found = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items() if value != "???"}
+
+
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values."""
     search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
     pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]
     for key, _ in pairs:
-        place = _place(key)
-        if not any(place == each or place.startswith(f"{each}.") for each in CHANGEABLE):
+        if not _is_changeable(_place(key)):
             raise InputError(
                 f"'{key}' cannot be changed of a stored run; {nearest(key, CHANGEABLE)}."
             )
@@ -155,8 +163,13 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
         if _place(key).split(".")[0] in groups:
             continue
         if key not in known:
-            raise InputError(f"'{key}' is not a key of this run; {nearest(key, known)}.")
+            open_ones = [each for each in known if _is_changeable(each)]
+            raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
         OmegaConf.update(config, key, _parsed(key, value))
+
+
+def _is_changeable(place: str) -> bool:
+    return any(place == each or place.startswith(f"{each}.") for each in CHANGEABLE)
 
 
 def _place(key: str) -> str:
