@@ -199,9 +199,11 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
     asked = session.loading.augment
     can = getattr(session.transform, "works_on_batches", False)
     if asked == "device" and not can:
+        has_choice = "colour" in session.config.transform
+        works = "transform.colour=intended" if has_choice else "transform=crm"
         raise InputError(
             f"data.augment=device, but {type(session.transform).__name__} works on single images "
-            "as it is set; choose transform=crm, or data.augment=loader."
+            f"as it is set; choose {works}, or data.augment=loader."
         )
     if asked == "auto":
         return "device" if can and session.fabric.device.type == "cuda" else "loader"

@@ -39,7 +39,7 @@ from rgbt.data.pseudo_labels import (
 )
 from rgbt.engine.confidence import probabilities
 from rgbt.engine.progress import progress
-from rgbt.session import Session, heads_of
+from rgbt.session import Session, decode_ahead, heads_of
 from rgbt.tracking.files import holding, write_atomic
 from rgbt.tracking.tables import Grid, percent
 from rgbt.tracking.terminal import tell
@@ -289,6 +289,7 @@ def _predict(
     """Predict and write the missing images; why others could not be read, by name."""
     if not missing:
         return {}
+    decode_ahead(session, asked.split)
     chosen = _Chosen(session.dataset.name, session.dataset, missing)
     batches = eval_batches(chosen, asked.split, session.transform, session.loading)
     model, fabric = session.model.eval(), session.fabric

@@ -27,7 +27,7 @@ from rgbt.metrics.named import OF_PAIRS
 from rgbt.metrics.names import CA, TC, consistency
 from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
 from rgbt.metrics.scores import class_mean
-from rgbt.session import Session, heads_of, view_of
+from rgbt.session import Session, decode_ahead, heads_of, view_of
 from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
 from rgbt.types import IGNORE, Batch, View
@@ -129,6 +129,7 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.session.evaluate`, and what the sec
         InputError: no sets of views, no second frames, or no image that can be read.
     """
     _check_second_frames(session, frames)
+    decode_ahead(session, split)
     model.eval()
     found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 SPLITS = {
     "train": [f"{n:05d}{'DN'[n % 2]}" for n in range(1, 9)],
@@ -22,6 +26,23 @@ SMALL = (
 )
 Call = Callable[..., tuple[int, str, str]]
 Trained = Callable[..., Path]
+
+
+@contextmanager
+def without_pictures() -> Iterator[None]:
+    """Pictures of runs are empty files: drawing takes as long as the steps of these tests."""
+    from rgbt import training
+    from rgbt.tracking import pair_pictures
+
+    def draw(*things: Any) -> None:
+        things[-1].parent.mkdir(parents=True, exist_ok=True)
+        things[-1].touch()
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("draw_panel", "draw_region_heat", "draw_pairs"):
+            patch.setattr(training, name, draw)
+        patch.setattr(pair_pictures, "draw_pairs", draw)
+        yield
 
 
 def short(steps: int) -> tuple[str, ...]:

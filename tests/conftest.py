@@ -8,17 +8,34 @@ import sys
 # One thread a process: two tests that share two cores otherwise wait for each other's threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from hydra._internal.hydra import Hydra
 
 from rgbt.randomness import numpy_generator
-from tests.commands import SPLITS, Call, Trained, only_run, words_of
+from tests.commands import SPLITS, Call, Trained, only_run, without_pictures, words_of
 
 WriteMFNet = Callable[..., Path]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composed_once() -> Iterator[None]:
+    """Hydra composes what it runs twice, first to see whether it is a grid: only searches are."""
+    ask = Hydra.get_mode
+
+    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+        names_one = any("search" in word or "hydra.mode" in word for word in overrides)
+        return ask(self, config_name, overrides) if names_one else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Hydra, "get_mode", get_mode)
+        yield
 
 
 def pair(name: str, hw: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -80,12 +97,22 @@ def png() -> Callable[[Path, np.ndarray], None]:
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Call:
+def pictures() -> None:
+    """Asked for by a test that looks at the pictures of a run; others go without."""
+
+
+@pytest.fixture
+def call(
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
+) -> Call:
     """Call a command's entry in this process: (exit code, stdout, stderr)."""
+    drawn = "pictures" in request.fixturenames
 
     def run(entry: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["rgbt", *arguments])
-        with pytest.raises(SystemExit) as left:
+        with nullcontext() if drawn else without_pictures(), pytest.raises(SystemExit) as left:
             entry()
         out, err = capfd.readouterr()
         return int(left.value.code or 0), out, err
@@ -112,7 +139,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
             words = ["rgbt", *words_of(data, place / "runs", *overrides)]
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(sys, "argv", words)
-                with pytest.raises(SystemExit) as left:
+                with without_pictures(), pytest.raises(SystemExit) as left:
                     main()
             assert not left.value.code
             made[overrides] = only_run(place / "runs")

@@ -29,7 +29,7 @@ def options(group: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "scale",
-    # Small, all of them are trained elsewhere, or composed as rows of the tables.
+    # Small ones are trained in other tests, or composed as rows of the tables.
     [pytest.param("demo", marks=pytest.mark.slow), "paper"],
 )
 @pytest.mark.parametrize("experiment", options("experiment"))

@@ -5,19 +5,24 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from omegaconf import DictConfig
 
 from rgbt import earlier
+from rgbt import prepared as prepared_module
 from rgbt.checks import InputError
 from rgbt.config import build, check, compose
 from rgbt.data.pseudo_labels import FORMAT
-from rgbt.prepared import prepare, rehearse
+from rgbt.prepared import _where_to_augment, prepare, rehearse
 from rgbt.pseudo import BEGUN, Teacher, write_pseudo_labels
 from rgbt.session import open_session
-from tests.commands import Call, assert_one_sentence
+from rgbt.types import Batch
+from tests.commands import SPLITS, Call, assert_one_sentence, words_of
+from tests.composed import composed as composed_once
 
 SIZES = (
     *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
@@ -225,3 +230,73 @@ def test_another_range_of_thermal_counts_is_another_input(
     with pytest.raises(InputError, match=r"pseudo-labels of another network \("):
         written(other)
     assert written().digest == first.digest
+
+
+# ---- images: decoded ahead, and where they are augmented ------------------------------------
+
+
+@pytest.fixture
+def cached(data: Path, tmp_path: Path) -> DictConfig:
+    """A small network on MFNet, with a cache."""
+    model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
+    place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
+    words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
+    return composed_once((*words, *place))
+
+
+def test_all_that_is_read_is_decoded_before_the_first_step(
+    cached: DictConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a disk that is full, or may not be written, is told before anything is trained."""
+    prepare(cached, rehearsal=True)
+    assert not (tmp_path / "cache").exists(), "a rehearsal leaves nothing behind"
+    prepared = prepare(cached)
+    dataset: Any = prepared.session.dataset
+
+    def refuses(name: str) -> None:
+        raise AssertionError(f"{name} was decoded")
+
+    monkeypatch.setattr(dataset.source, "read", refuses)
+    for split, names in SPLITS.items():
+        assert [dataset.read(name).name for name in names] == names, split
+    one = next(prepared.batches(range(1)))
+    assert isinstance(one, Batch), "no GPU to augment on"
+    monkeypatch.setattr(prepared_module, "_where_to_augment", lambda session: "device")
+    other = next(prepared.batches(range(1)))
+    assert not isinstance(other, Batch)
+    assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
+
+
+def place_of(asked: str, device: str, transform: object, **settings: object) -> str:
+    session: Any = SimpleNamespace(
+        loading=SimpleNamespace(augment=asked),
+        transform=transform,
+        fabric=SimpleNamespace(device=torch.device(device)),
+        config=SimpleNamespace(transform=settings),
+    )
+    return _where_to_augment(session)
+
+
+def test_where_batches_are_augmented() -> None:
+    able, unable = SimpleNamespace(works_on_batches=True), SimpleNamespace(works_on_batches=False)
+    for device, where in (("cpu", "loader"), ("cuda", "device")):
+        assert place_of("auto", device, able) == where
+        assert place_of("auto", device, unable) == "loader"
+        assert place_of("auto", device, object()) == "loader"
+        assert place_of("device", device, able) == "device", "as asked"
+        assert place_of("loader", device, able) == "loader"
+        assert place_of("loader", device, unable) == "loader"
+
+
+def test_a_transform_of_single_images_is_refused_on_the_device() -> None:
+    """With the key that helps: the one value that differs, or another transform."""
+    unable = SimpleNamespace(works_on_batches=False)
+    for settings, key in (
+        ({"colour": "released"}, "transform.colour=intended"),
+        ({}, "transform=crm"),
+    ):
+        sentence = rf"^data\.augment=device, but SimpleNamespace works on .*; choose {key}, or "
+        with pytest.raises(InputError, match=sentence):
+            place_of("device", "cuda", unable, **settings)
+    with pytest.raises(InputError, match="but object works on single images"):
+        place_of("device", "cpu", object())

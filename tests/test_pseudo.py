@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from rgbt import pseudo
 from rgbt.checks import InputError, RunError
 from rgbt.config import check, compose
+from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES
@@ -296,6 +297,22 @@ def test_missing_files_of_a_finished_folder_are_predicted(
     assert not (tmp_path / "out" / "pseudo_labels.json").exists()
     second = written(session, tmp_path / "out")
     assert (second.digest, session.model.calls) == (first.digest, 1)
+
+
+def test_images_come_from_the_cache(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where data.cache asks for one; labels are the same."""
+    expected = written(session, tmp_path / "without")
+    dataset = Decoded(session.dataset, tmp_path / "cache", num_threads=1)
+    found = written(replace(session, dataset=dataset), tmp_path / "with")
+    assert found.digest == expected.digest
+
+    def refuses(name: str) -> None:
+        raise AssertionError(f"{name} was decoded")
+
+    monkeypatch.setattr(dataset.source, "read", refuses)
+    assert [dataset.read(name).name for name in NAMES] == list(NAMES)
 
 
 def test_killed_in_between_it_goes_on(

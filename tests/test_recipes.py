@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,12 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config import conf_dir
+from rgbt.data import kp, pst900
+from rgbt.metrics.counts import Counts
 from rgbt.prepared import _tell_what_is_not_as_published
-from tests.models.golden import compose
+from tests.commands import SMALL, Call, only_run, short
+from tests.composed import composed
+from tests.test_run import ELSEWHERE
 
 FOLDER = conf_dir() / "recipe"
 
@@ -62,7 +67,7 @@ def test_every_recipe_holds_the_crop_of_the_demo_in_images_of_its_data_set() -> 
 
 
 def test_an_experiment_on_another_data_set_takes_its_recipe() -> None:
-    found = compose("+experiment=grbm_pst900", "scale=paper", "dataset.root=unused")
+    found = composed(["+experiment=grbm_pst900", "scale=paper", "dataset.root=unused"])
     assert found.recipe.dataset == found.dataset.name == "pst900"
     assert (found.data.batch_size, found.trainer.max_steps, found.trainer.eval_every) == (
         *(12, 35000, 245),
@@ -70,19 +75,48 @@ def test_an_experiment_on_another_data_set_takes_its_recipe() -> None:
     assert list(found.transform.crop_hw) == [224, 320]
     assert found.transform.sizes[-1] == 1440
     assert (found.transform.max_size, found.masker.patch_size) == (1920, 32)
-    found = compose("+experiment=spatialseg_kp", "scale=paper", "dataset.root=unused")
+    found = composed(["+experiment=spatialseg_kp", "scale=paper", "dataset.root=unused"])
     assert found.recipe.dataset == found.dataset.name == "kp"
     assert (found.data.batch_size, found.masker.patch_size) == (12, 64)
     assert found.loss.spatial.alpha == 2.0
 
 
 def test_a_recipe_is_chosen_against_that_of_an_experiment() -> None:
-    found = compose("+experiment=grbm", "scale=paper", "dataset=kp", "recipe=kp",
-                    "dataset.root=unused")  # fmt: skip
+    found = composed(
+        ["+experiment=grbm", "scale=paper", "dataset=kp", "recipe=kp", "dataset.root=unused"]
+    )
     assert (found.data.batch_size, found.trainer.max_steps) == (12, 35000)
-    found = compose("+experiment=crm_kp", "recipe.demo_steps=3")
+    found = composed(["+experiment=crm_kp", "recipe.demo_steps=3"])
     assert list(found.transform.sizes) == [128, 140, 152, 164, 176, 188]
     assert found.trainer.max_steps == 3
+
+
+QUICK = ("crm_pst900", "spatialseg_kp")
+"""Of the six; the others are like them."""
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in ELSEWHERE],
+)
+def test_an_experiment_on_another_data_set_trains_and_counts(
+    call: Call, tmp_path: Path, experiment: str
+) -> None:
+    from rgbt.run import main
+
+    splits = ("dataset.num_train=3", "dataset.num_val=3", "dataset.num_test=3")
+    place = (f"dataset.cache_dir={tmp_path / 'cache'}", f"runs_dir={tmp_path / 'runs'}")
+    size = ("dataset.height=48", "dataset.width=64", "tracking=none")
+    code, out, err = call(
+        main, f"+experiment={experiment}", *splits, *size, *place, *SMALL, *short(1)
+    )
+    assert code == 0, err
+    counts = Counts.load(only_run(tmp_path / "runs") / "counts_test.npz")
+    assert counts.classes == (kp if experiment.endswith("kp") else pst900).CLASSES
+    assert (counts.night is None) == experiment.endswith("pst900")
+    # Void of KP does not count.
+    assert (counts.counts.sum() < 3 * 48 * 64) == experiment.endswith("kp")
+    assert counts.classes[-1] in out
 
 
 # ---- what is told ---------------------------------------------------------------------------
@@ -100,7 +134,6 @@ class Told:
     tested: str = "best"
     weights: Any = "file"
     parts: tuple[str, ...] = ("backbone",)
-    splits: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def session(self) -> Any:
         splits = {"train": ("t",), "val": self.val, "test": ("x", "y")}

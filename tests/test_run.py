@@ -35,16 +35,21 @@ ROOT = Path(__file__).resolve().parents[1]
 ADAPTATION = ("sh_", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher")
 """Beginnings of experiments on days and nights: `tests/test_adaptation_run.py`."""
 
+METHODS = ("crm", "grbm", "spatialseg")
+ELSEWHERE = [f"{method}_{dataset}" for method in METHODS for dataset in ("kp", "pst900")]
+"""Experiments that are others' on another data set: `tests/test_recipes.py`."""
+
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
 @pytest.mark.parametrize(
-    "experiment", [name for name in EXPERIMENTS if not name.startswith(ADAPTATION)]
+    "experiment",
+    [name for name in EXPERIMENTS if not name.startswith(ADAPTATION) and name not in ELSEWHERE],
 )
 def test_every_experiment_trains_evaluates_and_leaves_its_folder(
     call: Call, data: Path, tmp_path: Path, experiment: str
 ) -> None:
-    unmasked = not experiment.startswith(("crm", "grbm", "spatialseg"))
+    unmasked = not experiment.startswith(METHODS)
     patch = ["masker.patch_size=null"] if unmasked else []
     code, out, err = train(call, data, tmp_path, f"+experiment={experiment}", *patch, *short(2))
     assert code == 0, err
@@ -64,10 +69,13 @@ def test_every_experiment_trains_evaluates_and_leaves_its_folder(
     assert {"loss", "grad_norm", "images_per_s", "wait_share"} <= set(lines[0]["values"])
 
 
+@pytest.mark.usefixtures("pictures")
 def test_a_finished_run_says_so_and_shows_its_tables(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
     first = train(call, data, tmp_path, "+experiment=grbm", *short(1))
+    for picture in ("panel.png", "regions.png"):
+        assert (only_run(tmp_path) / "figures" / picture).stat().st_size > 1000
     again = train(call, data, tmp_path, "+experiment=grbm", *short(1))
     assert again[0] == 0
     assert "is finished" in again[2]
@@ -99,14 +107,14 @@ def command(data: Path, runs: Path, *overrides: str) -> list[str]:
 
 
 def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_path: Path) -> None:
-    overrides = ("+experiment=grbm", *short(12))
+    overrides = ("+experiment=grbm", *short(8))
     process = subprocess.Popen(
         command(data, tmp_path / "killed", *overrides),
         cwd=ROOT,
         stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )
-    wait_for_step(tmp_path / "killed", 5)
+    wait_for_step(tmp_path / "killed", 3)
     process.send_signal(signal.SIGKILL)
     process.wait()
     (folder,) = (path.parent for path in (tmp_path / "killed").glob("*/metrics.jsonl"))
@@ -123,7 +131,7 @@ def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_p
         a, b = (Counts.load(f / f"counts_{split}.npz").counts for f in (resumed, straight))
         assert np.array_equal(a, b)
     steps = [json.loads(line) for line in (resumed / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in steps if line["kind"] == "train"] == list(range(1, 13))
+    assert [line["step"] for line in steps if line["kind"] == "train"] == list(range(1, 9))
 
 
 def wait_for_step(runs: Path, step: int, seconds: float = 120.0) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
+from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.session import heads_of, result_tables, view_of
+from rgbt.session import decode_ahead, heads_of, result_tables, view_of
 
 
 def test_tables_pool_the_image_and_keep_regions_apart() -> None:
@@ -114,3 +117,29 @@ def test_heads_of_images_that_are_in_no_list() -> None:
     alone = asked_session({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
     assert alone.dataset.asked == 0
+
+
+@pytest.mark.parametrize("degraded", [False, True])
+def test_images_of_the_splits_that_are_asked_for_are_decoded_ahead(
+    write_mfnet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, degraded: bool
+) -> None:
+    splits = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
+    dataset = Decoded(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
+    session = SimpleNamespace(dataset=SimpleNamespace(source=dataset) if degraded else dataset)
+    decode_ahead(session, "train", "val")
+    labels = {name: dataset.source.label(name) for name in (*splits["train"], *splits["val"])}
+
+    def refuses(name: str) -> None:
+        raise InputError(f"{name} was decoded")
+
+    monkeypatch.setattr(dataset.source, "read", refuses)
+    for name, label in labels.items():
+        np.testing.assert_array_equal(dataset.read(name).label, label)
+    with pytest.raises(InputError, match="00004N was decoded"):
+        dataset.read("00004N")
+
+
+def test_without_a_cache_nothing_is_decoded_ahead(write_mfnet) -> None:
+    dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
+    (dataset.root / "images" / "00001D.png").unlink()
+    decode_ahead(SimpleNamespace(dataset=dataset), "train")

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from math import cos, radians, sin
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rgbt import two_frames
 from rgbt.checks import InputError
 from rgbt.config import check, compose
 from rgbt.data.next_frames import NextFrames
@@ -79,6 +82,25 @@ def draw(data: Path, maps: list[np.ndarray]) -> None:
         image = np.dstack([np.zeros((*HW, 3), np.uint8), (28 * classes).astype(np.uint8)])
         write_png(data / "images" / f"{name}.png", image)
         write_png(data / "labels" / f"{name}.png", classes.astype(np.uint8))
+
+
+def test_the_split_is_decoded_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before its loader starts; only what can be measured at all is decoded."""
+
+    class Begun(BaseException):
+        pass
+
+    def begin(session: object, *splits: str) -> None:
+        raise Begun(splits)
+
+    monkeypatch.setattr(two_frames, "decode_ahead", begin)
+    sets = SimpleNamespace(sets=())
+    session: Any = SimpleNamespace(consistency=sets)
+    with pytest.raises(InputError, match=r"consistency\.sets is empty"):
+        count_pairs(session, Decoder(), "val", "virtual")
+    sets.sets = ("released_1",)
+    with pytest.raises(Begun, match="'val'"):
+        count_pairs(session, Decoder(), "val", "virtual")
 
 
 # ---- virtual views --------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, check_choice, check_range
 from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
+from rgbt.data.decoded.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
@@ -67,6 +68,7 @@ class LoaderSettings:
         check_range("data.num_workers", self.num_workers, 0, 2**10)
         check_range("data.prefetch", self.prefetch, 1, 2**10)
         check_choice("data.augment", self.augment, ("auto", "loader", "device"))
+        check_cache("data.cache", self.cache)
         check_choice("data.on_error", self.on_error, ("raise", "skip"))
 
 

@@ -81,8 +81,8 @@ class PST900:
             "val" as described above.
 
     Raises:
-        InputError: no such root, neither layout in it, numbers of classes, names and colours
-            differ.
+        InputError: no such root, neither layout in it, a bag that is no whole number, numbers of
+            classes, names and colours differ.
     """
 
     unscored: tuple[str, ...] = ()
@@ -110,6 +110,12 @@ class PST900:
                 "test of PST900."
             )
         check_lengths(num_classes, classes, palette)
+        for bag in val_bags:
+            if not isinstance(bag, int):
+                raise InputError(
+                    f"dataset.val_bags: {bag!r} is no whole number; give numbers of bags, such as "
+                    "[3,7]."
+                )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
 

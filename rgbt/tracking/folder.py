@@ -11,6 +11,7 @@ counts_<split>.npz  integer counts that every score is derived from; counts_<spl
 tables.json         the last region and class tables (`tables.py`)
 figures/*.png       pictures
 evaluations/*.npz   counts of later evaluations (`rgbt.evaluate`) and of pairs of frames
+evaluations/robustness/<split>/  counts of failing images, and what made them (`rgbt.robustness`)
 last.pt best.pt     checkpoints: to continue from, and the best by the selection split
 dataset.json        which images the run was begun on (`rgbt.training`)
 lock mlflow.json    who trains here now; what MLflow has been sent

@@ -41,6 +41,8 @@ FILES = (
     "*.patch",
     "counts_*.npz",
     "evaluations/*.npz",
+    "evaluations/robustness/*/*.npz",
+    "evaluations/robustness/*/*.json",
     "figures/*.png",
 )
 TABLE_FILE = "tables/iou.json"

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return done.stdout
 
 
+@cache
 def _packages() -> dict[str, str]:
     found = {dist.metadata["Name"]: dist.version for dist in metadata.distributions()}
     return {name: found[name] for name in sorted(found, key=str.lower)}

@@ -8,6 +8,7 @@ import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +18,15 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.data.decoded import file as decoded_file
+from rgbt.data.decoded import stamps as decoded_stamps
 from rgbt.data.decoded import store as decoded_store
 from rgbt.data.decoded.__main__ import main
 from rgbt.data.decoded.dataset import Decoded, decoded_dataset, default_folder
 from rgbt.data.mfnet import MFNet
+from rgbt.data.pst900 import PST900
+from rgbt.data.reader import Source
 from rgbt.types import Sample
+from tests.data.pst900_files import TRAIN, write_pst900
 
 NAMES = ("a", "b", "c", "d")
 SIZES = {"a": (4, 6), "b": (5, 7), "c": (4, 6), "d": (3, 3)}
@@ -216,6 +221,52 @@ def test_a_copy_with_other_times_finds_the_cache(case: Case, tmp_path: Path) -> 
     assert set(copy.decoded) == set(), "equal bytes"
 
 
+def settle(path: Path, time: int) -> None:
+    """Give a file a time of change, at another moment than it was changed before."""
+    before = path.stat().st_ctime_ns
+    while path.stat().st_ctime_ns == before:  # the clock of a disk ticks in milliseconds
+        os.utime(path, ns=(time, time))
+
+
+def test_equal_lengths_and_times_are_not_equal_files(case: Case, tmp_path: Path) -> None:
+    """Archives and images of containers keep times; a copy of other content is another data set."""
+    other = Arrays(tmp_path / "other")
+    other.root.mkdir()
+    for name in NAMES:
+        write(other.root, name, seed=int(name == "b"))
+        for root in (case.source.root, other.root):
+            os.utime(root / f"{name}.npy", ns=(5, 5))
+    assert other.fingerprint() == case.source.fingerprint()
+    case.opened()
+    decoded = case.opened(other)
+    assert set(other.decoded) == {"b"}, "equal bytes are not decoded again"
+    check_equal(decoded, other)
+    check_equal(case.opened(), case.source)
+
+
+def test_a_file_that_was_changed_in_place_and_given_its_time_back(case: Case) -> None:
+    path = case.source.root / "b.npy"
+    os.utime(path, ns=(5, 5))
+    case.opened()
+    inode = path.stat().st_ino
+    write(case.source.root, "b", seed=1)
+    settle(path, 5)
+    assert (path.stat().st_ino, path.stat().st_mtime_ns) == (inode, 5)
+    check_equal(case.opened(), case.source)
+
+
+def test_files_that_are_as_they_were_are_not_opened(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case.opened()
+
+    def refuses(path: Path) -> int:
+        raise AssertionError(f"{path} was read")
+
+    monkeypatch.setattr(decoded_stamps, "_crc", refuses)
+    check_equal(case.opened(), case.source)
+
+
 def test_other_lengths_make_another_cache_that_takes_what_is_the_same(
     case: Case, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -250,6 +301,70 @@ def test_other_settings_share_nothing(case: Case) -> None:
     case.opened(other)
     assert set(other.decoded) == set(NAMES)
     assert len(decoded_store.stores_like(case.cache, case.opened()._about())) == 1
+
+
+class Inverted(Arrays):
+    """Another reader of the same files."""
+
+    def read(self, name: str) -> Sample:
+        sample = super().read(name)
+        return replace(sample, thermal=255 - sample.thermal)
+
+
+@pytest.mark.parametrize(("kind", "name"), [(Inverted, "arrays"), (Arrays, "others")])
+def test_readers_share_nothing(case: Case, kind: type[Arrays], name: str) -> None:
+    """Their class and their name tell them apart, where all else is the same."""
+    case.opened()
+    other = kind(case.source.root)
+    other.name = name
+    decoded = case.opened(other)
+    assert set(other.decoded) == set(NAMES)
+    check_equal(decoded, other)
+    assert len(decoded.caches()) == 1
+    assert len(case.files()) == 2
+
+
+def test_another_data_set_is_no_earlier_state(
+    case: Case, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not even one with the same names: images of one folder are never linked to another's."""
+    first = case.opened()
+    other = Arrays(tmp_path / "other")
+    other.root.mkdir()
+    for name in NAMES:
+        np.save(other.root / f"{name}.npy", np.full((2, 2, 5), ord(name), np.uint8))
+    with caplog.at_level(logging.WARNING):
+        decoded = case.opened(other)
+    assert caplog.text == ""
+    check_equal(decoded, other)
+    (mine,), (its,) = decoded.caches(), first.caches()
+    assert [len(list(cache.glob("*.frames"))) for cache in (mine, its)] == [1, 1]
+    assert not {path.name for path in mine.glob("*.frames")} & {
+        path.name for path in case.files() if path.parent == its
+    }
+    decoded_store.remove(mine)
+    again = case.opened()
+    assert case.source.decoded == [], "what others remove is theirs"
+    check_equal(again, case.source)
+
+
+def test_a_data_set_that_moved_keeps_its_cache(case: Case, tmp_path: Path) -> None:
+    """And the states of the folder that it lies in now are its own, by whatever path."""
+    (cache,) = case.opened().caches()
+    case.source.root.rename(tmp_path / "moved")
+    moved = Arrays(tmp_path / "moved")
+    decoded = case.opened(moved)
+    assert moved.decoded == []
+    assert decoded.caches() == [cache]
+    (tmp_path / "link").symlink_to(tmp_path / "moved")
+    np.save(moved.root / "c.npy", np.zeros((2, 2, 5), np.uint8))
+    (changed,) = case.opened(moved).caches()
+    assert changed != cache, "that was begun in another folder"
+    write(moved.root, "c", seed=3)
+    np.save(moved.root / "d.npy", np.zeros((1, 1, 5), np.uint8))
+    linked = case.opened(Arrays(tmp_path / "link"))
+    assert changed in linked.caches()
+    assert len(linked.caches()) == 2
 
 
 def flip(path: Path, offset: int) -> None:
@@ -522,6 +637,56 @@ def test_trouble_of_the_system_is_told_as_well(case: Case) -> None:
     check_equal(decoded, case.source, ("a", "c", "d"))
 
 
+OTHER_IMAGES = {
+    "half a label": (lambda s: replace(s, label=s.label[:2]), r"label must be .* \(2, 7\)"),
+    "a wide label": (lambda s: replace(s, label=s.label.astype(np.int64)), "label must .* int64"),
+    "counts": (lambda s: replace(s, thermal=s.thermal.astype(np.uint16)), "thermal must .* uint16"),
+    "channels": (lambda s: replace(s, thermal=s.rgb), r"thermal must be .* \(5, 7, 3\)"),
+    "grey": (lambda s: replace(s, rgb=s.rgb[..., 0]), r"rgb must be .* \(5, 7, 3\), .* \(5, 7\)"),
+    "floats": (lambda s: replace(s, rgb=s.rgb / np.float32(255)), "rgb must be .* float32"),
+}
+
+
+@pytest.mark.parametrize("change", OTHER_IMAGES)
+def test_what_it_cannot_hold_is_refused_and_moves_nothing_else(case: Case, change: str) -> None:
+    """Readers of one's own may make other arrays; frames after them must stay where they are."""
+    changed, sentence = OTHER_IMAGES[change]
+
+    class Own(Arrays):
+        def read(self, name: str) -> Sample:
+            sample = super().read(name)
+            return changed(sample) if name == "b" else sample
+
+    source = Own(case.source.root)
+    decoded = case.opened(source)
+    with pytest.raises(InputError, match=rf"^'b': {sentence}.* \(data\.cache=null\)\.$"):
+        decoded.read("b")
+    check_equal(decoded, source, ("a", "c", "d"))
+    check_equal(case.opened(source), source, ("a", "c", "d"))
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_names_without_files_are_left_out_as_without_a_cache(tmp_path: Path, begun: bool) -> None:
+    """data.on_error=skip: PST900 refuses a name of both parts, and says so for its files too."""
+    before = PST900(str(write_pst900(tmp_path / "data")))
+    if begun:  # the frame is in the cache that the next one begins with
+        Decoded(before, tmp_path / "cache", num_threads=1).ensure(before.names("train"))
+    source = PST900(str(write_pst900(tmp_path / "data", (), (TRAIN[0],))))
+    decoded = Decoded(source, tmp_path / "cache", num_threads=2)
+    names = source.names("train")
+    decoded.ensure(names)
+    found: list[dict[str, str]] = []
+    for dataset in (source, decoded):
+        skipped: dict[str, str] = {}
+        reader = Source(dataset, names, None, skip_errors=True)  # type: ignore[arg-type]
+        read = [reader.read(name, skipped) for name in names]
+        assert [sample.name for sample in read if sample] == [n for n in names if n != TRAIN[0]]
+        found.append(skipped)
+    assert list(found[0]) == [TRAIN[0]]
+    assert found[0] == found[1]
+    check_equal(decoded, source, tuple(name for name in names if name != TRAIN[0]))
+
+
 def test_nothing_can_be_decoded(case: Case) -> None:
     for name in NAMES:
         (case.source.root / f"{name}.npy").unlink()
@@ -590,6 +755,8 @@ def test_the_command(
     assert list(case.cache.iterdir()) == []
     with pytest.raises(InputError, match="remove: 'maybe' is not a choice"):
         main({**arguments, "remove": "maybe"}, [])
+    with pytest.raises(InputError, match=r"^cache: 'null' names no folder; expected auto or a"):
+        main({**arguments, "cache": "null"}, [])
 
 
 def test_real_pairs_bit_for_bit(tmp_path: Path) -> None:

@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
+from rgbt.data import loaders
 from rgbt.data.batches import collate
 from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
+from rgbt.data.reader import Loaded
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
 
@@ -267,6 +269,63 @@ def test_settings_are_checked() -> None:
         settings(num_workers=-1)
     with pytest.raises(InputError, match="data.on_error: 'skpi'.*did you mean 'skip'"):
         settings(on_error="skpi")
+
+
+@pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
+def test_words_that_name_no_cache(cache: object) -> None:
+    """They would be folders where the command was typed."""
+    sentence = rf"^data\.cache: {cache!r} names no folder; expected auto or a folder \(\./NAME .*"
+    with pytest.raises(InputError, match=sentence):
+        settings(cache=cache)
+    for known in (None, "auto", "./none", "/fast/disk"):
+        assert settings(cache=known).cache == known
+
+
+@pytest.mark.parametrize(
+    ("workers", "ahead", "gpu"), [(0, None, True), (2, 5, True), (2, 5, False)]
+)
+def test_what_the_loader_is_asked_for(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
+) -> None:
+    """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""
+    asked: dict[str, object] = {}
+
+    def loader(reader: object, **words: object) -> list[object]:
+        asked.update(words)
+        return []
+
+    monkeypatch.setattr(loaders, "DataLoader", loader)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    changed = settings(num_workers=workers, prefetch=5)
+    assert list(eval_batches(dataset, "val", crm(), changed)) == []
+    assert (asked["num_workers"], asked["prefetch_factor"]) == (workers, ahead)
+    assert asked["pin_memory"] is gpu
+
+
+@pytest.mark.parametrize("augment", ["loader", "device"])
+def test_all_of_a_batch_is_pinned(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, augment: str
+) -> None:
+    """What waits for its augmentation as well; pages are locked on machines with a GPU alone."""
+    locked: dict[int, torch.Tensor] = {}
+
+    def lock(tensor: torch.Tensor) -> torch.Tensor:
+        copy = tensor.clone()
+        locked[id(copy)] = copy
+        return copy
+
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lock)
+    batch = next(train_batches(dataset, "train", crm(), settings(augment=augment), 0, range(1)))
+    pinned = Loaded(batch, {"x": "why"}).pin_memory()
+    assert pinned.skipped == {"x": "why"}
+    assert isinstance(pinned.batch, type(batch))
+    values = {each.name: getattr(pinned.batch, each.name) for each in dataclasses.fields(batch)}
+    tensors = {name for name, value in values.items() if isinstance(value, torch.Tensor)}
+    assert {"rgb", "thermal", "label", "original_hw"} < tensors
+    assert {name for name, value in values.items() if id(value) in locked} == tensors
+    assert_equal(batch.to("cpu"), pinned.batch.to("cpu"))
+    empty = Loaded(error="why")
+    assert empty.pin_memory() is empty
 
 
 def test_collate_stacks_in_order(dataset: MFNet) -> None:

@@ -402,6 +402,53 @@ def test_done_it_checks_again(
     assert (out / "images" / "00001D.png").read_bytes() == content
 
 
+def write_stored(path: Path, value: int) -> None:
+    """A label of one class whose length does not depend on it: PNG without compression."""
+    label = np.full((6, 8), value, np.uint8)
+    assert cv2.imwrite(str(path), label, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+
+
+def test_a_repaired_download_is_copied_again(mfnet: Path, tmp_path: Path) -> None:
+    """Its files may be as long as they were; those that are the same are left alone."""
+    label, out = mfnet / "labels" / "00002N.png", tmp_path / "out"
+    write_stored(label, 1)
+    assert call("mfnet", mfnet, out) == 0
+    before, length = state(out), label.stat().st_size
+    write_stored(label, 2)
+    assert label.stat().st_size == length
+    assert call("mfnet", mfnet, out) == 0
+    assert (MFNet(str(out)).label("00002N") == 2).all()
+    after = state(out)
+    assert {path for path in before if before[path] != after[path]} == {"labels/00002N.png"}
+    write_stored(out / "labels" / "00002N.png", 3)
+    assert call("mfnet", mfnet, out) == 0
+    assert (out / "labels" / "00002N.png").read_bytes() == label.read_bytes()
+
+
+def test_files_that_the_download_does_not_hold(tmp_path: Path) -> None:
+    """A reader that lists folders would take them for images of the split."""
+    source, out = pst900_files.write_pst900(tmp_path / "in"), tmp_path / "out"
+    assert call("pst900", source, out) == 0
+    (out / "train" / "rgb" / ".DS_Store").touch()
+    (out / "notes.txt").write_text("mine")
+    assert call("pst900", source, out) == 0
+    lost = pst900_files.TRAIN[0]
+    for kind in ("rgb", "thermal", "labels"):
+        (source / "train" / kind / f"{lost}.png").unlink()
+    before = state(out)
+    with pytest.raises(
+        InputError,
+        match=rf"^out: 3 files lie in .*out that the download does not hold, the first is .*"
+        rf"train/labels/{lost}\.png; remove them, or name another folder\.$",
+    ):
+        call("pst900", source, out)
+    assert state(out) == before
+    for kind in ("rgb", "thermal", "labels"):
+        (out / "train" / kind / f"{lost}.png").unlink()
+    assert call("pst900", source, out) == 0
+    assert lost not in PST900(str(out)).names("train")
+
+
 def test_what_is_wrong_with_the_download_is_told(
     mfnet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,7 @@ from rich.progress import Progress, TaskID
 from rgbt.checks import check_choice
 from rgbt.command import built, plain_command
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded.dataset import Decoded, decoded_dataset
+from rgbt.data.decoded.dataset import Decoded, check_cache, decoded_dataset
 from rgbt.data.decoded.store import Told, gigabytes, remove, size_of
 
 
@@ -42,10 +42,11 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """Decode every split of a data set into a cache and show its size, or remove it.
 
     cache      auto, or the folder where caches lie
-    remove     true: remove the cache, and those of earlier states of the data set
+    remove     true: remove the cache, and those of earlier states of the same folder
     overrides  such as dataset=mfnet dataset.root=/data/MFNet
     """
     check_choice("remove", arguments["remove"], ("true", "false"))
+    check_cache("cache", arguments["cache"])
     source: LabelledDataset = built("dataset", overrides)
     dataset = decoded_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
     assert isinstance(dataset, Decoded)

@@ -28,6 +28,8 @@ from rgbt.data.dataset import LabelledDataset
 from rgbt.data.decoded.file import bytes_of, crc_of
 from rgbt.data.decoded.stamps import is_fresh, stamp_of
 from rgbt.data.decoded.store import (
+    FINGERPRINT,
+    ROOT,
     Fresh,
     Placed,
     Store,
@@ -39,8 +41,11 @@ from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 """Part of the key; rises when the files are laid out otherwise."""
+
+NO_FOLDERS = ("", "none", "null", "true", "false", "yes", "no", "on", "off")
+"""What people type who do not mean a folder."""
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -50,6 +55,25 @@ def _silent(what: str, done: int, total: int) -> None:
 def default_folder() -> Path:
     """$XDG_CACHE_HOME/rgbt/decoded, or ~/.cache/rgbt/decoded where that is not set."""
     return default_cache() / "decoded"
+
+
+def check_cache(key: str, cache: object) -> None:
+    """Refuse words that would name a folder by mistake: "" is the current one.
+
+    Args:
+        key: of the configuration, for the message.
+        cache: as `decoded_dataset` takes it.
+
+    Raises:
+        InputError: no text, an empty one, or a word for nothing such as "none".
+    """
+    if cache is None:
+        return
+    if not isinstance(cache, str) or cache.strip().lower() in NO_FOLDERS:
+        raise InputError(
+            f"{key}: {cache!r} names no folder; expected auto or a folder (./NAME where it is "
+            f"called so), or leave {key} away."
+        )
 
 
 def decoded_dataset(
@@ -76,7 +100,8 @@ class Decoded:
     are kept, and a CRC-32 of their bytes: where only the time differs the bytes are compared, so
     that a copy of the data set elsewhere finds the same cache. When files are changed so that the
     fingerprint is another one, the new cache takes the frames that are the same from the old one;
-    the old one stays until somebody removes it.
+    the old one stays until somebody removes it. An old one is known by the folder of the data set:
+    other data sets of the same name are nobody's earlier state.
 
     Args:
         dataset: what is decoded; its samples must not carry confidences.
@@ -180,7 +205,7 @@ class Decoded:
         return self.source.fingerprint()
 
     def caches(self) -> list[Path]:
-        """Caches of this data set in `folder`, those of its earlier states too."""
+        """Caches in `folder` of this data set, those of earlier states of its folder too."""
         return stores_like(self.folder, self._about())
 
     def _about(self) -> dict[str, Any]:
@@ -190,7 +215,8 @@ class Decoded:
             "name": self.name,
             "class": f"{kind.__module__}.{kind.__qualname__}",
             "decoding": self.source.decoding(),
-            "fingerprint": self.source.fingerprint(),
+            FINGERPRINT: self.source.fingerprint(),
+            ROOT: str(Path(self.root).resolve()),
         }
         # As it comes back from a file: tuples are lists there.
         return dict(json.loads(json.dumps(about)))
@@ -286,5 +312,7 @@ def _check_kept(sample: Sample) -> None:
 
 
 def _store_name(about: dict[str, Any]) -> str:
-    key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+    # Equal copies are one cache, wherever they lie.
+    same = {key: value for key, value in about.items() if key != ROOT}
+    key = hashlib.sha256(json.dumps(same, sort_keys=True).encode()).hexdigest()[:16]
     return f"{re.sub(r'[^A-Za-z0-9_-]', '_', about['name'])}-{key}"

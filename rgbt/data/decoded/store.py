@@ -1,6 +1,6 @@
 """A folder of decoded frames: which are there, which are whole, and adding others.
 
-    about.json          what it was decoded from: class, decoding, fingerprint
+    about.json          what it was decoded from: class, decoding, fingerprint; and its folder then
     NNNN-XXXXXXXX.frames   `rgbt.data.decoded.file`; of a frame in several of them, the last counts
     verified.json       file -> length and time of change when its checksums were last compared, and
                         the frames that were damaged then
@@ -32,6 +32,9 @@ from rgbt.types import Sample
 LOG = logging.getLogger(__name__)
 
 ABOUT, VERIFIED, LOCK, FRAMES = "about.json", "verified.json", "lock", "*.frames"
+FINGERPRINT, ROOT = "fingerprint", "root"
+"""Entries of about.json: the state of a data set, and where it lay when the store was begun."""
+
 FILE_BYTES = 256 * 2**20
 """A file is closed when it holds this much: what a killed build loses, seconds of decoding."""
 
@@ -200,17 +203,19 @@ def gigabytes(num_bytes: int) -> str:
 
 
 def stores_like(folder: Path, about: dict[str, Any]) -> list[Path]:
-    """Stores in `folder` that were decoded in the same way from any state of the same data set.
+    """Stores in `folder` that were decoded in the same way from the same data set.
+
+    That is from equal files anywhere, or from any files that lay in the same place.
 
     Args:
         folder: holds stores.
-        about: of the store that others are compared with; "fingerprint" does not count.
+        about: of the store that others are compared with.
     """
-    wanted = {key: value for key, value in about.items() if key != "fingerprint"}
     found = []
     for path in sorted(folder.glob(f"*/{ABOUT}")):
         other = _read_json(path)
-        if all(other.get(key) == value for key, value in wanted.items()):
+        differing = [key for key, value in about.items() if other.get(key) != value]
+        if differing in ([], [FINGERPRINT], [ROOT]):
             found.append(path.parent)
     return found
 
