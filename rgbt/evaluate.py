@@ -77,6 +77,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     tables = result_tables(counts, session.regions, label, stored.step)
     heads = session.domains.told(head or session.domains.tested_head)
     places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
+    if found.skipped:
+        places.append(("left out", f"{len(found.skipped)} images that cannot be read"))
     show(result_view(tables, path.parent, places))
     return 0
 

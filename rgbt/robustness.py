@@ -67,9 +67,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         folder = Path(arguments["out"] or stored.folder / FOLDER / _place(stored, arguments))
         measured = measure(stored.session, arguments["split"], chosen, folder)
         grid = robustness_grid(measured, _title(stored, arguments["split"]))
-        _write_tables(measured, grid, folder)
+        # A table of some failures does not take the place of that of all.
+        some = [] if arguments["degradations"] == OWN["degradations"] else chosen
+        stem = "_".join(["robustness", *(each.row for each in some)])
+        _write_tables(measured, grid, folder / stem)
         show(rich_table(grid))
-        show(place_lines([("counts", f"{folder}/ (robustness.md, robustness.csv)")]))
+        show(place_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
     return 0
 
 
@@ -169,7 +172,8 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
     return Grid(title, header, tuple(lines))
 
 
-def _write_tables(measured: Sequence[Measured], grid: Grid, folder: Path) -> None:
+def _write_tables(measured: Sequence[Measured], grid: Grid, place: Path) -> None:
+    """The numbers and the table in `place` with .csv and .md."""
     from rgbt.tracking.files import write_atomic
 
     stream = io.StringIO()
@@ -182,8 +186,9 @@ def _write_tables(measured: Sequence[Measured], grid: Grid, folder: Path) -> Non
         writer.writerow(
             (asked.row, asked.title, asked.unit, f"{asked.severity:g}", asked.view, *values)
         )
-    write_atomic(folder / "robustness.csv", stream.getvalue().encode())
-    write_atomic(folder / "robustness.md", grid.to_markdown().encode())
+    # Names hold dots of severities: endings are added, not exchanged.
+    write_atomic(place.with_name(f"{place.name}.csv"), stream.getvalue().encode())
+    write_atomic(place.with_name(f"{place.name}.md"), grid.to_markdown().encode())
 
 
 if __name__ == "__main__":

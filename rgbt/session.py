@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import os
 from collections.abc import Collection
@@ -167,6 +169,17 @@ def decode_ahead(session: Session, *splits: str) -> None:
                 display[0].update(tasks[what], completed=done)
 
             dataset.ensure(names, advance)
+
+
+def names_key(session: Session) -> str:
+    """SHA-256 in hexadecimal over the names of the training splits and of the test split.
+
+    Raises:
+        InputError: a split is missing.
+    """
+    domains = (domain.split for domain in session.domains.named.values())
+    lists = {split: session.dataset.names(split) for split in (*domains, "test")}
+    return hashlib.sha256(json.dumps(lists).encode()).hexdigest()
 
 
 def view_of(session: Session, modality: str = "default") -> View:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.identity import run_key, weights_file
 from rgbt.metrics.counts import Counts
-from rgbt.session import Session, open_session
+from rgbt.session import Session, names_key, open_session
 from rgbt.tracking.folder import find_run
+from rgbt.tracking.terminal import tell
 
 CHECKPOINTS = ("best", "last")
 GROUPS = ("dataset", "metric", "consistency")
@@ -115,6 +117,7 @@ def open_run(
     for key, value in _plain(defaults.data).items():
         if key not in config.data:
             config.data[key] = value
+    trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
     check(config)
@@ -131,8 +134,29 @@ def open_run(
                 "can map them with label_map=..."
             )
     restore_weights(session.model, payload["model"], weights)
+    _tell_other_splits(folder, trained_on, session)
     step = payload["step"] if checkpoint == "best" else payload["state"]["step"]
     return Stored(session, step, folder / "evaluations", config.name)
+
+
+def _tell_other_splits(folder: Path, trained_on: str | None, session: Session) -> None:
+    """Say so where the data set that a run was trained on is divided otherwise by now.
+
+    Lists that were changed, or shares that are drawn anew as files come and go: images of the
+    training may be among those that are measured.
+    """
+    marker = folder / "dataset.json"
+    if trained_on is None or session.config.dataset.get("name") != trained_on:
+        return
+    try:
+        now, begun = names_key(session), json.loads(marker.read_text())["names"]
+    except (InputError, OSError, ValueError, KeyError):
+        return  # nothing to compare with
+    if now != begun:
+        tell(
+            f"the splits of {session.dataset.name} ({session.dataset.root}) are not those that "
+            f"{folder.name} was trained with: what is measured now may hold images of its training."
+        )
 
 
 def _plain(node: DictConfig) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import textwrap
 import time
@@ -31,6 +30,7 @@ from rgbt.session import (
     Session,
     evaluate,
     legend_of,
+    names_key,
     panel_names,
     result_tables,
     view_of,
@@ -194,10 +194,7 @@ class Run:
         """Write what identifies the run; refuse a folder that was begun on other images."""
         marker = self.folder.path / "dataset.json"
         dataset = session.dataset
-        splits = (*self.prepared.splits().values(), "test")
-        lists = {split: dataset.names(split) for split in splits}
-        names_key = hashlib.sha256(json.dumps(lists).encode()).hexdigest()
-        found = {"names": names_key, "files": dataset.fingerprint()}
+        found = {"names": names_key(session), "files": dataset.fingerprint()}
         begun = json.loads(marker.read_text()) if marker.exists() else found
         if begun["names"] != found["names"]:
             raise InputError(

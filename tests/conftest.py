@@ -139,7 +139,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
             words = ["rgbt", *words_of(data, place / "runs", *overrides)]
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(sys, "argv", words)
-                with without_pictures(), pytest.raises(SystemExit) as left:
+                with pytest.raises(SystemExit) as left:
                     main()
             assert not left.value.code
             made[overrides] = only_run(place / "runs")

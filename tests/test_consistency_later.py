@@ -41,6 +41,7 @@ def plain(trained: Trained, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("pictures")
 def test_a_run_measures_its_best_checkpoint_and_draws_it(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

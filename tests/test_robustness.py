@@ -302,12 +302,12 @@ def test_the_command_measures_a_run_as_evaluate_does(
     assert "noise, RGB" in out
     assert f"counts  {place}/" in out
     assert {path.name for path in place.iterdir()} == {
-        *("robustness.md", "robustness.csv"),
+        *("robustness_noise_rgb.md", "robustness_noise_rgb.csv"),
         *(f"{mark}.{end}" for mark in MARKS for end in ("npz", "json")),
     }
     counts = {path.stem: Counts.load(path).counts for path in place.glob("*.npz")}
     np.testing.assert_array_equal(counts["clean"], Counts.load(folder / "counts_test.npz").counts)
-    with (place / "robustness.csv").open() as file:
+    with (place / "robustness_noise_rgb.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert [line["severity"] for line in lines] == ["0", "1", "1", "16", "64"]
     # The same by the other command.

@@ -771,3 +771,8 @@ def test_real_pairs_bit_for_bit(tmp_path: Path) -> None:
     check_equal(decoded, source, names)
     packed = cv2.imread(str(root / "images" / f"{names[0]}.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(decoded.read(names[0]).rgb, packed[..., 2::-1])
+
+
+def test_the_command_refuses_what_it_does_not_heed(case: Case) -> None:
+    with pytest.raises(InputError, match=r"'data\.cache' has no effect here; .*cache=FOLDER"):
+        main({"cache": str(case.cache), "remove": "false"}, ["dataset=synth", "data.cache=/x"])

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from rgbt.checks import check_choice
+from rgbt.checks import InputError, check_choice
 from rgbt.command import built, plain_command
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.decoded.dataset import Decoded, check_cache, decoded_dataset
@@ -47,6 +47,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     check_choice("remove", arguments["remove"], ("true", "false"))
     check_cache("cache", arguments["cache"])
+    for word in overrides:
+        key = word.lstrip("+").partition("=")[0]
+        if key.partition(".")[0] != "dataset" and key != "hydra.searchpath":
+            raise InputError(
+                f"'{key}' has no effect here; give dataset=... and its settings, cache=FOLDER for "
+                "where the cache lies, or remove=true."
+            )
     source: LabelledDataset = built("dataset", overrides)
     dataset = decoded_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
     assert isinstance(dataset, Decoded)
