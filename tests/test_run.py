@@ -219,7 +219,7 @@ def label_of_nine(data: Path) -> str:
 
 def other_size(data: Path) -> str:
     assert cv2.imwrite(str(data / "labels" / "00003N.png"), np.zeros((24, 32), np.uint8))
-    return "the image is 48x64 pixels but its label is 24x32"
+    return "RGB is 48x64 pixels but its label is 24x32"
 
 
 def three_channels(data: Path) -> str:
@@ -357,7 +357,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
         (f"run={folder}", "split=tset"): "no split 'tset'",
         (f"run={folder}", "checkpoint=first"): "'first' is not a choice",
         (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
-        (f"run={folder}", "data.batch=1"): "did you mean 'data.batch_size'?",
+        (f"run={folder}", "data.batch_siz=1"): "did you mean 'data.batch_size'?",
         (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",
         (f"run={folder}", "model=mask2former_swin_t"): "'model' cannot be changed",
         (f"run={folder}", "data.eval_batch_size=[1"): "cannot be read as a value",

@@ -63,7 +63,8 @@ def test_the_ordinary_reader_reads_it(data: KP) -> None:
 
 
 def test_files_hold_the_scenes(data: KP) -> None:
-    for name in (data.names("train_day")[0], data.names("test_night")[-1]):
+    tints = []
+    for name in (*data.names("train_day"), *data.names("test_night")):
         scene = render_scene(0, int(name[-5:]), FACTORS)
         sample = data.read(name)
         assert scene.is_night == data.nights((name,))[0]
@@ -71,7 +72,11 @@ def test_files_hold_the_scenes(data: KP) -> None:
         assert np.array_equal(sample.label, np.where(ids == 19, 255, ids))
         # JPEG loses a few grey levels, of colours more than of grey.
         assert np.abs(sample.thermal.astype(int) - scene.thermal).mean() < 3
+        means, stored = (image.mean((0, 1)) for image in (scene.rgb, sample.rgb))
+        assert np.abs(means - stored).max() < 1
+        tints.append(abs(means[0] - means[2]))
         assert np.abs(sample.rgb.astype(int) - scene.rgb).mean() < 12
+    assert max(tints) > 3, "red and blue are told apart"
 
 
 def test_the_files_are_of_the_kind_that_kp_has(data: KP) -> None:
