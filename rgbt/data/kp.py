@@ -129,9 +129,13 @@ class KP:
     def has(self, split: str) -> bool:
         """Whether anything of `split` is there; InputError where the split is unknown."""
         self._check_split(split)
-        if self.lists == "files":
-            return bool(self._sources(split))
-        return bool(self._with_labels(split))
+        if self.lists != "files":
+            return bool(self._with_labels(split))
+        sources = self._sources(split)
+        if len(sources) != 1 or sources == (split,):
+            return bool(sources)
+        # A part of a list that holds days or nights alone may be empty.
+        return any(self._is_of_time(name, split) for name in self._read_list(sources[0]))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in the order of its list, or sorted.
@@ -248,13 +252,17 @@ class KP:
             return (base,)
         return parts if all(map(is_there, parts)) else ()
 
+    @staticmethod
+    def _is_of_time(name: str, split: str) -> bool:
+        return is_night(name) == split.endswith("_night")
+
     def _of_lists(self, split: str) -> tuple[str, ...]:
         sources = self._sources(split) or (split,)
         names = [name for source in sources for name in self._read_list(source)]
         if len(sources) > 1:
             return tuple(sorted(names))
         if sources != (split,):
-            names = [name for name in names if is_night(name) == split.endswith("_night")]
+            names = [name for name in names if self._is_of_time(name, split)]
         if not names:
             raise InputError(
                 f"split '{split}' of {self.name} is empty: there is no such image in "

@@ -286,7 +286,8 @@ def _check_alike(drawn: Sequence[Drawn]) -> None:
             raise InputError(
                 f"all images of one batch must have one size, got {one[0]}x{one[1]} "
                 f"('{first.name}') and {other[0]}x{other[1]} ('{each.name}'); choose "
-                "transform.crop_hw so that it fits into every resized image."
+                "transform.crop_hw so that it fits into every resized image, or the sizes for this "
+                "data set (recipe=kp, ...)."
             )
         if (first.confidence is None) != (each.confidence is None):
             raise InputError(

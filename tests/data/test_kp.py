@@ -154,6 +154,16 @@ def test_times_of_day_out_of_one_list(root: Path) -> None:
         dataset.names("val_night")
 
 
+def test_a_list_of_days_alone(root: Path) -> None:
+    """There are no nights then, and nothing that walks the splits stumbles over them."""
+    for split, name in (("train", TRAIN[0]), ("val", VAL[0]), ("test", TEST[0])):
+        (root / f"{split}.txt").write_text(f"{name}\n")
+    data = KP(str(root))
+    assert [data.has(f"{split}_night") for split in ("train", "val", "test")] == [False] * 3
+    assert data.has("val_day")
+    assert len(data.fingerprint()) == 64
+
+
 def test_a_split_out_of_its_times_of_day(tmp_path: Path) -> None:
     root = write_kp(tmp_path)
     write_lists(root, {"test_day": TEST[1::-1], "test_night": TEST[2:], "train_day": TRAIN[:1]}, "")
