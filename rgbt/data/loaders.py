@@ -32,8 +32,8 @@ from rgbt.types import Batch, Loadable
 LOG = logging.getLogger(__name__)
 
 CROP_ADVICE = (
-    "; choose transform.crop_hw so that it fits into every resized image, or the sizes for this data "
-    "set (recipe=kp, ...)"
+    "; choose transform.crop_hw so that it fits into every resized image, or the sizes for this "
+    "data set (recipe=kp, ...)"
 )
 EVAL_ADVICE = "; set data.eval_batch_size=1"
 
