@@ -386,6 +386,7 @@ def test_a_checkpoint_of_another_model_is_refused(
     assert_one_sentence(err, "does not fit this network")
 
 
+@pytest.mark.slow
 def test_multirun_finishes_the_other_points_when_one_is_wrong(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

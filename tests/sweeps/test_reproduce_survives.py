@@ -78,6 +78,7 @@ def table_of(runs: Path) -> str:
     return file.read_text()
 
 
+@pytest.mark.slow
 def test_killed_and_called_again_loses_nothing_and_runs_nothing_twice(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
