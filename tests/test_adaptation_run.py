@@ -35,7 +35,7 @@ SMALL = (
     *("scale.batch_size=2", "scale.eval_batch_size=4", "scale.critic_width=4", "tracking=none"),
     *("trainer.accelerator=cpu", "trainer.threads=1", "trainer.log_every=1"),
 )
-QUICK = ("multi_head_night", "heatnet")
+QUICK = ("multi_head_night",)
 """Two kinds; the others are like one of them, or run below, and are slow."""
 
 
@@ -213,6 +213,7 @@ def test_one_head_for_all_as_the_thesis_scripts(
     assert not np.array_equal(counts[2:], Counts.load(own / "counts_test.npz").counts[2:])
 
 
+@pytest.mark.slow
 def test_thermal_images_are_predicted_by_the_targets_head(
     run: Runs, evaluated: Callable[..., Counts], tmp_path: Path
 ) -> None:
@@ -260,6 +261,7 @@ def heads_line(said: str) -> list[str]:
         ("sh_source", None),
     ],
 )
+@pytest.mark.slow
 def test_which_head_predicted_what_is_said(
     run: Runs, call: Call, tmp_path: Path, experiment: str, own: str | None
 ) -> None:

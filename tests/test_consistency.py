@@ -108,6 +108,7 @@ def test_measuring_afterwards_gives_the_same_counts(call: Call, folder: Path) ->
         )
 
 
+@pytest.mark.slow
 def test_a_run_that_measured_nothing_is_the_same_run(
     call: Call, trained: Trained, folder: Path, tmp_path: Path
 ) -> None:
@@ -145,6 +146,7 @@ def test_a_run_of_before_there_was_any_consistency(
     assert np.array_equal(mine.counts, theirs.counts)
 
 
+@pytest.mark.slow
 def test_views_of_ones_own_have_a_file_of_their_own(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
@@ -198,6 +200,7 @@ def test_a_finished_run_that_is_asked_for_consistency_says_where_to_get_it(
     assert "TC aligned" in out or "rgbt.consistency" in err
 
 
+@pytest.mark.slow
 def test_split_checkpoint_and_place_have_their_own_files(
     call: Call, folder: Path, tmp_path: Path
 ) -> None:

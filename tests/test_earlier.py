@@ -499,6 +499,7 @@ def test_other_labels_lie_in_another_folder(typed: list[str], name: str) -> None
 # ---- the file that the first of the stages starts from ---------------------------------------
 
 
+@pytest.mark.slow
 def test_pretrained_weights_reach_the_first_stage(tmp_path: Path) -> None:
     """And count by what is in them in its key, and in the keys of all that stand on it."""
 

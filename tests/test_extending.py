@@ -100,6 +100,7 @@ class Aside:
 
 
 @pytest.mark.parametrize("hw", [(48, 64), (48, 48)], ids=["3:4", "square"])
+@pytest.mark.slow
 def test_a_second_frame_of_ones_own_is_trained_on(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hw: tuple[int, int]
 ) -> None:

@@ -71,6 +71,7 @@ def test_the_number_of_workers_does_not_count(run: Any) -> None:
     "experiment",
     ["temporal_con", pytest.param("temporal_con_released", marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_interrupted_and_continued_equals_uninterrupted(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str
 ) -> None:
@@ -182,6 +183,7 @@ def test_rows_of_the_tables_are_overrides(
     assert set(step) == {"loss", *(f"loss/{part}" for part in PARTS[row] | both)}
 
 
+@pytest.mark.slow
 def test_what_is_measured_is_no_part_of_the_key_but_how_it_is_trained_is() -> None:
     def key(*overrides: str) -> str:
         return run_key(compose(["+experiment=temporal_con", *overrides]))

@@ -80,6 +80,7 @@ def test_weights_are_scored_without_a_run(
     assert len(list((tmp_path / "out").glob("*_overlay.png"))) == len(stored.names)
 
 
+@pytest.mark.slow
 def test_another_way_of_feeding_is_said(
     call: Call, data: Path, trained: Trained, tmp_path: Path
 ) -> None:

@@ -106,9 +106,7 @@ def all_outputs(
     return found
 
 
-@pytest.mark.parametrize(
-    ("name", "size"), recorded(r"crm_swin_([tsb]).*", fast=["crm_swin_t"])
-)
+@pytest.mark.parametrize(("name", "size"), recorded(r"crm_swin_([tsb]).*", fast=["crm_swin_t"]))
 def test_every_recorded_tensor(name: str, size: str) -> None:
     golden = load(name)
     classes = golden.classes("network.sem_seg_head.predictor.class_embed.bias") - 1

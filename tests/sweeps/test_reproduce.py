@@ -152,6 +152,7 @@ def test_a_table_that_cannot_be_run_shows_what_is_printed(
     assert (place / "runs/tables/spatialseg/fps_demo/table.md").exists()
 
 
+@pytest.mark.slow
 def test_a_table_of_sizes_runs_nothing_and_has_values(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
