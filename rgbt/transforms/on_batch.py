@@ -7,9 +7,9 @@ pixels with whole numbers, so that neither the batch, the number of workers nor 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,11 +18,33 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.transforms.hsv import to_hsv, to_rgb
-from rgbt.transforms.joint import Taps, View
+from rgbt.transforms.joint import Indices, Taps, View
 from rgbt.transforms.photometric import LEVELS, Colours, scale_and_truncate
 from rgbt.types import IGNORE, Batch, Sample
 
 Pixels = NDArray[np.uint8]
+
+
+class Axis(NamedTuple):
+    """What is read of one axis of an original, counted from the first place that is.
+
+    Attributes:
+        span: all places of the original from the first to the last that is read.
+        taps: (3, n) int64, first and second place of every pixel, and weight (see `Taps`).
+        nearest: (n,) int64, place of every pixel of the label.
+    """
+
+    span: slice
+    taps: Indices
+    nearest: Indices
+
+    @classmethod
+    def of(cls, taps: Taps, nearest: Indices) -> Axis:
+        """From places in the original."""
+        start = int(min(taps.first.min(), nearest.min()))
+        stop = int(max(taps.second.max(), nearest.max())) + 1
+        relative = np.stack([taps.first - start, taps.second - start, taps.weight])
+        return cls(slice(start, stop), relative, nearest - start)
 
 
 @dataclass(frozen=True)
@@ -37,7 +59,8 @@ class Drawn:
         thermal: (H', W') uint8, the same part.
         label: (H', W') uint8, the same part.
         confidence: (H', W') float32, or None.
-        corner_yx: first row and column of that part in the original.
+        rows: which rows of the original are read, and how.
+        columns: likewise.
         view: resize, crop and flip, of the original.
         colours: colour changes.
     """
@@ -47,17 +70,17 @@ class Drawn:
     thermal: Pixels
     label: Pixels
     confidence: NDArray[np.float32] | None
-    corner_yx: tuple[int, int]
+    rows: Axis
+    columns: Axis
     view: View
     colours: Colours
 
     @classmethod
     def of(cls, sample: Sample, view: View, colours: Colours) -> Drawn:
         """Cut out what is read; no label: all pixels are ignored."""
-        rows, columns = (
-            _span(taps, nearest) for taps, nearest in zip(view.taps(), _nearest(view), strict=True)
-        )
-        part = (rows, columns)
+        taps = view.taps()
+        rows, columns = Axis.of(taps[0], view.rows()), Axis.of(taps[1], view.columns())
+        part = (rows.span, columns.span)
         return cls(
             name=sample.name,
             rgb=sample.rgb[part],
@@ -66,7 +89,8 @@ class Drawn:
             if sample.label is None
             else sample.label[part],
             confidence=None if sample.confidence is None else sample.confidence[part],
-            corner_yx=(rows.start, columns.start),
+            rows=rows,
+            columns=columns,
             view=view,
             colours=colours,
         )
@@ -124,23 +148,20 @@ class DrawnBatch:
         _check_alike(drawn)
         hw = tuple(max(each.label.shape[axis] for each in drawn) for axis in (0, 1))
         confidences = [each.confidence for each in drawn if each.confidence is not None]
-        taps = [_relative(each) for each in drawn]
-        nearest = [_nearest(each.view) for each in drawn]
-        corners = np.array([each.corner_yx for each in drawn])
         return cls(
             name=tuple(each.name for each in drawn),
             rgb=_padded([each.rgb for each in drawn], hw),
             thermal=_padded([each.thermal for each in drawn], hw),
             label=_padded([each.label for each in drawn], hw),
             confidence=_padded(confidences, hw) if confidences else None,
-            rows=torch.from_numpy(np.stack([np.stack(rows) for rows, _ in taps])),
-            columns=torch.from_numpy(np.stack([np.stack(columns) for _, columns in taps])),
-            nearest_rows=torch.from_numpy(np.stack([rows for rows, _ in nearest]) - corners[:, :1]),
-            nearest_columns=torch.from_numpy(
-                np.stack([columns for _, columns in nearest]) - corners[:, 1:]
+            rows=_stacked(each.rows.taps for each in drawn),
+            columns=_stacked(each.columns.taps for each in drawn),
+            nearest_rows=_stacked(each.rows.nearest for each in drawn),
+            nearest_columns=_stacked(each.columns.nearest for each in drawn),
+            corner_yx=torch.tensor(
+                [[each.rows.span.start, each.columns.span.start] for each in drawn]
             ),
-            corner_yx=torch.from_numpy(corners),
-            tables=torch.from_numpy(np.stack([_tables(each.colours) for each in drawn])),
+            tables=_stacked(_tables(each.colours) for each in drawn),
             hue=torch.tensor([each.colours.hue or 0 for each in drawn]),
             saturated=_places(each.colours.saturation is not None for each in drawn),
             turned=_places(each.colours.hue is not None for each in drawn),
@@ -229,26 +250,6 @@ def _at(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return image.flatten(1).gather(1, index.flatten(1)).view(index.shape)
 
 
-def _nearest(view: View) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    return view.rows(), view.columns()
-
-
-def _span(taps: Taps, nearest: NDArray[np.int64]) -> slice:
-    """From the first to the last place that is read of an axis."""
-    return slice(
-        int(min(taps.first.min(), nearest.min())), int(max(taps.second.max(), nearest.max())) + 1
-    )
-
-
-def _relative(drawn: Drawn) -> tuple[Taps, Taps]:
-    """Taps from the corner of the part."""
-    rows, columns = (
-        Taps(taps.first - corner, taps.second - corner, taps.weight)
-        for taps, corner in zip(drawn.view.taps(), drawn.corner_yx, strict=True)
-    )
-    return rows, columns
-
-
 def _tables(colours: Colours) -> NDArray[np.uint8]:
     """(4, 256) uint8, see `DrawnBatch.tables`."""
     before = after = LEVELS
@@ -263,6 +264,10 @@ def _tables(colours: Colours) -> NDArray[np.uint8]:
     if colours.saturation is not None:
         saturation = scale_and_truncate(LEVELS, colours.saturation)
     return np.stack([each.ravel() for each in (before, saturation, after, colours.thermal(LEVELS))])
+
+
+def _stacked(arrays: Iterable[NDArray[Any]]) -> Tensor:
+    return torch.from_numpy(np.stack(list(arrays)))
 
 
 def _padded(parts: Sequence[NDArray[Any]], hw: tuple[int, ...]) -> Tensor:
