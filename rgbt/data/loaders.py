@@ -6,7 +6,10 @@ decide who decodes them. Batches are not padded: networks pad images and losses 
 
 from __future__ import annotations
 
+import errno
 import logging
+import multiprocessing
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +18,7 @@ from typing import Any, Literal, TypeVar, cast
 import torch
 from torch.utils.data import DataLoader
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import InputError, RunError, check_choice, check_range
 from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
 from rgbt.data.decoded.dataset import check_cache
 from rgbt.data.reader import (
@@ -24,6 +27,7 @@ from rgbt.data.reader import (
     Loaded,
     Source,
     TrainExamples,
+    no_shared_memory,
     start_worker,
 )
 from rgbt.randomness import numpy_generator
@@ -36,6 +40,10 @@ CROP_ADVICE = (
     "data set (recipe=kp, ...)"
 )
 EVAL_ADVICE = "; set data.eval_batch_size=1"
+
+DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
+
+LOCKS_PER_WORKER = 16
 
 Kind = TypeVar("Kind", bound=Loadable)
 
@@ -103,22 +111,36 @@ class Batches(Iterator[Kind]):
             # Without one of its own, the loader draws a seed for its workers from the global one.
             generator=torch.Generator(),
         )
-        self._loaded = cast(Iterator[Loaded], iter(loader))
+        self._loaded = cast(Iterator[Loaded], _started(loader, settings.num_workers))
 
     def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
 
         Raises:
-            InputError: a file cannot be read (on_error="raise"), or sizes differ within the batch.
+            InputError: a file cannot be read (on_error="raise"), sizes differ within the batch, or
+                there is no shared memory left.
+            RunError: a worker process died.
         """
         while True:
-            loaded = next(self._loaded)
+            loaded = self._wait()
             self._report(loaded.skipped)
             if loaded.error:
                 self.close()
                 raise InputError(loaded.error)
             if loaded.batch is not None:
                 return cast(Kind, loaded.batch)
+
+    def _wait(self) -> Loaded:
+        try:
+            return next(self._loaded)
+        except RuntimeError as error:
+            if not DEAD_WORKER.search(str(error)):
+                raise
+            raise RunError(
+                f"A loader process died ({str(error).splitlines()[0].rstrip('. ')}), most often "
+                "because memory ran out. Lower data.num_workers, data.prefetch or "
+                "data.batch_size, and rerun the command to resume."
+            ) from error
 
     def close(self) -> None:
         """Stop the worker processes; nothing comes after it."""
@@ -131,6 +153,23 @@ class Batches(Iterator[Kind]):
             if name not in self.skipped:
                 LOG.warning("skipped '%s': %s", name, reason)
         self.skipped.update(skipped)
+
+
+def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
+    """The loader's iterator, which starts its worker processes.
+
+    Raises:
+        InputError: the system refuses them what they need.
+    """
+    try:
+        # A loader that fails half-way prints a traceback of its own; these locks, a few more than
+        # it makes, fail before it.
+        _ = [multiprocessing.Lock() for _ in range(LOCKS_PER_WORKER * num_workers)]
+        return iter(loader)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise InputError(no_shared_memory(error.strerror)) from error
 
 
 def train_batches(

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
+from torch.utils.data import get_worker_info
 
 from rgbt.checks import InputError
 from rgbt.data.batches import Dataset, Example, Transform
@@ -115,7 +116,7 @@ class Loaded:
 
     def pin_memory(self) -> Loaded:
         """Called by the loader's own thread, so that copies to the device need not wait."""
-        return self if self.batch is None else replace(self, batch=_pinned(self.batch))
+        return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
 
 
 class BatchReader(TorchDataset[Loaded]):
@@ -137,6 +138,8 @@ class BatchReader(TorchDataset[Loaded]):
             found = [self.make_example(key, skipped) for key in keys]
             examples = [example for example in found if example is not None]
             batch = self.stack(examples) if examples else None
+            if batch is not None and get_worker_info() is not None:
+                batch = _each(batch, _shared)
         except InputError as error:
             return Loaded(skipped=skipped, error=str(error))
         return Loaded(batch, skipped)
@@ -148,10 +151,37 @@ def start_worker(_: int) -> None:
     cv2.setNumThreads(0)
 
 
-def _pinned(batch: Any) -> Any:
-    pinned: dict[str, Any] = {}
-    for each in fields(batch):
-        value = getattr(batch, each.name)
-        if isinstance(value, Tensor):
-            pinned[each.name] = value.pin_memory()
-    return replace(batch, **pinned)
+def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """`batch`, a dataclass, with `change` applied to each of its tensors."""
+    values = {each.name: getattr(batch, each.name) for each in fields(batch)}
+    tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+    return replace(batch, **{name: change(value) for name, value in tensors.items()})
+
+
+def _pinned(tensor: Tensor) -> Tensor:
+    return tensor.pin_memory()
+
+
+def _shared(tensor: Tensor) -> Tensor:
+    """`tensor` in memory that the main process can read.
+
+    The worker's queue would move it there as well, but in a thread whose error nobody sees: the
+    main process would wait for ever.
+    """
+    try:
+        return tensor.share_memory_()
+    except RuntimeError as error:
+        raise InputError(no_shared_memory(str(error).splitlines()[0])) from error
+
+
+def no_shared_memory(reason: str) -> str:
+    """The sentence about shared memory that loader processes do not get.
+
+    Args:
+        reason: what the system reported.
+    """
+    return (
+        f"The loader processes cannot get shared memory in /dev/shm ({reason}). Enlarge it "
+        "(docker run --shm-size=8g, or mount -o remount,size=8g /dev/shm), or load in the main "
+        "process with data.num_workers=0."
+    )

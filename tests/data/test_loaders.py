@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import logging
 import multiprocessing
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, RunError
 from rgbt.data import loaders
 from rgbt.data.batches import collate
 from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
@@ -360,6 +363,45 @@ def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
     message = f"those of '{NAMES[1]}' do and those of '{NAMES[0]}' do not"
     with pytest.raises(InputError, match=message):
         batch(None, 0.75)
+
+
+def test_full_shared_memory_is_reported_and_does_not_hang(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: torch.Tensor) -> torch.Tensor:
+        raise RuntimeError("unable to allocate shared memory(shm): No space left on device (28)")
+
+    monkeypatch.setattr(torch.Tensor, "share_memory_", refuse)  # inherited by the workers
+    batches = train_batches(dataset, "train", crm(), settings(num_workers=2), 0, range(2))
+    with pytest.raises(InputError, match=r"/dev/shm .*No space left.*--shm-size.*num_workers=0"):
+        next(batches)
+
+
+def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(loaders.multiprocessing, "Lock", refuse)
+    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0"):
+        train_batches(dataset, "train", crm(), settings(num_workers=2), 0, range(2))
+
+
+def test_a_killed_worker_is_reported_in_one_sentence(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = os.getpid()
+
+    def die(_: str) -> Sample:
+        assert os.getpid() != main, "only a worker is to die"
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError("a killed process does nothing more")
+
+    monkeypatch.setattr(dataset, "read", die)
+    batches = train_batches(dataset, "train", crm(), settings(num_workers=1), 0, range(2))
+    with pytest.raises(RunError, match=r"loader process died .*memory.*data\.num_workers"):
+        next(batches)
 
 
 @pytest.mark.gpu
