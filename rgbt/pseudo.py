@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -248,7 +249,7 @@ def _alone(out: Path) -> Iterator[None]:
             yield from _tidied(out)
             return
     tell(f"{out} is being written by {holder}; waiting for it.")
-    with holding(out / LOCK, wait=True):
+    with holding(out / LOCK, wait_s=math.inf):
         yield from _tidied(out)
 
 

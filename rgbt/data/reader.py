@@ -169,9 +169,10 @@ def _shared(tensor: Tensor) -> Tensor:
     main process would wait for ever.
     """
     try:
-        return tensor.share_memory_()
+        tensor.share_memory_()  # type: ignore[no-untyped-call]
     except RuntimeError as error:
         raise InputError(no_shared_memory(str(error).splitlines()[0])) from error
+    return tensor
 
 
 def no_shared_memory(reason: str) -> str:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+POLL_S = 0.1
+"""Seconds between two attempts to take a lock."""
 
 _held: set[int] = set()
 """Descriptors of locks of this process; loader workers forked from it must not keep them."""
@@ -31,14 +35,14 @@ def write_atomic(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def holding(path: Path, *, wait: bool = False) -> Iterator[str | None]:
+def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
     """Hold an exclusive lock on the file `path`, which is made if needed and never removed.
 
     The operating system frees the lock when this process ends, however it ends.
 
     Args:
         path: the lock's file; it says in words who holds it.
-        wait: wait for the lock instead of reporting who holds it.
+        wait_s: seconds to wait for a lock that another process holds, >= 0; `math.inf` for ever.
 
     Yields:
         None while the lock is held by us; otherwise who holds it ("process 12 on host").
@@ -46,7 +50,7 @@ def holding(path: Path, *, wait: bool = False) -> Iterator[str | None]:
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     _held.add(descriptor)
     try:
-        holder = _try_lock(descriptor, wait=wait)
+        holder = _lock(descriptor, time.monotonic() + wait_s)
         yield holder
     finally:
         _held.discard(descriptor)
@@ -66,12 +70,18 @@ def is_held(path: Path) -> bool:
     return False
 
 
-def _try_lock(descriptor: int, *, wait: bool) -> str | None:
-    """None if the lock is ours now, else who holds it."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        return os.pread(descriptor, 200, 0).decode() or "another process"
+def _lock(descriptor: int, deadline: float) -> str | None:
+    """None once the lock is ours; who holds it where it is not until `deadline`."""
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            # Polled: a wait inside flock has no limit, and a stopped process never lets go.
+            if time.monotonic() >= deadline:
+                return os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
+            time.sleep(POLL_S)
+        else:
+            break
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
     return None

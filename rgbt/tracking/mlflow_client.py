@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +27,12 @@ ENVIRONMENT = {
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
 """Set before the first import of mlflow, unless the user set them."""
+
+LOCK_WAIT_S = 60.0
+"""Seconds to wait for another process: several that create the tables take seconds each."""
+
+QUIET_WAIT_S = 15.0
+"""Of these, seconds without a word."""
 
 EXPERIMENT_NOTE = """\
 One run per configuration and seed. **mIoU**, **Var**, **region/...**, **class/...** are of the last
@@ -77,6 +84,28 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
     return Store(client, str(found.experiment_id))
 
 
+class StoreBusyError(Exception):
+    """Another process holds a lock of the store, or of a run's way to it, for too long."""
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock `path` of a store or of a run's way to it.
+
+    Raises:
+        StoreBusyError: another process holds it for `LOCK_WAIT_S`; a stopped one would for ever.
+    """
+    with holding(path, wait_s=QUIET_WAIT_S) as holder:
+        if holder is None:
+            yield
+            return
+    sys.stderr.write(f"rgbt: waiting for {holder}, which holds {path} (up to {LOCK_WAIT_S:g} s).\n")
+    with holding(path, wait_s=LOCK_WAIT_S - QUIET_WAIT_S) as holder:
+        if holder is not None:
+            raise StoreBusyError(f"{holder} has held {path} for {LOCK_WAIT_S:g} s")
+        yield
+
+
 @contextmanager
 def _alone(uri: str) -> Iterator[None]:
     """One process at a time: two that create the tables of one SQLite file together break it."""
@@ -85,7 +114,7 @@ def _alone(uri: str) -> Iterator[None]:
         return
     database = Path(uri.removeprefix("sqlite:///"))
     database.parent.mkdir(parents=True, exist_ok=True)
-    with holding(database.with_name(f".{database.name}.lock"), wait=True):
+    with locked(database.with_name(f".{database.name}.lock")):
         yield
 
 

@@ -13,23 +13,21 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import MetricLine, RunFolder
 from rgbt.tracking.mlflow_client import Store
+from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
 from rgbt.tracking.tables import ResultTables, result_grids
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 
 PARAM_LENGTH = 500
 """Characters of a parameter's value that are sent; MLflow's pages show far fewer."""
-
-NAME_LENGTH = 250
-"""Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
 
 BATCH_LENGTH = 1000
 """Metrics in one call, MLflow's limit."""
@@ -77,9 +75,23 @@ class Sent:
 
 
 def read_sent(folder: RunFolder) -> Sent | None:
-    """What was sent from this folder, or None if nothing ever was."""
+    """What was sent from this folder, or None if nothing ever was.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
     path = folder.path / "mlflow.json"
-    return Sent(**json.loads(path.read_text())) if path.exists() else None
+    if not path.exists():
+        return None
+    try:
+        return TypeAdapter(Sent).validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise InputError(
+            f"{path} is damaged ({error.errors()[0]['msg']}). Remove it: the MLflow run is then "
+            "found by its key."
+        ) from error
 
 
 def write_sent(folder: RunFolder, sent: Sent) -> None:
@@ -122,34 +134,13 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
 
 def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], str, str]:
     """Its parameters' names, status and name; the run is made if the store does not know it."""
-    from mlflow.exceptions import MlflowException
-
-    if sent.run_id:
-        try:
-            run = store.client.get_run(sent.run_id)
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
-                raise
-        else:
-            # A run deleted in the pages takes nothing more; a folder that goes on gets a new one.
-            if run.info.lifecycle_stage == "active":
-                return set(run.data.params), str(run.info.status), str(run.info.run_name)
-    description = folder.description()
-    assert description is not None, f"{folder.path}: describe() comes before fill()"
-    run_name = short_name(description.name)
-    run = store.client.create_run(
-        store.experiment_id, start_time=_start_time(folder), run_name=run_name
-    )
-    sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
-    sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
-    # Written at once: a crash after this line must not leave a second run behind.
-    write_sent(folder, sent)
-    return set(), str(run.info.status), run_name
-
-
-def short_name(name: str) -> str:
-    """A run's name as MLflow takes it; the whole one stays in the folder."""
-    return name if len(name) <= NAME_LENGTH else f"{name[: NAME_LENGTH - 4]} ..."
+    run = noted_run(store, sent.run_id)
+    if run is None:
+        run = unnoted_run(store, folder) or new_run(store, folder)
+        sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
+        sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
+        write_sent(folder, sent)
+    return set(run.data.params), str(run.info.status), str(run.info.run_name)
 
 
 def _send(store: Store, sent: Sent, entities: tuple[list[Any], list[Any], list[Any]]) -> None:
@@ -252,9 +243,9 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
         "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
         "rgbt.command": first.get("command", ""),
         "mlflow.source.git.commit": first.get("git_commit") or "",
-        "rgbt.folder": str(folder.path),
         "rgbt.dataset": (folder.result() or {}).get("dataset", ""),
         **({} if description is None else description.tags),
+        **identity(folder),
     }
     if tables is not None:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
@@ -316,13 +307,6 @@ def _send_files(store: Store, folder: RunFolder, sent: Sent) -> None:
             parent = None if place.parent == Path() else str(place.parent)
             store.client.log_artifact(sent.run_id, str(path), parent)
             sent.files[str(place)] = digest
-
-
-def _start_time(folder: RunFolder) -> int:
-    """Milliseconds since 1970 at which the first process of the run began."""
-    first = (folder.provenance() or [{}])[0].get("started")
-    seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
-    return round(1000 * seconds)
 
 
 def _end_time(folder: RunFolder) -> int:

@@ -6,17 +6,18 @@ The run folder is the truth. What MLflow could not take while a run trained is s
 
 from __future__ import annotations
 
-import shutil
+import shlex
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from rgbt.tracking.files import holding
+from rgbt.checks import InputError
 from rgbt.tracking.folder import Description, RunFolder
-from rgbt.tracking.mlflow_client import Store, open_store
+from rgbt.tracking.mlflow_client import Store, locked, open_store
 from rgbt.tracking.mlflow_fill import Sent, Status, fill, read_sent, write_sent
+from rgbt.tracking.mlflow_server import pages_of, python_command
 from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
 from rgbt.tracking.provenance import without_passwords
 
@@ -25,8 +26,6 @@ Link = tuple[str, str]
 
 PAUSE_S = 300.0
 """Seconds a running training leaves a store alone after it failed."""
-
-UI_ADDRESS = "http://127.0.0.1:5000"
 
 
 class Tracking(Protocol):
@@ -128,19 +127,18 @@ class MlflowTracking:
         self._guarded(status)
 
     def links(self) -> list[Link]:
-        """The command that opens the pages, then the addresses of this run and of the charts."""
+        """Addresses of this run and of the charts, after the command where no server runs."""
         assert self._folder is not None, "start() comes before links()"
         sent = self._sent(self._folder)
         if not sent.run_id:
             return [("MLflow later", sync_command(self._folder))]
-        is_server = self.uri.startswith(("http://", "https://"))
-        base = self.uri.rstrip("/") if is_server else UI_ADDRESS
+        shown = pages_of(self.uri, sent.run_id)
         pages = [
-            ("this run", base + run_path(sent.experiment_id, sent.run_id)),
-            ("compare runs", base + view_path(sent.experiment_id, RUNS_VIEW)),
-            ("over seeds", base + view_path(sent.experiment_id, GROUPS_VIEW)),
+            ("this run", shown.address + run_path(sent.experiment_id, sent.run_id)),
+            ("compare runs", shown.address + view_path(sent.experiment_id, RUNS_VIEW)),
+            ("over seeds", shown.address + view_path(sent.experiment_id, GROUPS_VIEW)),
         ]
-        return pages if is_server else [("open MLflow", ui_command(self.uri)), *pages]
+        return pages if shown.command is None else [("open MLflow", shown.command), *pages]
 
     def sync(self, folder: RunFolder, status: Status) -> str:
         """Bring this store up to date with `folder`; the id of the MLflow run.
@@ -149,7 +147,7 @@ class MlflowTracking:
         """
         store = self.store()
         # A training and a sync by hand may meet in one folder.
-        with holding(folder.path / "mlflow.lock", wait=True):
+        with locked(folder.path / "mlflow.lock"):
             sent = self._sent(folder)
             fill(store, folder, sent, status)
         return sent.run_id
@@ -163,7 +161,12 @@ class MlflowTracking:
     def _sent(self, folder: RunFolder) -> Sent:
         """What this store has of the run; nothing if the folder was sent to another one."""
         fresh = Sent(without_passwords(self.uri), self.experiment, self.artifact_uri)
-        sent = read_sent(folder)
+        try:
+            sent = read_sent(folder)
+        except InputError as error:
+            # Repaired by the next write: `fill` finds the run by its key and sends everything.
+            sys.stderr.write(f"rgbt: {error}\n")
+            return fresh
         same = sent is not None and (sent.uri, sent.experiment) == (fresh.uri, fresh.experiment)
         return sent if sent is not None and same else fresh
 
@@ -183,7 +186,7 @@ class MlflowTracking:
         reason = (str(error).splitlines() or [""])[0][:120]
         sys.stderr.write(
             f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
-            f"({type(error).__name__}: {without_passwords(reason)}); the run goes on, and "
+            f"({type(error).__name__}: {without_passwords(reason)}). The run continues; "
             f"`{sync_command(self._folder)}` sends it later.\n"
         )
 
@@ -199,17 +202,4 @@ def described(run_name: str, tags: Mapping[str, str], params: Mapping[str, objec
 
 def sync_command(folder: RunFolder) -> str:
     """The command that sends a run folder to its store."""
-    return f"{_python()} -m rgbt.tracking.sync run={folder.path}"
-
-
-def ui_command(uri: str) -> str:
-    """The command that opens MLflow's pages on a database; one worker is enough for one person."""
-    return f"{_python()} -m mlflow ui --workers 1 --backend-store-uri {without_passwords(uri)}"
-
-
-def _python() -> str:
-    """How this interpreter is called from here: `make` uses one that is not on the path."""
-    if shutil.which("python") == sys.executable:
-        return "python"
-    here, program = Path.cwd(), Path(sys.executable)
-    return str(program.relative_to(here) if program.is_relative_to(here) else program)
+    return f"{python_command()} -m rgbt.tracking.sync {shlex.quote(f'run={folder.path}')}"

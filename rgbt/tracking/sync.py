@@ -13,7 +13,8 @@ from pathlib import Path
 from rgbt.checks import InputError, nearest
 from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_fill import Status, read_sent
-from rgbt.tracking.mlflow_store import MlflowTracking, ui_command
+from rgbt.tracking.mlflow_server import ui_command
+from rgbt.tracking.mlflow_store import MlflowTracking
 
 KEYS = ("run", "runs_dir", "uri", "artifact_uri", "experiment")
 EXPERIMENT = "rgbt"

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rgbt.tracking.mlflow_store import UI_ADDRESS, Link, MlflowTracking, Tracking, ui_command
+from rgbt.tracking.mlflow_server import pages_of
+from rgbt.tracking.mlflow_store import Link, MlflowTracking, Tracking
 from rgbt.tracking.mlflow_view import run_path
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.terminal import tell
@@ -70,10 +71,9 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
             f"{without_passwords(reason)}); the same command sends it later."
         )
         return []
-    is_server = tracking.uri.startswith(("http://", "https://"))
-    base = tracking.uri.rstrip("/") if is_server else UI_ADDRESS
-    page = (f"{kind} in MLflow", without_passwords(base) + run_path(store.experiment_id, run_id))
-    return [page] if is_server else [("open MLflow", ui_command(tracking.uri)), page]
+    shown = pages_of(tracking.uri, run_id)
+    page = (f"{kind} in MLflow", shown.address + run_path(store.experiment_id, run_id))
+    return [page] if shown.command is None else [("open MLflow", shown.command), page]
 
 
 def _run(store: Store, name: str) -> str:
@@ -81,8 +81,9 @@ def _run(store: Store, name: str) -> str:
     found = _oldest(store, name)
     if found is not None:
         return found
-    made = str(store.client.create_run(store.experiment_id, run_name=name).info.run_id)
-    store.client.set_tag(made, RECORD, name)
+    # Tagged in the same call: a run that nothing finds would stay as running for ever.
+    tags = {RECORD: name}
+    made = store.client.create_run(store.experiment_id, run_name=name, tags=tags).info.run_id
     # Another driver of the same table may have ended at this moment: both keep the older run.
     kept = _oldest(store, name) or made
     if kept != made:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,8 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config import build, check_node
-from rgbt.tracking import sync
+from rgbt.tracking import mlflow_client, sync
+from rgbt.tracking.files import holding
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import artifact_table, read_sent, shown, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
@@ -25,7 +27,7 @@ from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
 DEAD = "http://127.0.0.1:9"
-TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}
+TAGS = {"rgbt.group": "grbm", "rgbt.seed": "0"}
 PARAMS = {"seed": 0, "masker.sigma_div": 2, "long": "x" * 900}
 TABLES = ResultTables(
     split="test",
@@ -138,12 +140,54 @@ def test_sending_lines_again_after_a_crash_leaves_no_duplicate(runs_dir: Path) -
     assert read_sent(folder) == sent
 
 
+def unnoted(runs_dir: Path, name: str) -> RunFolder:
+    """A folder whose MLflow run was made by a process that was killed before it noted the id."""
+    folder = RunFolder(runs_dir / name)
+    folder.add_provenance({"started": "2026-01-02T00:00:00+00:00"})
+    begin(folder, tracking(runs_dir))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["unnoted", 'it\'s \\ "unnoted"'])
+@pytest.mark.parametrize("content", [None, "", "{}", "[1]", '{"uri": 3', "\0"])
+def test_a_run_whose_id_was_not_noted_is_found_by_its_key(
+    runs_dir: Path,
+    name: str,
+    content: str | None,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = unnoted(runs_dir, f"{name} {content!r}".replace("/", ""))
+    first = run_id(folder)
+    sent = folder.path / "mlflow.json"
+    sent.unlink() if content is None else sent.write_text(content)
+    again = tracking(runs_dir)
+    begin(folder, again)
+    conclude(folder)
+    again.finish("FINISHED")
+    assert run_id(folder) == first
+    assert client(runs_dir).get_run(first).info.status == "FINISHED"
+    said = capsys.readouterr().err
+    assert said.count("is damaged") == (0 if content is None else 1)
+    assert "Traceback" not in said
+
+
+def test_a_run_trained_anew_under_the_same_key_is_another_mlflow_run(runs_dir: Path) -> None:
+    folder = unnoted(runs_dir, "anew")
+    first = run_id(folder)
+    (folder.path / "mlflow.json").unlink()
+    (folder.path / "provenance.json").unlink()
+    folder.add_provenance({"started": "2026-01-03T00:00:00+00:00"})
+    begin(folder, tracking(runs_dir))
+    assert run_id(folder) != first
+
+
 def test_the_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None:
     run = client(runs_dir).get_run(run_id(finished))
     assert run.info.status == "FINISHED"
     assert run.info.run_name == "grbm seed=0"
     assert run.info.start_time == 1767225600000
     assert TAGS.items() <= run.data.tags.items()
+    assert run.data.tags["rgbt.key"] == finished.path.name
     assert run.data.params["masker.sigma_div"] == "2"
     assert len(run.data.params["long"]) == 500
     assert "class/car" not in run.data.metrics, "a score that does not exist is not drawn"
@@ -241,12 +285,32 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     assert client(runs_dir).get_run(sent.run_id).info.status == "KILLED"
 
 
+def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
+    folder, tracker = RunFolder(tmp_path / "waits"), tracking(tmp_path)
+    with holding(tmp_path / ".mlflow.db.lock"):
+        begin(folder, tracker)
+        tracker.finish("FINISHED")
+    said = capsys.readouterr().err
+    assert said.count("waiting for process") == 2, "at the start and at the end"
+    assert said.count("cannot be used") == 1
+    assert re.search(
+        r"StoreBusyError: process \d+ on .* has held .*mlflow\.db\.lock for 0.3 s", said
+    )
+    assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
+    assert sync.main([f"run={folder.path}"]) == 0
+    assert run_id(folder)
+
+
 def test_links_open_the_pages(runs_dir: Path) -> None:
     tracker = tracking(runs_dir)
     begin(RunFolder(runs_dir / "links"), tracker)
     links = dict(tracker.links())
     assert links["open MLflow"].endswith(f"sqlite:///{runs_dir / 'mlflow.db'}")
-    assert links["compare runs"].startswith("http://127.0.0.1:5000/#/experiments/1/runs?")
+    assert links["compare runs"].startswith("http://127.0.0.1:50")
     assert "viewStateShareKey=rgbt-runs" in links["compare runs"]
 
 

@@ -72,11 +72,11 @@ def test_two_that_make_the_run_at_once_keep_the_older(place: Path, table_file: P
         def __getattr__(self, name: str) -> Any:
             return getattr(store.client, name)
 
-        def create_run(self, experiment: str, run_name: str) -> Any:
-            other = store.client.create_run(experiment, run_name=run_name, start_time=1)
-            store.client.set_tag(other.info.run_id, "rgbt.record", run_name)
+        def create_run(self, experiment: str, **words: Any) -> Any:
+            assert words["tags"] == {"rgbt.record": words["run_name"]}
+            other = store.client.create_run(experiment, start_time=1, **words)
             made.append(other.info.run_id)
-            return store.client.create_run(experiment, run_name=run_name)
+            return store.client.create_run(experiment, **words)
 
     tracking._store = type(store)(Client(), store.experiment_id)
     links = sent(tracking, table_file, name="own/raced demo")

@@ -1,0 +1,73 @@
+"""Which MLflow run belongs to a run folder: the noted one, an unnoted one, or a new one."""
+
+from __future__ import annotations
+
+import time
+from datetime import datetime
+from typing import Any
+
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.mlflow_client import Store
+
+NAME_LENGTH = 250
+"""Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
+
+
+def noted_run(store: Store, run_id: str) -> Any:
+    """The run that ``mlflow.json`` names; None where the store does not have it any more.
+
+    A run that was deleted in the pages takes nothing more; its folder gets a new one.
+    """
+    from mlflow.exceptions import MlflowException
+
+    if not run_id:
+        return None
+    try:
+        run = store.client.get_run(run_id)
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        return None
+    return run if run.info.lifecycle_stage == "active" else None
+
+
+def unnoted_run(store: Store, folder: RunFolder) -> Any:
+    """A run made for this folder by a process that was killed before it noted the run's id.
+
+    Without this look it would stay in the pages as running for ever. The time of the first start
+    keeps runs apart that are trained anew under one key.
+    """
+    started = f"attributes.start_time = {_start_time(folder)}"
+    # Compared here: MLflow's search cannot quote every path.
+    runs = store.client.search_runs([store.experiment_id], started)
+    same = [run for run in runs if identity(folder).items() <= run.data.tags.items()]
+    return same[0] if same else None
+
+
+def new_run(store: Store, folder: RunFolder) -> Any:
+    """A run made for this folder, found again by `unnoted_run`."""
+    description = folder.description()
+    assert description is not None, f"{folder.path}: describe() comes before fill()"
+    return store.client.create_run(
+        store.experiment_id,
+        start_time=_start_time(folder),
+        tags=identity(folder),
+        run_name=short_name(description.name),
+    )
+
+
+def identity(folder: RunFolder) -> dict[str, str]:
+    """Tags by which a run is found again, set in the call that makes it."""
+    return {"rgbt.key": folder.path.name, "rgbt.folder": str(folder.path)}
+
+
+def short_name(name: str) -> str:
+    """A run's name as MLflow takes it; the whole one stays in the folder."""
+    return name if len(name) <= NAME_LENGTH else f"{name[: NAME_LENGTH - 4]} ..."
+
+
+def _start_time(folder: RunFolder) -> int:
+    """Milliseconds since 1970 at which the first process of the run began."""
+    first = (folder.provenance() or [{}])[0].get("started")
+    seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
+    return round(1000 * seconds)
