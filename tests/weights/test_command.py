@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from rgbt.weights.__main__ import main
 from tests.models.golden import SHARED
