@@ -26,6 +26,7 @@ OWN = {
     "split": "test",
     "modality": "default",
     "checkpoint": "best",
+    "trust": "",
     "out": "",
 }
 
@@ -42,6 +43,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     split     split of the data set
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     checkpoint  best (by validation mIoU) or last
+    trust     modules of yours that the run was made with: trust=my_lab; their code is run
     out       folder of the counts and of a picture; default: evaluations/ in the run folder, where
               counts on other images or other views than the published ones say so in their names,
               and those on second frames of one motion are not replaced by those of another
@@ -50,6 +52,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     from rgbt.session import panel_names, view_of
     from rgbt.stored import open_trained
+    from rgbt.stored_config import parse_trust
     from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import place_lines, rich_table, show
@@ -60,7 +63,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         overrides = ["consistency=views", *overrides]
     _check_comparable(arguments, overrides)
     runs_dir = Path(arguments["runs_dir"])
-    stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
+    run, trust = arguments["run"], parse_trust(arguments["trust"])
+    stored = open_trained(run, runs_dir, overrides, arguments["checkpoint"], trust=trust)
     session, split = stored.session, arguments["split"]
     view = view_of(session, arguments["modality"])
     frames = cast(Frames, arguments["frames"])

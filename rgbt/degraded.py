@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build, check_node, conf_dir
 from rgbt.degradations.dataset import Degraded, settings_of
 from rgbt.degradations.degradation import Degradation
 from rgbt.session import Session
+from rgbt.stored_config import load_config
+from rgbt.yaml_files import parse_yaml
 
 NODE = "degradation"
 SEED = "seed"
@@ -119,12 +119,13 @@ def known_degradations() -> list[str]:
     return sorted(path.stem for path in (conf_dir() / NODE).glob("*.yaml"))
 
 
-def choose(name: str, words: Sequence[str] = ()) -> Chosen:
+def choose(name: str, words: Sequence[str] = (), trust: Collection[str] = ()) -> Chosen:
     """The degradation called `name`.
 
     Args:
         name: a file of ``conf/degradation/`` without extension, or a path that ends in .yaml.
         words: ``degradation.KEY=VALUE``, as `own_words` finds them.
+        trust: modules that the file may name (`rgbt.stored_config`).
 
     Raises:
         InputError: no such file or key, or a value that does not fit.
@@ -134,10 +135,10 @@ def choose(name: str, words: Sequence[str] = ()) -> Chosen:
         check_choice(NODE, name, known_degradations())
     path = Path(name).expanduser() if is_file else conf_dir() / NODE / f"{name}.yaml"
     pairs = [word.removeprefix(f"{NODE}.").partition("=")[::2] for word in words]
-    node = _node(path)
+    node = _node(path, trust)
     for key, value in pairs:
         if key != SEED:
-            OmegaConf.update(node, key, _parsed(key, value))
+            OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
     check_node(node, NODE)
     return Chosen(
         name=path.stem,
@@ -153,26 +154,13 @@ def own_words(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, [word for word in overrides if word not in own]
 
 
-def _node(path: Path) -> DictConfig:
+def _node(path: Path, trust: Collection[str]) -> DictConfig:
     if not path.is_file():
         raise InputError(f"degradation={path}: there is no such file.")
-    try:
-        # Below its key, so that sentences about it say degradation.block and not block.
-        whole = OmegaConf.create({NODE: OmegaConf.load(path)})
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} cannot be read as YAML: {reason}") from error
-    node = whole[NODE]
-    if not isinstance(node, DictConfig):
-        raise InputError(f"{path}: expected keys, with _target_ first; see conf/degradation/.")
+    # Below its key, so that sentences about it say degradation.block and not block.
+    node = OmegaConf.create({NODE: load_config(path, trust)})[NODE]
+    assert isinstance(node, DictConfig), "load_config returns a mapping"
     return node
-
-
-def _parsed(key: str, value: str) -> object:
-    try:
-        return yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"{NODE}.{key}={value}: cannot be read as a value.") from error
 
 
 def _seed(typed: Sequence[str]) -> int:

@@ -24,6 +24,7 @@ from rgbt.data.domains import GIVEN, NONE
 from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.identity import DOMAINS, SHARED, earlier_config, earlier_run, run_key
 from rgbt.naming import TAGS
+from rgbt.stored_config import targets
 from rgbt.tracking.files import is_held
 from rgbt.tracking.terminal import tell
 
@@ -207,7 +208,10 @@ def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
         *(f"dataset.{each}" for each in ("root", "cache_dir") if each in config.dataset),
     ]
     place = [f"{each}={json.dumps(OmegaConf.select(config, each))}" for each in here]
-    session = open_run(earlier.folder, place, earlier.checkpoint.removesuffix(".pt")).session
+    checkpoint = earlier.checkpoint.removesuffix(".pt")
+    # The user's own: the same configuration as this command composed.
+    own = [target for _, target in targets(OmegaConf.to_container(earlier.config))]
+    session = open_run(earlier.folder, place, checkpoint, trust=own).session
     view = view_of(session, node.teacher_view or "default")
     teacher = teacher_of(earlier.folder.name, session.model)
     write_pseudo_labels(

@@ -5,6 +5,7 @@ Counts are written, and the tables that follow from them are shown.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
@@ -25,6 +26,7 @@ OWN = {
     "degradation": "none",
     "severity": "",
     "checkpoint": "best",
+    "trust": "",
     "out": "",
 }
 
@@ -41,6 +43,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     degradation  of the images: a file of conf/degradation such as thermal_removed or noise, with a
               severity: degradation=noise severity=16; python -m rgbt.robustness takes all of them
     checkpoint  best (by validation mIoU) or last
+    trust     modules of yours that the run was made with: trust=my_lab; their code is run
     out       file of the counts; default: evaluations/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
               degradation: degradation.block=16 degradation.seed=1
@@ -48,14 +51,17 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.degraded import own_words
     from rgbt.session import evaluate, result_tables, view_of
     from rgbt.stored import open_trained
+    from rgbt.stored_config import parse_trust
     from rgbt.tracking.terminal import result_view, show
 
     words, overrides = own_words(overrides)
-    failure = _failure(arguments, words)
+    trust = parse_trust(arguments["trust"])
+    failure = _failure(arguments, words, trust)
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     runs_dir = Path(arguments["runs_dir"])
-    stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
+    run, checkpoint = arguments["run"], arguments["checkpoint"]
+    stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
     session = stored.session
     view = view_of(session, arguments["modality"])
     head = _head(arguments["head"])
@@ -90,12 +96,12 @@ def _head(asked: str) -> TestedHead | None:
     return cast(TestedHead, asked)
 
 
-def _failure(arguments: dict[str, str], words: list[str]) -> Failure | None:
+def _failure(arguments: dict[str, str], words: list[str], trust: Collection[str]) -> Failure | None:
     """The degradation and its severity; None where none is asked for."""
     from rgbt.degraded import choose
 
     if arguments["degradation"] != OWN["degradation"]:
-        return choose(arguments["degradation"], words).at(arguments["severity"])
+        return choose(arguments["degradation"], words, trust).at(arguments["severity"])
     idle = [*(["severity"] if arguments["severity"] else []), *words]
     if idle:
         key = idle[0].partition("=")[0]

@@ -31,6 +31,7 @@ OWN = {
     "modality": "default",
     "head": "as trained",
     "checkpoint": "best",
+    "trust": "",
     "label_map": "none",
     "pseudo_labels": "false",
     "threshold": "0",
@@ -47,6 +48,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     head      of a network with a head per domain: own, source or target
     checkpoint  best (by validation mIoU) or last, of a run
+    trust     modules of yours that the run was made with: trust=my_lab; their code is run
     label_map a file of conf/label_map, for a network that knows other classes than the data set:
               vistas_to_freiburg (of 66 classes), cityscapes_to_freiburg, freiburg_to_mfnet
     pseudo_labels  true: of a split, write labels/NAME.png (class indices, 255 where not sure),
@@ -56,6 +58,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     from rgbt.pseudo import label_map_of
     from rgbt.stored import open_trained
+    from rgbt.stored_config import parse_trust
 
     check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
     as_labels = arguments["pseudo_labels"] == "true"
@@ -66,7 +69,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         )
     label_map = label_map_of(arguments["label_map"])
     runs_dir = Path(arguments["runs_dir"])
-    stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"], label_map)
+    run, checkpoint = arguments["run"], arguments["checkpoint"]
+    trust = parse_trust(arguments["trust"])
+    stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
     if as_labels:
         _pseudo_labels(arguments, stored, label_map)
     else:

@@ -13,6 +13,7 @@ from torch import nn
 from rgbt.checks import InputError
 from rgbt.config import compose
 from rgbt.identity import weights_file
+from rgbt.stored_config import read_settings
 from rgbt.tracking.terminal import tell
 from rgbt.weights.load import load_weights
 from rgbt.weights.report import Report
@@ -74,8 +75,7 @@ def _fed_otherwise(node: DictConfig, report: Report, source: Path) -> bool:
     said: Any = report.facts.inputs
     beside = source.parent / "config.yaml"
     if said is None and report.facts.layout == "own" and beside.is_file():
-        stored = OmegaConf.load(beside)
-        said = OmegaConf.select(stored, "model.inputs") if isinstance(stored, DictConfig) else None
+        said = read_settings(beside).get("model", {}).get("inputs")
     return said is not None and "inputs" in node and _plain(said) != _plain(node.inputs)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ OWN = {
     "degradations": "all",
     "regions": "as trained",
     "checkpoint": "best",
+    "trust": "",
     "out": "",
 }
 FOLDER = "robustness"
@@ -44,6 +45,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               that can decode one branch alone, both branches are always measured beside them
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
     checkpoint  best (by validation mIoU) or last
+    trust     modules of yours that the runs were made with: trust=my_lab; their code is run
     out       folder of the counts of one run; default: evaluations/robustness/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet, degradation.seed=1 (of what is drawn),
               and of a single degradation any key: degradations=noise degradation.severities=[4,12]
@@ -54,16 +56,19 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.degraded import own_words
     from rgbt.failing_images import measure
     from rgbt.stored import open_trained
+    from rgbt.stored_config import parse_trust
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     words, overrides = own_words(overrides)
-    chosen = chosen_of(arguments["degradations"], words)
+    trust = parse_trust(arguments["trust"])
+    chosen = chosen_of(arguments["degradations"], words, trust)
     runs = [word.strip() for word in arguments["run"].split(",")]
     _check_comparable(arguments, overrides, runs)
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     for run in runs:
-        stored = open_trained(run, Path(arguments["runs_dir"]), overrides, arguments["checkpoint"])
+        runs_dir, checkpoint = Path(arguments["runs_dir"]), arguments["checkpoint"]
+        stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
         folder = Path(arguments["out"] or stored.folder / FOLDER / _place(stored, arguments))
         measured = measure(stored.session, arguments["split"], chosen, folder)
         grid = robustness_grid(measured, _title(stored, arguments["split"]))
@@ -76,12 +81,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     return 0
 
 
-def chosen_of(text: str, words: Sequence[str]) -> list[Chosen]:
+def chosen_of(text: str, words: Sequence[str], trust: Collection[str] = ()) -> list[Chosen]:
     """The degradations of ``degradations=``.
 
     Args:
         text: names with commas, or "all".
         words: ``degradation.KEY=VALUE``; any key of a single degradation, the seed of several.
+        trust: see `rgbt.degraded.choose`.
 
     Raises:
         InputError: an unknown name, one that stands twice, or keys of several degradations at once.
@@ -97,7 +103,7 @@ def chosen_of(text: str, words: Sequence[str]) -> list[Chosen]:
                 f"'{key}' is a key of one degradation, but {len(names)} were asked for; name that "
                 "one with degradations=..."
             )
-    chosen = [choose(name, words) for name in names]
+    chosen = [choose(name, words, trust) for name in names]
     stems = [each.name for each in chosen]
     for name in stems:
         if stems.count(name) > 1:

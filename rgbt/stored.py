@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice, nearest
@@ -17,8 +17,10 @@ from rgbt.engine.checkpoint import load_checkpoint, restore_weights
 from rgbt.identity import run_key, weights_file
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, names_key, open_session
+from rgbt.stored_config import load_config
 from rgbt.tracking.folder import find_run
 from rgbt.tracking.terminal import tell
+from rgbt.yaml_files import parse_yaml
 
 CHECKPOINTS = ("best", "last")
 GROUPS = ("dataset", "metric", "consistency")
@@ -52,6 +54,7 @@ def open_trained(
     overrides: list[str],
     checkpoint: str = "best",
     label_map: LabelMap | None = None,
+    trust: Collection[str] = (),
 ) -> Stored:
     """What ``run=`` names; without, the network of `overrides` with `model.weights`.
 
@@ -62,12 +65,13 @@ def open_trained(
             scale=paper, such as model=mfnet model.weights=final.pth dataset.root=/data/MFNet.
         checkpoint: "best" or "last" of a run.
         label_map: from the classes of the network to those of the data set, where they differ.
+        trust: see `open_run`.
 
     Raises:
         InputError: no such run; no weights; settings that do not fit.
     """
     if run:
-        return open_run(find_run(run, runs_dir), overrides, checkpoint, label_map)
+        return open_run(find_run(run, runs_dir), overrides, checkpoint, label_map, trust)
     config = compose(["scale=paper", f"runs_dir={runs_dir}", *overrides])
     source = weights_file(config)
     if source is None:
@@ -94,6 +98,7 @@ def open_run(
     overrides: list[str],
     checkpoint: str = "best",
     label_map: LabelMap | None = None,
+    trust: Collection[str] = (),
 ) -> Stored:
     """Session of a stored run with its weights.
 
@@ -103,13 +108,14 @@ def open_run(
             node by that file of ``conf/dataset/``; ``data.eval_batch_size=1`` one value.
         checkpoint: "best" by the selection split, or "last".
         label_map: from the classes it was trained with to those of the data set, where they differ.
+        trust: modules that the stored configuration may name (`rgbt.stored_config`).
 
     Raises:
-        InputError: overrides that do not fit, no checkpoint, other classes than trained.
+        InputError: a target that is not trusted, overrides that do not fit, no checkpoint, other
+            classes than trained.
     """
     register_resolvers()
-    config = OmegaConf.load(folder / "config.yaml")
-    assert isinstance(config, DictConfig), "a stored configuration is a mapping"
+    config = load_config(folder / "config.yaml", trust)
     defaults = compose([])
     for key, value in _plain(defaults).items():
         if key not in config:  # a run of before there was any
@@ -189,7 +195,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
         if key not in known:
             open_ones = [each for each in known if _is_changeable(each)]
             raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
-        OmegaConf.update(config, key, _parsed(key, value))
+        OmegaConf.update(config, key, parse_yaml(value, key))
 
 
 def _is_changeable(place: str) -> bool:
@@ -204,10 +210,3 @@ def _place(key: str) -> str:
 def _pair(item: str) -> tuple[str, str]:
     key, _, value = item.lstrip("+").partition("=")
     return key, value
-
-
-def _parsed(key: str, value: str) -> object:
-    try:
-        return yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"{key}={value}: cannot be read as a value ({error}).") from error

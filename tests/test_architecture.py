@@ -29,6 +29,8 @@ ALLOWED = {
     "config.py": {"rgbt.checks"},
     "identity.py": {"rgbt.checks", "rgbt.config"},
     "command.py": {"rgbt.checks", "rgbt.config"},
+    "yaml_files.py": {"rgbt.checks"},
+    "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""
@@ -69,7 +71,10 @@ def is_command(text: str) -> bool:
     return 'if __name__ == "__main__"' in text
 
 
-SWEEPS_MAY = {"checks", "types", "config", "identity", "command", "naming", "metrics", "tracking"}
+SWEEPS_MAY = {
+    *("checks", "types", "config", "identity", "command", "naming", "metrics", "tracking"),
+    "yaml_files",
+}
 """What of rgbt the sweeps may import: they call its commands and read what these leave."""
 
 ROOMS = {
@@ -96,7 +101,7 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
 
 
 ANALYSIS_MAY = {
-    *("checks", "types", "config", "identity", "command"),
+    *("checks", "types", "config", "identity", "command", "stored_config", "yaml_files"),
     *("randomness", "metrics", "tracking", "data"),
 }
 """What of rgbt the analysis may import: data sets and what runs have left, never a network."""

@@ -74,7 +74,7 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
     chosen = choose(str(path))
     assert (chosen.name, chosen.degradation.severities) == ("hazy", (3.0, 30.0))
     path.write_text("- 1\n")
-    with pytest.raises(InputError, match=r"hazy.yaml: expected keys, with _target_ first"):
+    with pytest.raises(InputError, match=r"hazy.yaml: expected a mapping of keys and values, got"):
         choose(str(path))
     path.write_text("a: [\n")
     with pytest.raises(InputError, match=r"hazy.yaml cannot be read as YAML"):
@@ -115,7 +115,7 @@ def test_identity_is_what_decides_how_images_look() -> None:
             "'degradation.blok' is not .*'block'",
         ),
         ("occluded", ["degradation.block=big"], "0.5", "'degradation.block'"),
-        ("occluded", ["degradation.block=["], "0.5", "cannot be read as a value"),
+        ("occluded", ["degradation.block=["], "0.5", "degradation.block cannot be read as YAML"),
         ("occluded", ["degradation.seed=x"], "0.5", "whole number of at least 0"),
         ("noise", ["degradation.severities=[4,2]"], "3", "must rise from above 0"),
     ],

@@ -115,7 +115,7 @@ def whole_cells(patches: Sequence[int]) -> int:
     Raises:
         InputError: a size that is not positive.
     """
-    if min(patches) < 1:
+    if min(patches, default=1) < 1:
         raise InputError(f"patches must be positive numbers of pixels, got {min(patches)}.")
     return math.lcm(STRIDE, *patches)
 

@@ -15,8 +15,9 @@ from typing import Any
 from analysis.arguments import MOST, out_folder, refuse_others, whole
 from rgbt.checks import InputError
 from rgbt.command import built, plain_command, readable_paths
+from rgbt.stored_config import parse_trust
 
-OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000"}
+OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000", "trust": ""}
 
 FEWEST = 100
 """Resamples."""
@@ -31,6 +32,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     out        folder; the page is index.html in it
     runs_dir   folder of runs; its mlflow.db is the store unless tracking.uri says another
     resamples  of the images, for intervals and p-values
+    trust      modules of yours with maskers and data sets to draw: trust=my_lab; their code is run
     overrides of the tracker, such as tracking.uri=http://host:5000 or tracking.experiment=mine
 
     Every score is computed from the counts of its run. What cannot be read is told here and listed
@@ -38,6 +40,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     resamples = whole("resamples", arguments["resamples"], FEWEST, MOST)
     runs_dir, out = Path(arguments["runs_dir"]).expanduser(), out_folder(arguments["out"])
+    trust = parse_trust(arguments["trust"])
     if out is None:
         raise InputError("'out' has no value; give a folder for the page.")
     # Read by Hydra; the tracker resolves the folder like that of a run.
@@ -58,7 +61,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         def track(items: Sequence[Any], what: str) -> Any:
             return progress.track(items, description=what)
 
-        data = collect(Asked(tracking, runs_dir, resamples, typed), track)
+        data = collect(Asked(tracking, runs_dir, resamples, typed, trust), track)
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
     for remark in data.remarks[:TOLD]:

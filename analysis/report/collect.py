@@ -31,12 +31,14 @@ class Asked:
         runs_dir: folder of runs; their files are read there where it has them.
         resamples: of the images, for intervals and p-values.
         command: that makes the page again.
+        trust: modules of which the report may build maskers and data sets.
     """
 
     tracking: Tracking
     runs_dir: Path
     resamples: int
     command: str
+    trust: tuple[str, ...] = ()
 
 
 def collect(asked: Asked, track: Track) -> ReportData:
@@ -63,7 +65,7 @@ def collect(asked: Asked, track: Track) -> ReportData:
         records = {kind: [r for r in stored if r.kind == kind] for kind in ("table", "study")}
         tables = table_entries(records["table"], by_key, asked.resamples, track, remarks)
         studies = study_entries(records["study"], remarks)
-        masks = mask_pictures(runs, track, remarks)
+        masks = mask_pictures(runs, track, remarks, asked.trust)
         differences = difference_entries(runs, asked.resamples, track)
     if not runs:
         remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")

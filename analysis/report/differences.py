@@ -16,6 +16,7 @@ from analysis.uncertainty import Comparison, Difference, Resampling, compare
 from rgbt.checks import InputError
 from rgbt.identity import NOT_IN_KEY
 from rgbt.metrics import names
+from rgbt.yaml_files import read_yaml
 
 FILE = Path(__file__).with_name("differences.yaml")
 METRICS = (names.MIOU, names.VAR)
@@ -64,9 +65,6 @@ class Pair:
 
 def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
     """The entries of `FILE`, which is part of the package."""
-    import yaml
-
-    entries = yaml.safe_load(path.read_text())
     return tuple(
         Choice(
             topic=entry["topic"],
@@ -75,7 +73,7 @@ def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
             paper=Side(**entry["paper"]),
             released=Side(**entry["released"]),
         )
-        for entry in entries
+        for entry in read_yaml(path)
     )
 
 

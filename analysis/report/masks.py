@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from analysis.report.data import Picture
 from analysis.report.runs import Run
 from analysis.report.tables_intervals import Track
 from rgbt.checks import InputError
+from rgbt.stored_config import check_targets
 
 MOST = 8
 """Pictures on the page."""
@@ -50,13 +51,16 @@ class Masked:
     runs: int
 
 
-def mask_pictures(runs: Iterable[Run], track: Track, remarks: list[str]) -> tuple[Picture, ...]:
+def mask_pictures(
+    runs: Iterable[Run], track: Track, remarks: list[str], trust: Collection[str] = ()
+) -> tuple[Picture, ...]:
     """One picture per masker that hides anything, those of the most runs first.
 
     Args:
         runs: of the store.
         track: shows how far it is.
         remarks: gets a sentence for each that cannot be drawn, and for those beyond `MOST`.
+        trust: modules that their configurations may name (`rgbt.stored_config`).
     """
     maskers = maskers_in_use(runs)
     if len(maskers) > MOST:
@@ -64,7 +68,7 @@ def mask_pictures(runs: Iterable[Run], track: Track, remarks: list[str]) -> tupl
     pictures = []
     for masked in track(maskers[:MOST], "masks"):
         try:
-            pictures.append(picture(masked))
+            pictures.append(picture(masked, trust))
         except (InputError, OSError) as error:
             remarks.append(f"Masks of '{masked.groups[0]}' cannot be drawn: {error}")
     return tuple(pictures)
@@ -96,18 +100,22 @@ def _node(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     }
 
 
-def picture(masked: Masked) -> Picture:
+def picture(masked: Masked, trust: Collection[str] = ()) -> Picture:
     """Draws of one masker: RGB above, thermal below, hidden pixels coloured.
 
     Raises:
-        InputError: the masker cannot be built or does not fit the images.
+        InputError: the masker or its data set is not trusted, cannot be built, or does not
+            fit the images.
     """
     from analysis.figures.masks import mask_examples, whole_cells
 
+    for group, values in (("masker", masked.masker), ("dataset", masked.dataset)):
+        check_targets({group: values}, trust, "its config.yaml", group)
     masker = _built("masker", masked.masker)
     sample, source = _sample(masked.dataset)
     draws = {str(index): masker for index in range(DRAWS)}
-    multiple = whole_cells([int(masked.masker["patch_size"])])
+    size = masked.masker.get("patch_size")
+    multiple = whole_cells([size] if isinstance(size, int) else [])
     examples = mask_examples(sample, draws, multiple, seed=0)
     columns = [np.vstack([each.rgb, each.thermal]) for each in examples]
     image = _beside(columns)

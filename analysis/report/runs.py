@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -21,16 +21,19 @@ from analysis.report.runs_provenance import (
     repeat_command,
 )
 from analysis.report.store import Files, StoredRun
-from rgbt.checks import InputError
+from rgbt.checks import InputError, check_choice
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import iou, miou, summary
+from rgbt.stored_config import settings_of
 from rgbt.tracking.provenance import without_passwords
+from rgbt.yaml_files import parse_yaml
 from sweeps.table.cell_points import DEFAULT_SCALE, TAG
 
 SPLIT = "test"
 STUDY_TAG = "rgbt.study/"
+ABSENT = get_args(Absent)
 
 ROUNDING = 0.0051
 """MLflow has two decimals: a larger difference is another number."""
@@ -123,24 +126,19 @@ def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:
 
 
 def _config(stored: StoredRun, remarks: list[str]) -> dict[str, Any]:
-    import yaml
-
     try:
         text = stored.files.text("config.yaml")
         if text is None:
             raise InputError("there is none")
-        # Resolved when it was written: plain YAML, which its C reader takes in a twentieth of the
-        # time that OmegaConf needs.
-        plain = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        if not isinstance(plain, dict):
-            raise InputError("it is no mapping")
-    except (InputError, yaml.YAMLError) as error:
+        settings = dict(_leaves(settings_of(parse_yaml(text, "it"), "it"), ""))
+        check_choice("metric.absent", settings.setdefault("metric.absent", ABSENT[0]), ABSENT)
+        return settings
+    except InputError as error:
         said = " ".join(str(error).split()).rstrip(".")
         remarks.append(
             f"Run '{stored.name}': config.yaml cannot be read ({said}); its parameters are shown."
         )
         return {}
-    return dict(_leaves(plain, ""))
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:

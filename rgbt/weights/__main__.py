@@ -11,21 +11,19 @@ from __future__ import annotations
 
 import json
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.command import plain_command
-from rgbt.config import build, compose, conf_dir, register_resolvers
+from rgbt.config import build, compose, conf_dir
+from rgbt.stored_config import check_targets, parse_trust, read_settings
 from rgbt.weights.layout import Facts
 from rgbt.weights.read import Contents
 
-INSPECT = {"file": None}
+INSPECT = {"file": None, "trust": ""}
 EXPORT = {"run": None, "format": None, "out": None, "checkpoint": "best", "runs_dir": "runs"}
 CHECKPOINTS = ("best", "last")
 NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
@@ -37,6 +35,7 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
     FILE      of weights, ours or a released one
     overrides the network, such as model=mask2former_tiny model.fresh=[sem_seg_head]; without, the
               one that fits, or the one of the run that the file belongs to
+    trust     modules of yours with the network of that run: trust=my_lab; their code is run
     """
     from rgbt.tracking.terminal import show
     from rgbt.weights.load import plan_for
@@ -47,7 +46,7 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
     contents = read(Path(arguments["file"]))
     facts = recognise(contents)
     show(facts_view(contents, facts))
-    found = _network(contents, facts, overrides)
+    found = _network(contents, facts, overrides, parse_trust(arguments["trust"]))
     if found is None:
         return 0
     node, name = found
@@ -57,14 +56,16 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
 
 
 def _network(
-    contents: Contents, facts: Facts, overrides: list[str]
+    contents: Contents, facts: Facts, overrides: list[str], trust: tuple[str, ...]
 ) -> tuple[DictConfig, str] | None:
     """The network that is asked about and its name; None where nothing says which."""
     beside = contents.path.parent / "config.yaml"
     if not overrides and contents.ours and beside.is_file():
-        node = _stored(beside).get("model")
-        is_network = isinstance(node, DictConfig) and "_target_" in node and _is_ours(node)
-        return (node, str(beside)) if is_network else None
+        model = read_settings(beside).get("model")
+        if model is None:
+            return None
+        check_targets({"model": model}, trust, str(beside), group="model")
+        return OmegaConf.create({"model": model}).model, str(beside)
     if not any(word.startswith("model=") for word in overrides):
         usual = next((each for each in facts.fits if _is_there(each)), ())
         if not usual:
@@ -73,34 +74,6 @@ def _network(
     if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
         overrides = [*overrides, f"model.num_classes={facts.classes}"]
     return compose(overrides).model, " ".join(overrides)
-
-
-def _is_ours(node: object) -> bool:
-    """Whether every object that a node describes is a network of rgbt.models or a part of one.
-
-    A configuration beside a file of somebody else's might describe a call of anything.
-    """
-    if not isinstance(node, DictConfig):
-        return True
-    target = node.get("_target_")
-    return (target is None or _is_part(str(target))) and all(map(_is_ours, node.values()))
-
-
-def _is_part(target: str) -> bool:
-    """Whether a dotted path names a class that a module of rgbt.models defines itself.
-
-    What such a module imports (rgbt.models.inputs.torch.os.system) is not looked at.
-    """
-    from torch import nn
-
-    module, _, name = target.rpartition(".")
-    if not module.startswith("rgbt.models."):
-        return False
-    try:
-        found = getattr(import_module(module), name, None)
-    except ImportError:
-        return False
-    return isinstance(found, type) and issubclass(found, nn.Module) and found.__module__ == module
 
 
 def _is_there(overrides: tuple[str, ...]) -> bool:
@@ -142,7 +115,7 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
         )
     check_choice("checkpoint", arguments["checkpoint"], CHECKPOINTS)
     folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
-    model = _stored(folder / "config.yaml").model
+    model = _model(folder / "config.yaml")
     contents = read(folder / f"{arguments['checkpoint']}.pt")
     family = family_named(model._target_)
     plain: Any = OmegaConf.to_container(model, resolve=True)
@@ -170,14 +143,12 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     return 0
 
 
-def _stored(path: Path) -> DictConfig:
-    register_resolvers()
-    try:
-        config = OmegaConf.load(path)
-    except (YAMLError, OmegaConfBaseException) as error:
-        raise InputError(f"{path} cannot be read as the configuration of a run.") from error
-    if not isinstance(config, DictConfig):
-        raise InputError(f"{path} is not the configuration of a run, which is a mapping.")
+def _model(path: Path) -> DictConfig:
+    """Settings of a stored network, for what is written of them; nothing is built from them."""
+    settings = read_settings(path)
+    if not isinstance(settings.get("model", {}).get("_target_"), str):
+        raise InputError(f"{path}: 'model' must be a mapping with `_target_`.")
+    config: DictConfig = OmegaConf.create(settings).model
     return config
 
 

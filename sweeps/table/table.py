@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.pairs import Protocol
+from rgbt.yaml_files import read_yaml
 from sweeps.points import Head
 from sweeps.table.checks import check_table
 
@@ -211,7 +212,7 @@ def load_table(name: str, folder: Path = OWN) -> Table:
             a wrong type; the sentence names file, row and key.
     """
     path = _find(name, folder)
-    table = _typed(_read(path), path)
+    table = _typed(read_yaml(path), path)
     check_table(table, str(path))
     return table
 
@@ -228,18 +229,6 @@ def _find(name: str, folder: Path) -> Path:
     if not found:
         raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
     return found[0]
-
-
-def _read(path: Path) -> Any:
-    import yaml
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:  # OmegaConf and not plain yaml: a key that stands twice is refused.
-        return OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} cannot be read as YAML: {reason}") from error
 
 
 def _typed(plain: Any, path: Path) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -128,10 +129,11 @@ def test_a_configuration_beside_a_file_runs_nothing(
     imported = {**evil, "_target_": "rgbt.models.inputs.torch.os.system"}
     part = {"_target_": "rgbt.models.mfnet.MFNet"}
     for model in (evil, imported, {**part, "inputs": evil}, {**part, "inputs": imported}, 3):
-        (run / "config.yaml").write_text(yaml.safe_dump({"model": model}))
-        code, out, _ = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
-        assert code == 0
+        (run / "config.yaml").write_text(json.dumps({"model": model}))
+        code, out, err = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
+        assert code == 2
         assert "checkpoint of a run, MFNet" in out
+        assert "'model" in err
         assert not marker.exists()
 
 
@@ -194,11 +196,11 @@ def test_help(monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
 def test_a_broken_configuration_beside_a_file_is_named(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
-    for text in ("[1, 2]", "model: [", "model: {a: ${b}"):
+    for text in ("[1, 2]", "model: [", "model: {a: '${b}'}"):
         (run / "config.yaml").write_text(text)
         code, _, err = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
         assert code == 2
-        assert "configuration of a run" in err
+        assert f"rgbt: {run / 'config.yaml'}" in err
 
 
 def test_an_export_that_the_authors_code_feeds_otherwise_is_said(
