@@ -1,4 +1,4 @@
-"""A command that may end itself between two writes: ``python -m tests.dying "after last.pt 2" ...``.
+"""A command that ends itself between two writes: ``python -m tests.dying "after last.pt 2" ...``.
 
 Names are those of files as they get their final one, by rename or by link; "before" is the moment
 with the temporary file written and flushed. "-" ends nothing. Pictures are left out.

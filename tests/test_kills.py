@@ -7,7 +7,6 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,7 +88,7 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     root = tmp_path_factory.mktemp("kills")
     write_data(root / "mf", IMAGES, (64, 64))
     executor = LocalExecutor()
@@ -97,7 +96,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     first.finish()  # starts the fork server and makes the store
     straight = Training(root / "straight", root, executor)
     began = time.monotonic()
-    yield Bench(root, executor, straight.finish(), time.monotonic() - began)
+    return Bench(root, executor, straight.finish(), time.monotonic() - began)
 
 
 def lines(folder: Path) -> list[tuple[str, int, dict[str, Any]]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -143,6 +144,9 @@ class _Copies:
         self.known: dict[int, Any] = {}
 
     def of(self, value: Any, depth: int) -> Any:
+        if type(value) is str:
+            # One object for equal texts, as in a program: what is saved again has the same bytes.
+            return sys.intern(value)
         if type(value) in PLAIN:
             return value
         if id(value) not in self.known:
@@ -158,16 +162,13 @@ class _Copies:
                 raise RefusedError.greedy()
             return value.tensor().clone()
         if type(value) is dict:
-            return {_key(key): self.of(each, depth - 1) for key, each in value.items()}
+            if not all(type(key) in (str, int) for key in value):
+                raise TypeError("not a plain key")
+            pairs = value.items()
+            return {self.of(key, depth): self.of(each, depth - 1) for key, each in pairs}
         if type(value) in (list, tuple):
             return type(value)(self.of(each, depth - 1) for each in value)
         raise TypeError("not a plain value")
-
-
-def _key(key: Any) -> Any:
-    if type(key) not in (str, int):
-        raise TypeError("not a plain key")
-    return key
 
 
 class _Hashing:

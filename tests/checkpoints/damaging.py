@@ -62,9 +62,11 @@ def swapped(draw: random.Random, content: bytes) -> bytes:
     with zipfile.ZipFile(BytesIO(content)) as archive:
         entries = [entry for entry in archive.infolist() if "/data/" in entry.filename]
     one = draw.choice(entries)
-    like = [e for e in entries if (e.file_size, len(e.filename)) == (one.file_size, len(one.filename))]
+    like = [
+        e for e in entries if (e.file_size, len(e.filename)) == (one.file_size, len(one.filename))
+    ]
     other = draw.choice([entry for entry in like if entry is not one] or [one])
-    table = content.rindex(b"PK\x01\x02" + content[4:8][:0]) if False else content.index(b"PK\x01\x02")
+    table = content.index(b"PK\x01\x02")
     for entry, name in ((one, other.filename), (other, one.filename)):
         listed = content.index(entry.filename.encode(), table)
         changed[listed : listed + len(name)] = name.encode()
