@@ -107,6 +107,12 @@ def lines(folder: Path) -> list[tuple[str, int, dict[str, Any]]]:
     return [(line["kind"], line["step"], line["values"]) for line in found]
 
 
+def files(folder: Path) -> set[Path]:
+    """All but the changes of the code at each start."""
+    found = {path for path in folder.rglob("*") if path.is_file() and path.suffix != ".patch"}
+    return {path.relative_to(folder) for path in found}
+
+
 def check(bench: Bench, place: Path) -> None:
     """The run in `place` is as the undisturbed one, and nothing else is left."""
     folder, straight = only_run(place), bench.undisturbed
@@ -121,11 +127,9 @@ def check(bench: Bench, place: Path) -> None:
     for split in ("val", "test"):
         one, other = (Counts.load(f / f"counts_{split}.npz") for f in (folder, straight))
         assert np.array_equal(one.counts, other.counts)
-    files = {p.relative_to(f) for f in (folder,) for p in f.rglob("*") if p.is_file()}
-    wanted = {p.relative_to(straight) for p in straight.rglob("*") if p.is_file()}
-    assert files == wanted
+    assert files(folder) == files(straight)
     runs = sent(bench.root, place.name)
-    assert [(run.data.tags["rgbt.key"], run.info.status) for run in runs] == [
+    assert [(run.data.tags.get("rgbt.key"), run.info.status) for run in runs] == [
         (folder.name, "FINISHED")
     ]
     steps = shown_steps(bench.root, runs[0].info.run_id)
