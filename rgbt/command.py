@@ -1,7 +1,7 @@
 """The command line: Hydra overrides in, one sentence and an exit code out.
 
-Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 130 and 143
-stopped by Ctrl-C and by SIGTERM.
+Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 129, 130 and
+143 stopped by SIGHUP, Ctrl-C and SIGTERM.
 """
 
 from __future__ import annotations
@@ -9,13 +9,11 @@ from __future__ import annotations
 import logging
 import os
 import re
-import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import hydra
@@ -26,12 +24,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.config import build, check, check_node, compose, conf_dir, register_resolvers
+from rgbt.stopping import Stopped, answered
 
 Main = Callable[[DictConfig], int | None]
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM, which a cluster sends before it takes a machine away."""
 
 
 def command(
@@ -64,33 +59,13 @@ def command(
             def job(config: DictConfig) -> None:
                 codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
 
-            with _terminable():
+            with answered():
                 code = max([_report(lambda: _compose(config_name, job)), *codes])
             sys.exit(code)
 
         return entry
 
     return decorate
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM raises `Terminated`, so that a run says where it stopped before it goes."""
-    process = os.getpid()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        if os.getpid() != process:  # a worker forked from us: it has nothing to tidy up
-            os._exit(143)
-        # Clusters signal a process more than once; the first one is being answered.
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 PATHS = ("model.weights", "pretrained", "dataset.root", "runs_dir", "out")
@@ -149,12 +124,14 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
         return _say(_hydra_sentence(error, words), 2)
     except OSError as error:
         return _say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
-    except KeyboardInterrupt as interrupt:
+    except Stopped as stop:
         if not catch_interrupt:
             raise
-        terminated = isinstance(interrupt, Terminated)
-        word, code = ("stopped by SIGTERM", 143) if terminated else ("interrupted", 130)
-        return _say(f"{word}; given again, the same command goes on where it was.", code)
+        return _say(str(stop), stop.code)
+    except KeyboardInterrupt:  # a second Ctrl-C
+        if not catch_interrupt:
+            raise
+        return _say("interrupted; rerun the command to resume from its last checkpoint.", 130)
 
 
 def _say(sentence: str, code: int) -> int:
@@ -254,7 +231,7 @@ def plain_command(
             usage = " ".join(f"{k}=..." if v is None else f"[{k}={v}]" for k, v in own.items())
             sys.stdout.write(f"{(main.__doc__ or '').strip()}\n\nusage: {usage} [overrides]\n")
             sys.exit(0)
-        with _terminable():
+        with answered():
             code = _report(lambda: main(*_split(own, arguments)))
         sys.exit(code)
 

@@ -19,7 +19,8 @@ from rgbt.config import build
 from rgbt.data.domains import Domains
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
-from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
+from rgbt.engine.checkpoint import State, restore_weights
+from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.identity import run_key
 from rgbt.metrics import names, scores
@@ -76,6 +77,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     tracking: Tracking = build(config.tracking)
     if (path / "result.json").exists():
         folder = RunFolder(path)
+        folder.clean()
         _show_again(folder, tracking, asked)
         _tell_other_files(folder, config)
         _tell_unmeasured(folder, build(config.consistency))
@@ -148,9 +150,12 @@ class Run:
         self.tracking.start(self.folder, shown.name, tags, shown.params)
         try:
             state = self._train(session)
-            self._restore_best(session)
+            checkpoints = Checkpoints(self.folder.path)
+            best = checkpoints.load_best(state.best_step)
+            restore_weights(session.model, best, checkpoints.best)
             pairs = self._consistency(session)
             self._test(session, state, pairs.get("test"))
+            checkpoints.tidy()
             self._finish(session, state, time.time() - started, pairs)
         except KeyboardInterrupt:
             self.tracking.finish("KILLED")
@@ -213,14 +218,23 @@ class Run:
         state = State(seed=session.config.seed)
         trainer = self._trainer(session, state)
         if trainer.resume(state):
+            if trainer.checkpoints.warning:
+                tell(trainer.checkpoints.warning)
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
-        self.folder.truncate_after(state.step)
+        self._tell_repeated(state.step)
+        self.folder.truncate_after(state.step, state.evaluated_step)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = self.prepared.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
         self._tell_waiting(session)
         return state
+
+    def _tell_repeated(self, step: int) -> None:
+        """Say how many steps of a process that was killed were not saved."""
+        reached = max((line.step for line in self.folder.lines()), default=0)
+        if reached > step:
+            tell(f"steps {step + 1} to {reached} were not saved before and are repeated.")
 
     def _tell_waiting(self, session: Session) -> None:
         """Say so where the training mostly waited for images, and what helps."""
@@ -244,17 +258,15 @@ class Run:
 
         def validate(step: int) -> float:
             found = evaluate(session, self.prepared.model, split)
+            place = trainer.checkpoints.begin_evaluation(step)
+            found.counts.save(place / self.folder.counts_path(split).name)
             values = scores.summary(found.counts, session.regions.absent)
-            is_kept = values[names.MIOU] > state.best_score or session.trainer.tested == "last"
-            values |= self._of_target(session, self.prepared.model, split, save=is_kept)
+            values |= self._of_target(session, self.prepared.model, split, place)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
-            if is_kept:
-                found.counts.save(self.folder.counts_path(split))
-            self.tracking.update()
             return values[names.MIOU]
 
-        return Trainer(
+        trainer = Trainer(
             fabric=session.fabric,
             settings=session.trainer,
             scheme=self.prepared.scheme,
@@ -266,11 +278,9 @@ class Run:
             folder=self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
             validate=validate,
+            committed=self.tracking.update,
         )
-
-    def _restore_best(self, session: Session) -> None:
-        best = self.folder.path / "best.pt"
-        restore_weights(session.model, load_checkpoint(best)["model"], best)
+        return trainer
 
     def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
         """TC and CA of the best checkpoint under "val" and "test", as far as asked for."""
@@ -299,7 +309,7 @@ class Run:
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
-        of_target = self._of_target(session, session.model, "test", save=True)
+        of_target = self._of_target(session, session.model, "test", self.folder.path)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
@@ -314,15 +324,17 @@ class Run:
             tell("none of the images of the panel could be read; no pictures were drawn.")
 
     def _of_target(
-        self, session: Session, model: nn.Module, split: str, *, save: bool
+        self, session: Session, model: nn.Module, split: str, place: Path
     ) -> dict[str, float]:
-        """Where the target is seen in another view than the source: its mIoU, named after that."""
+        """Where the target is seen in another view than the source: its mIoU, named after that.
+
+        Its counts are written to the folder `place`.
+        """
         target = session.domains.target
         if target is None or target.view in (None, view_of(session)):
             return {}
         counts = evaluate(session, model, split, view=target.view).counts
-        if save:
-            counts.save(self.folder.counts_path(f"{split}_{target.view}"))
+        counts.save(place / self.folder.counts_path(f"{split}_{target.view}").name)
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 import torch
 
+from rgbt.checkpoints.stored import save
 from rgbt.config import build, compose
-from rgbt.engine.checkpoint import load_checkpoint, save_checkpoint
+from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.schemes.adversarial import Adversarial
@@ -170,7 +171,7 @@ def without_head(folder: Path, head: str, place: Path) -> Path:
     assert zeroed
     for name in zeroed:
         payload["model"][name].zero_()
-    save_checkpoint(place / "best.pt", payload)
+    save(place / "best.pt", payload)
     return place
 
 

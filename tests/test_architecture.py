@@ -19,18 +19,20 @@ ISLANDS = {"data", "degradations", "transforms", "maskers", "models", "losses", 
 ALLOWED = {
     **{island: COMMON | {f"rgbt.{island}"} for island in ISLANDS},
     "schemes": COMMON | {"rgbt.schemes"},
-    "engine": COMMON | {"rgbt.engine"},
+    "engine": COMMON | {"rgbt.engine", "rgbt.checkpoints", "rgbt.stopping"},
     "tracking": COMMON | {"rgbt.tracking", "rgbt.metrics"},
-    "weights": COMMON | {"rgbt.weights"},
+    "checkpoints": COMMON | {"rgbt.checkpoints"},
+    "weights": COMMON | {"rgbt.weights", "rgbt.checkpoints"},
     "types.py": set(),
     "checks.py": set(),
     "geometry": {"rgbt.types", "rgbt.checks", "rgbt.geometry"},
     "randomness.py": set(),
     "config.py": {"rgbt.checks"},
     "identity.py": {"rgbt.checks", "rgbt.config"},
-    "command.py": {"rgbt.checks", "rgbt.config"},
     "yaml_files.py": {"rgbt.checks"},
     "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
+    "command.py": {"rgbt.checks", "rgbt.config", "rgbt.stopping"},
+    "stopping.py": set(),
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""

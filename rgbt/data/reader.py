@@ -5,6 +5,9 @@ Part of `rgbt.data.loaders`, which decides what each batch holds.
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -25,6 +28,9 @@ MakeExample = Callable[[Any, dict[str, str]], Any]
 
 Stack = Callable[[list[Any]], Loadable]
 """Examples of one size -> one value; InputError where their sizes differ."""
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a command (`rgbt.stopping`)."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +155,18 @@ def start_worker(_: int) -> None:
     """Settings of a worker process."""
     # The processes are the parallelism; threads of OpenCV beside them only get in each other's way.
     cv2.setNumThreads(0)
+    # A terminal and a cluster signal all processes of a run. The main one finishes its step first,
+    # for which it needs its workers, and then ends them.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Leave when the main process says so."""
+    while True:
+        told = signal.sigwaitinfo(ENDING)
+        if told.si_signo == signal.SIGTERM and told.si_pid == os.getppid():
+            os._exit(0)
 
 
 def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:

@@ -1,16 +1,14 @@
-"""Checkpoints: written whole or not at all, read without executing code.
+"""What a run's checkpoints hold: the state to resume from, and the best weights.
 
-Which checkpoint is taken when a run starts, first match wins:
-1. ``last.pt`` of the run folder (the run continues);
+Which one is taken when a run starts, first match wins:
+1. ``last.pt`` of the run folder (the run resumes; `rgbt.engine.committed`);
 2. `model.weights` (read by `rgbt.weights`);
 3. fresh weights.
 """
 
 from __future__ import annotations
 
-import os
-import pickle
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rgbt.checkpoints.stored import ZIP, explained, plain, read_stored
 from rgbt.checks import InputError
 
 
@@ -31,6 +30,9 @@ class State:
         best_step: the step it was reached at.
         seed: run seed, from which every generator is derived together with `step`.
         skipped: names of unreadable files that were left out so far, sorted.
+        evaluated_step: step of the last evaluation; below `step` where a signal came before the
+            evaluation of `step`, which is then made on resuming.
+        unlogged: values of the steps since the last line of ``metrics.jsonl``.
     """
 
     seed: int
@@ -38,22 +40,33 @@ class State:
     best_score: float = -1.0
     best_step: int = 0
     skipped: list[str] = field(default_factory=list)
+    evaluated_step: int = 0
+    unlogged: dict[str, float] = field(default_factory=dict)
 
     def skip(self, names: Iterable[str]) -> None:
         """Note files that were left out."""
         self.skipped = sorted({*self.skipped, *names})
 
+    @classmethod
+    def of(cls, payload: Mapping[str, Any]) -> State:
+        """The state in a checkpoint.
 
-def save_checkpoint(path: Path, payload: dict[str, Any]) -> None:
-    """Write `payload` to a temporary name, flush it to disk, rename it to `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # One name: what a killed process left half written is overwritten, never piled up.
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as file:
-        torch.save(payload, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+        Raises:
+            TypeError: it is none.
+        """
+        stored = payload.get("state")
+        if not isinstance(stored, dict):
+            raise TypeError("no state")
+        # Before there was this entry, a checkpoint was written after the evaluation of its step.
+        state = cls(**{"evaluated_step": stored.get("step"), **stored})
+        numbers = (state.seed, state.step, state.best_step, state.evaluated_step)
+        if any(type(number) is not int or number < 0 for number in numbers):
+            raise TypeError("steps and seed are whole numbers")
+        if not isinstance(state.best_score, float):
+            raise TypeError("a score is a number")
+        if not isinstance(state.skipped, list) or not isinstance(state.unlogged, dict):
+            raise TypeError("no names, no values")
+        return state
 
 
 def training_payload(
@@ -75,20 +88,41 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """The payload of a checkpoint file, tensors on the CPU.
 
     Raises:
-        InputError: missing, cut short, or not a checkpoint of ours.
+        InputError: missing, damaged, or not a checkpoint of ours; nothing in it is executed.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such checkpoint.")
-    try:
-        payload = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path} cannot be read as a checkpoint ({reason}).") from error
-    if not isinstance(payload, dict) or "model" not in payload:
+    advice = "copy it again from where it is whole, or train the run again in another runs_dir=..."
+    with explained(path, "a checkpoint", advice):
+        value, container = read_stored(path)
+        payload = plain(value, path.stat().st_size) if container == ZIP else None
+    if not isinstance(payload, dict) or not _is_state_dict(payload.get("model")):
         raise InputError(
             f"{path} holds no weights under 'model'; give a checkpoint written by rgbt.run."
         )
     return payload
+
+
+def _is_state_dict(value: object) -> bool:
+    """Whether a value is tensors by name."""
+    return isinstance(value, dict) and all(
+        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in value.items()
+    )
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
+    """Put the state of an optimiser back.
+
+    Raises:
+        InputError: it is the state of another one.
+    """
+    try:
+        optimizer.load_state_dict(stored)
+    except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
+        raise InputError(
+            f"{source} holds the state of another optimizer than the one of this run; resume with "
+            "the code that wrote it, or train the run again in another runs_dir=..."
+        ) from error
 
 
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:

@@ -15,12 +15,14 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checks import RunError
-from rgbt.engine.checkpoint import State, load_checkpoint, save_checkpoint, training_payload
+from rgbt.checks import InputError, RunError
+from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
+from rgbt.engine.committed import Checkpoints
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.randomness import torch_generator
+from rgbt.stopping import Stopped, at_once, deferred
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
 RecordStep = Callable[[int, dict[str, float]], None]
@@ -67,6 +69,7 @@ class Trainer:
         folder: where checkpoints go.
         record: called with (step, values) every `settings.log_every` steps.
         validate: called with the step; returns the score that selects the best checkpoint.
+        committed: called after an evaluation has been committed.
     """
 
     def __init__(  # noqa: PLR0913 - the loop is where everything meets
@@ -83,6 +86,7 @@ class Trainer:
         folder: Path,
         record: RecordStep,
         validate: Validate,
+        committed: Callable[[], None] = lambda: None,
     ) -> None:
         self.fabric = fabric
         self.settings = settings
@@ -92,26 +96,39 @@ class Trainer:
         self.optimizers = optimizers
         self.schedule = schedule
         self.steps_per_epoch = steps_per_epoch
-        self.last = folder / "last.pt"
-        self.best = folder / "best.pt"
+        self.checkpoints = Checkpoints(folder)
         self.record = record
         self.validate = validate
+        self.committed = committed
 
     def resume(self, state: State) -> bool:
-        """Take up everything from the last checkpoint into `state`; False if there is none."""
-        if not self.last.exists():
+        """Take up everything from the last checkpoint into `state`; False if there is none.
+
+        Raises:
+            RunError: the checkpoints are damaged.
+            InputError: they are of another configuration.
+        """
+        loaded = self.checkpoints.load()
+        if loaded is None:
             return False
-        payload = load_checkpoint(self.last)
-        self.model.load_state_dict(payload["model"])
+        payload, stored = loaded
+        source = self.checkpoints.last
+        restore_weights(self.model, payload["model"], source)
+        others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
+        if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
+            raise InputError(f"{source} is a checkpoint of other networks than those of this run.")
         for name, module in self.others.items():
-            module.load_state_dict(payload["others"][name])
+            restore_weights(module, others[name], source)
         for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(payload["optimizers"][name])
-        vars(state).update(payload["state"])
+            restore_optimizer(optimizer, optimizers[name], source)
+        vars(state).update(vars(stored))
         return True
 
     def fit(self, batches: Iterator[Loaded], state: State) -> None:
         """Train from ``state.step`` to the last step, keeping `state` up to date.
+
+        A signal that ends the command is answered after the step in progress, or at once during an
+        evaluation: the state is saved first.
 
         Args:
             batches: training batches, starting at that step.
@@ -119,35 +136,56 @@ class Trainer:
 
         Raises:
             RunError: a loss part or the gradient is not finite.
+            Stopped: a signal came; its `step` is saved.
         """
         total = self.settings.max_steps
-        with progress() as display:
+        with progress() as display, deferred():
             task = display.add_task("training", total=total, completed=state.step, note="")
+            if state.step:  # its evaluation may be what a signal came before
+                self._save_when_due(state)
             self.model.train()
-            values: dict[str, float] = {}
             for step in range(state.step, total):
                 # Steps may alternate between phases: a line has the last values of each.
-                values |= self._step(step, batches, state.seed)
+                values = self._step(step, batches, state.seed)
+                state.unlogged |= values
                 state.step = step + 1
                 note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
                 display.update(task, completed=state.step, note=note)
                 if state.step % self.settings.log_every == 0 or state.step == total:
-                    self.record(state.step, values)
-                    values = {}
+                    self.record(state.step, state.unlogged)
+                    state.unlogged = {}
                 self._save_when_due(state)
 
     def _save_when_due(self, state: State) -> None:
-        due = state.step == self.settings.max_steps
-        if due or state.step % self.settings.eval_every == 0:
-            score = self.validate(state.step)
-            self.model.train()
-            if score > state.best_score or self.settings.tested == "last":
-                state.best_score, state.best_step = score, state.step
-                save_checkpoint(self.best, {"model": self.model.state_dict(), "step": state.step})
-            due = True
-        if due or state.step % self.settings.checkpoint_every == 0:
-            payload = training_payload(self.model, self.others, self.optimizers, state)
-            save_checkpoint(self.last, payload)
+        """Evaluate and save where this step asks for it; save and stop where a signal came."""
+        is_last = state.step == self.settings.max_steps
+        due = is_last or state.step % self.settings.eval_every == 0
+        due = due and state.evaluated_step < state.step
+        try:
+            with at_once():
+                score = self.validate(state.step) if due else -math.inf
+            if due:
+                self._choose(score, state)
+            if due or state.step % self.settings.checkpoint_every == 0:
+                self._save(state)
+            if due:
+                with at_once():
+                    self.committed()
+                self.model.train()
+        except Stopped as stop:
+            self._save(state)
+            stop.step = state.step
+            raise
+
+    def _choose(self, score: float, state: State) -> None:
+        if score > state.best_score or self.settings.tested == "last":
+            self.checkpoints.save_best(state.step, self.model.state_dict())
+            state.best_score, state.best_step = score, state.step
+        state.evaluated_step = state.step
+
+    def _save(self, state: State) -> None:
+        payload = training_payload(self.model, self.others, self.optimizers, state)
+        self.checkpoints.commit(payload, state)
 
     def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
         """One optimiser step of every phase; what to record of it."""

@@ -32,11 +32,14 @@ class Archive:
     def save(self, path: Path, values: Mapping[str, Any]) -> None:
         """Write arrays under a temporary name, then rename: never half a file."""
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, **{"format": np.array(self.mark), **values})
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
+        try:
+            with partial.open("wb") as stream:
+                np.savez_compressed(stream, **{"format": np.array(self.mark), **values})
+                stream.flush()
+                os.fsync(stream.fileno())
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
     def load(self, path: Path) -> dict[str, Any]:
         """What `save` wrote, by name; nothing in the file is executed.

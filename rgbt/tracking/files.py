@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,15 @@ from pathlib import Path
 
 POLL_S = 0.1
 """Seconds between two attempts to take a lock."""
+LEFT_BEHIND = re.compile(
+    r"\.(?:last|last_previous|best)\.pt\.partial|\.counts_\w+\.npz\.partial"
+    r"|\..+\.(\d+)|.+\.(\d+)\.partial"
+)
+"""Temporary names in a run folder, with the process that wrote them. Those without one are written
+by the holder of the run's lock alone."""
+
+STALE_S = 3600.0
+"""Age above which a temporary file is nobody's any more, whoever began it."""
 
 _held: set[int] = set()
 """Descriptors of locks of this process; loader workers forked from it must not keep them."""
@@ -22,16 +32,44 @@ def write_atomic(path: Path, content: bytes) -> None:
     Temporary name in the same folder, fsync, rename, fsync of the folder.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def remove_left_behind(folder: Path, writer: int | None) -> None:
+    """Remove temporary files that a killed process left in a run folder.
+
+    Files that another process may be writing now, such as an evaluation, are left alone.
+
+    Args:
+        folder: of the run, whose lock is held.
+        writer: the process that held the lock before; None: not known.
+    """
+    for path in folder.rglob("*"):
+        found = LEFT_BEHIND.fullmatch(path.name)
+        if found is None:
+            continue
+        number = found.group(1) or found.group(2)
+        is_ours = number is None or int(number) in (writer, os.getpid())
+        if is_ours or time.time() - path.stat().st_mtime > STALE_S:
+            path.unlink()
+
+
+def holder_of(path: Path) -> int | None:
+    """Number of the process that held the lock `path` last; None where it does not say."""
+    found = re.match(r"process (\d+) on ", path.read_text()) if path.exists() else None
+    return None if found is None else int(found.group(1))
 
 
 @contextmanager

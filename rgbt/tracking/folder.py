@@ -12,7 +12,8 @@ tables.json         the last region and class tables (`tables.py`)
 figures/*.png       pictures
 evaluations/*.npz   counts of later evaluations (`rgbt.evaluate`) and of pairs of frames
 evaluations/robustness/<split>/  counts of failing images, and what made them (`rgbt.robustness`)
-last.pt best.pt     checkpoints: to continue from, and the best by the selection split
+last.pt best.pt     checkpoints: to resume from, and the best by the selection split;
+                    last_previous.pt, checkpoints/: while training (`rgbt.engine.committed`)
 dataset.json        which images the run was begun on (`rgbt.training`)
 lock mlflow.json    who trains here now; what MLflow has been sent
 result.json         written last, by rename: the run is finished exactly if it exists
@@ -31,7 +32,13 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rgbt.checks import InputError
-from rgbt.tracking.files import holding, is_held, write_atomic
+from rgbt.tracking.files import (
+    holder_of,
+    holding,
+    is_held,
+    remove_left_behind,
+    write_atomic,
+)
 
 Kind = Literal["train", "val", "test"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -79,18 +86,32 @@ class RunFolder:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes from training in this folder.
+        """Keep other processes from training in this folder; remove what a killed one left half
+        written.
 
         Raises:
             InputError: another process does; the sentence says which one, on which machine.
         """
-        with holding(self.path / "lock") as holder:
+        with self._locked() as holder:
             if holder is not None:
                 raise InputError(
-                    f"{self.path} is being trained by {holder}; wait for it, or stop it and give "
-                    "the same command again to continue."
+                    f"{self.path} is being trained by {holder}; wait for it, or stop it and rerun "
+                    "the command to resume."
                 )
             yield
+
+    def clean(self) -> None:
+        """Remove what a killed process left half written, unless another one trains here."""
+        with self._locked():
+            pass
+
+    @contextmanager
+    def _locked(self) -> Iterator[str | None]:
+        before = holder_of(self.path / "lock")
+        with holding(self.path / "lock") as holder:
+            if holder is None:
+                remove_left_behind(self.path, before)
+            yield holder
 
     def is_locked(self) -> bool:
         """Whether a process is training here now."""
@@ -144,13 +165,18 @@ class RunFolder:
         whole, newline, _ = path.read_text().rpartition("\n")
         return [metric_line(text) for text in (whole + newline).splitlines()]
 
-    def truncate_after(self, step: int) -> None:
+    def truncate_after(self, step: int, evaluated_step: int | None = None) -> None:
         """Drop what a run that resumes at `step` will write again.
 
         These are the lines beyond `step`, every "test" line (the last evaluation is repeated) and
         a line cut short by a crash.
+
+        Args:
+            step: of the checkpoint.
+            evaluated_step: "val" lines beyond this one are dropped too; None: as `step`.
         """
-        kept = [line for line in self.lines() if line.step <= step and line.kind != "test"]
+        ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
+        kept = [line for line in self.lines() if line.step <= ends.get(line.kind, -1)]
         plain = (
             {
                 **vars(line),

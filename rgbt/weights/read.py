@@ -9,9 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rgbt.checks import InputError
-from rgbt.weights.records import Array, DamagedError, Inert, RefusedError, Strided, printable
-from rgbt.weights.torch_files import mapped, read_pickles, read_zip
+from rgbt.checkpoints.records import Array, DamagedError, Inert, RefusedError, Strided, printable
+from rgbt.checkpoints.stored import beginning_of, explained, read_stored
 
 WRAPPERS = ("state_dict", "model", "module")
 """Keys under which releases put their weights."""
@@ -30,17 +29,6 @@ NOTE = "rgbt"
 """Key of what an export says about itself."""
 
 PLAIN = (str, int, float, bool)
-
-DAMAGE = (
-    DamagedError,
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-)
-"""What overwritten or invented bytes lead to, wherever they are made sense of."""
 
 
 @dataclass(frozen=True)
@@ -79,55 +67,11 @@ def read(path: Path) -> Contents:
     Raises:
         InputError: missing, empty, cut short, of another kind, or asking for code.
     """
-    beginning = _beginning(path)
-    try:
-        if _is_safetensors(beginning):
+    with explained(path, "a file of weights", "copy or download it again"):
+        if _is_safetensors(beginning_of(path)):
             return _read_safetensors(path)
-        if beginning.startswith(b"PK\x03\x04"):
-            return _unwrapped(path, read_zip(path), "torch.save")
-        _refuse_others(beginning)
-        value, container = read_pickles(mapped(path))
+        value, container = read_stored(path)
         return _unwrapped(path, value, container)
-    except RefusedError as refusal:
-        raise InputError(f"{path} {refusal}") from refusal
-    except DAMAGE as damage:
-        raise InputError(
-            f"{path} cannot be read as a file of weights: it is cut short, damaged, or of another "
-            "kind; copy or download it again."
-        ) from damage
-
-
-def _beginning(path: Path) -> bytes:
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file of weights in it.")
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file of weights.")
-    with path.open("rb") as file:
-        beginning = file.read(512)
-    if not beginning:
-        raise InputError(f"{path} is empty; copy or download it again.")
-    return beginning
-
-
-def _refuse_others(beginning: bytes) -> None:
-    """Name what is often saved or downloaded in the place of weights."""
-    text = beginning.lstrip().lower()
-    if text.startswith(b"version https://git-lfs"):
-        raise RefusedError(
-            "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
-        )
-    if text.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
-        raise RefusedError(
-            "is a web page, probably of the host's download button; download it again."
-        )
-    if beginning[257:262] == b"ustar":
-        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
-    if beginning.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")):
-        raise RefusedError("is a compressed archive; unpack it and name the file of weights.")
-    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
-        raise RefusedError(
-            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
-        )
 
 
 def _is_safetensors(beginning: bytes) -> bool:

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+from rgbt.checkpoints.records import printable
 from rgbt.weights.layout import Facts, Layout
 from rgbt.weights.layouts import cmx, heatnet, mask2former, mfnet, mit, own, resnet, rtfnet, swin
 from rgbt.weights.read import Contents
-from rgbt.weights.records import printable
 
 LAYOUTS: MappingProxyType[str, Layout] = MappingProxyType(
     {

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rgbt.checkpoints.records import printable
 from rgbt.weights.layout import CLASS_PARTS, Facts
 from rgbt.weights.plan import Plan
-from rgbt.weights.records import printable
 
 ANOTHER_SIZE = 0.05
 """Share of entries that do not fit, above which the network is of another size than the file."""

@@ -10,10 +10,10 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
+from rgbt.checkpoints.records import printable
 from rgbt.weights.layout import Facts
 from rgbt.weights.plan import Plan
 from rgbt.weights.read import Contents
-from rgbt.weights.records import printable
 
 NOT_TRAINED = (
     *("running_mean", "running_var", "num_batches_tracked"),

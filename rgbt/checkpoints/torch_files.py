@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import mmap
 import struct
-import zipfile
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, cast
@@ -16,24 +15,16 @@ from typing import IO, Any, cast
 import torch
 from torch import Tensor
 
-from rgbt.weights.builders import BUILDERS, STORAGES, UNTYPED
-from rgbt.weights.pickles import unpickle
-from rgbt.weights.records import DamagedError, Name, RefusedError, Storage
+from rgbt.checkpoints.archives import listed_in, mapped, verified
+from rgbt.checkpoints.builders import BUILDERS, STORAGES, UNTYPED
+from rgbt.checkpoints.pickles import unpickle
+from rgbt.checkpoints.records import DamagedError, Name, RefusedError, Storage
 
 MAGIC = 0x1950A86A20F9469CFC6C
 """Value of the first pickle of a file from before 1.6."""
 
 PROTOCOL = 1001
-LOCAL_HEADER = struct.Struct("<26xHH")
-"""Of a zip entry: lengths of name and extra field, behind which the content begins."""
-
 Buffer = mmap.mmap | bytes
-
-
-def mapped(path: Path) -> mmap.mmap:
-    """The file as memory that is read where it is touched."""
-    with path.open("rb") as file:
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
 
 
 class References:
@@ -116,59 +107,35 @@ def read_zip(path: Path) -> Any:
 
     Raises:
         RefusedError: another zip archive, a program, another byte order.
-        DamagedError: cut short.
+        DamagedError: cut short, overwritten.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = {entry.filename: entry for entry in archive.infolist()}
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, EOFError) as error:
-        raise DamagedError from error
     buffer = mapped(path)
-    root = next((name[:-8] for name in entries if name.endswith("data.pkl")), None)
+    listed = listed_in(path)
+    root = next((name[:-8] for name in listed if name.endswith("data.pkl")), None)
     if root is None:
         raise RefusedError(
             "is a zip archive, but not one of torch.save; unpack it and name a file."
         )
-    if f"{root}constants.pkl" in entries:
+    if f"{root}constants.pkl" in listed:
         raise RefusedError(
             "is a TorchScript program, which would have to run; give a file that holds its "
             "state_dict()."
         )
+    entries = verified(buffer, listed)
+    start, end = entries.get(f"{root}byteorder", (0, 0))
+    if buffer[start:end] not in (b"", b"little"):
+        raise RefusedError("was written on a big-endian machine, which is not supported.")
     references = References()
-
-    def content(name: str) -> tuple[int, int]:
-        return _place(buffer, entries[f"{root}{name}"])
-
-    if f"{root}byteorder" in entries:
-        start, end = content("byteorder")
-        if buffer[start:end] != b"little":
-            raise RefusedError("was written on a big-endian machine, which is not supported.")
-    start, end = content("data.pkl")
+    start, end = entries[f"{root}data.pkl"]
     value = unpickle(BytesIO(buffer[start:end]), FULL, references)
     places = {}
     for key, storage in references.storages.items():
-        start, end = content(f"data/{key}")
+        start, end = entries[f"{root}data/{key}"]
         if end - start < storage.num_bytes:
             raise DamagedError("a tensor is longer than its entry")
         places[key] = numbers(buffer, start, storage)
     references.locate(places)
     return value
-
-
-def _place(buffer: mmap.mmap, entry: zipfile.ZipInfo) -> tuple[int, int]:
-    """Where the content of a zip entry lies; torch compresses nothing."""
-    if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-        raise RefusedError(
-            "was packed again with compression; unpack it and pack it with torch.save, or store it "
-            "uncompressed."
-        )
-    header = buffer[entry.header_offset : entry.header_offset + LOCAL_HEADER.size]
-    if len(header) < LOCAL_HEADER.size:
-        raise DamagedError("an entry lies outside the file")
-    start = entry.header_offset + LOCAL_HEADER.size + sum(LOCAL_HEADER.unpack(header))
-    if start + entry.file_size > len(buffer):
-        raise DamagedError("an entry reaches outside the file")
-    return start, start + entry.file_size
 
 
 def read_pickles(buffer: Buffer) -> tuple[Any, str]:

@@ -24,6 +24,13 @@ class RefusedError(Exception):
             "state_dict()."
         )
 
+    @classmethod
+    def greedy(cls) -> RefusedError:
+        """For content that would grow beyond all proportion."""
+        return cls(
+            "would take far more memory than it has bytes; it is damaged, or made to do harm."
+        )
+
 
 class DamagedError(Exception):
     """A file that is cut short, overwritten, or not what its beginning says."""
@@ -70,6 +77,11 @@ class Strided:
     offset: int
     size: tuple[int, ...]
     stride: tuple[int, ...]
+
+    @property
+    def num_bytes(self) -> int:
+        """What a copy takes; more than the storage where a stride is 0."""
+        return math.prod(self.size) * self.storage.dtype.itemsize
 
     def tensor(self) -> Tensor:
         """A view of the storage.

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from rgbt.weights.records import (
+from rgbt.checkpoints.records import (
     Array,
     Inert,
     Name,

@@ -1,7 +1,7 @@
 """Pickles as data: a reader of the opcodes that has no way to call what a file names.
 
 Python's own unpickler imports the objects that a file names and calls them. Here a name stays a
-`Name`; what a file wants called is looked up among the few builders of `rgbt.weights.builders`,
+`Name`; what a file wants called is looked up among the few builders of `rgbt.checkpoints.builders`,
 which put together inert values of ours. Every other name is refused where it occurs, called or not.
 """
 
@@ -12,8 +12,8 @@ import pickletools
 from collections.abc import Callable, Mapping
 from typing import IO, Any
 
-from rgbt.weights.builders import PLAIN_NAMES, STAND_INS, Builder
-from rgbt.weights.records import (
+from rgbt.checkpoints.builders import PLAIN_NAMES, STAND_INS, Builder
+from rgbt.checkpoints.records import (
     Array,
     DamagedError,
     Inert,
@@ -139,9 +139,7 @@ class Machine:
         """
         self.budget -= sum(len(value) for value in values if isinstance(value, SIZED))
         if self.budget < 0:
-            raise RefusedError(
-                "would take far more memory than it has bytes; it is damaged, or made to do harm."
-            )
+            raise RefusedError.greedy()
 
     def extend(self, items: list[Any]) -> None:
         """Append to a list."""

@@ -1,0 +1,209 @@
+"""One reader for all files of tensors, and the writer of ours.
+
+Whatever a file holds, reading it gives plain values and tensors or one sentence.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, BinaryIO, cast
+
+import torch
+
+from rgbt.checkpoints.archives import COMMENT_LENGTH, comment_of, mapped
+from rgbt.checkpoints.pickles import GROWTH, SMALL
+from rgbt.checkpoints.records import DamagedError, RefusedError, Strided
+from rgbt.checkpoints.torch_files import read_pickles, read_zip
+from rgbt.checks import InputError
+
+ZIP = "torch.save"
+"""Name of the format that checkpoints have."""
+
+DAMAGE = (
+    DamagedError,
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+)
+"""What overwritten or invented bytes lead to, wherever they are made sense of."""
+
+PLAIN = (str, int, float, bool, type(None))
+DEPTH = 20
+"""Levels of containers in a value of ours; state_dict() of optimisers have four."""
+
+
+@contextmanager
+def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
+    """Turn what is wrong with the content of a file into one sentence.
+
+    Args:
+        path: of the file.
+        kind: what it was read as: "a file of weights".
+        advice: what to do about a damaged one: "copy or download it again".
+
+    Raises:
+        InputError: refused or damaged.
+    """
+    try:
+        yield
+    except InputError:  # a ValueError too, and said already
+        raise
+    except RefusedError as refusal:
+        raise InputError(f"{path} {refusal}") from refusal
+    except DAMAGE as damage:
+        raise InputError(
+            f"{path} cannot be read as {kind}: it is cut short, damaged, or of another kind; "
+            f"{advice}."
+        ) from damage
+
+
+def read_stored(path: Path) -> tuple[Any, str]:
+    """The value of a file of torch.save or pickle, and the name of its format.
+
+    Tensors are `Strided` or `Array`, objects of known classes `Inert`.
+
+    Raises:
+        RefusedError: it asks for code, for far more memory than it has bytes, or is another kind of
+            file.
+        DamagedError: one of `DAMAGE`: it is cut short or overwritten.
+    """
+    beginning = beginning_of(path)
+    if beginning.startswith(b"PK\x03\x04"):
+        return read_zip(path), ZIP
+    _refuse_others(beginning)
+    return read_pickles(mapped(path))
+
+
+def beginning_of(path: Path) -> bytes:
+    """The first 512 bytes.
+
+    Raises:
+        InputError: there is no such file, or nothing in it.
+    """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file of weights in it.")
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file of weights.")
+    with path.open("rb") as file:
+        beginning = file.read(512)
+    if not beginning:
+        raise InputError(f"{path} is empty; copy or download it again.")
+    return beginning
+
+
+def _refuse_others(beginning: bytes) -> None:
+    """Name what is often saved or downloaded in the place of weights."""
+    text = beginning.lstrip().lower()
+    if text.startswith(b"version https://git-lfs"):
+        raise RefusedError(
+            "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
+        )
+    if text.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
+        raise RefusedError(
+            "is a web page, probably of the host's download button; download it again."
+        )
+    if beginning[257:262] == b"ustar":
+        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
+    if beginning.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")):
+        raise RefusedError("is a compressed archive; unpack it and name the file of weights.")
+    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
+        raise RefusedError(
+            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
+        )
+
+
+def plain(value: Any, num_bytes: int) -> Any:
+    """A value of ours with its tensors copied out of the file.
+
+    Args:
+        value: see `read_stored`.
+        num_bytes: size of the file, which bounds what all tensors together may take.
+
+    Raises:
+        RefusedError: the tensors would take far more.
+        TypeError: anything but dictionaries, lists and tuples of plain values and tensors.
+        DamagedError: a tensor reaches outside its storage.
+    """
+    return _Copies(GROWTH * num_bytes + SMALL).of(value, DEPTH)
+
+
+class _Copies:
+    """Copies within a budget of bytes; one container in many places is copied once."""
+
+    def __init__(self, budget: int) -> None:
+        self.budget = budget
+        self.known: dict[int, Any] = {}
+
+    def of(self, value: Any, depth: int) -> Any:
+        if type(value) is str:
+            # One object for equal texts, as in a program: what is saved again has the same bytes.
+            return sys.intern(value)
+        if type(value) in PLAIN:
+            return value
+        if id(value) not in self.known:
+            self.known[id(value)] = self._made(value, depth)
+        return self.known[id(value)]
+
+    def _made(self, value: Any, depth: int) -> Any:
+        if depth == 0:
+            raise TypeError("too many levels")
+        if isinstance(value, Strided):
+            self.budget -= value.num_bytes
+            if self.budget < 0:
+                raise RefusedError.greedy()
+            return value.tensor().clone()
+        if type(value) is dict:
+            if not all(type(key) in (str, int) for key in value):
+                raise TypeError("not a plain key")
+            pairs = value.items()
+            return {self.of(key, depth): self.of(each, depth - 1) for key, each in pairs}
+        if type(value) in (list, tuple):
+            return type(value)(self.of(each, depth - 1) for each in value)
+        raise TypeError("not a plain value")
+
+
+class _Hashing:
+    """Hands on what is written, and hashes it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.digest = hashlib.sha256()
+
+    def write(self, content: bytes) -> int:
+        self.digest.update(content)
+        return self.file.write(content)
+
+    def flush(self) -> None:
+        self.file.flush()
+
+
+def save(path: Path, value: Any) -> None:
+    """Write tensors and plain values with their digest: a whole file, or none.
+
+    Raises:
+        OSError: the file cannot be written; an older one of this name is left as it was.
+    """
+    # One name: what a killed process left half written is overwritten, never piled up.
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        with temporary.open("wb") as file:
+            hashing = _Hashing(file)
+            torch.save(value, cast(IO[bytes], hashing))
+            # torch ends the archive without a comment: its length is the last two bytes.
+            file.seek(-2, os.SEEK_CUR)
+            file.write(struct.pack("<H", COMMENT_LENGTH))
+            file.write(comment_of(hashing.digest.hexdigest()))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,191 @@
+"""The checkpoints in a run's folder, of which one rename commits a state as a whole.
+
+====================  ============================================================================
+last.pt               the committed state: model, optimisers, step, and which step is the best
+last_previous.pt      the state committed before it, for the case that last.pt is damaged
+checkpoints/<step>/   what the evaluation at that step made: best.pt, counts_val.npz, ...; kept for
+                      the best steps of these two states
+best.pt, ...          hard links to the files of the best step of last.pt
+====================  ============================================================================
+
+An evaluation writes its files under its step first; until last.pt names that step they count for
+nothing. What a process killed in between left is repaired on resuming.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from rgbt.checkpoints.stored import save
+from rgbt.checks import InputError, RunError
+from rgbt.engine.checkpoint import State, load_checkpoint
+
+BEST = "best.pt"
+NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES)
+"""What file systems say that know no hard links; files are copied there."""
+
+
+class Checkpoints:
+    """See the module.
+
+    Args:
+        folder: of the run.
+
+    Attributes:
+        warning: after `load`: what was wrong with last.pt, "" if nothing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.last = folder / "last.pt"
+        self.previous = folder / "last_previous.pt"
+        self.best = folder / BEST
+        self.warning = ""
+        self._by_step = folder / "checkpoints"
+        self._committed: tuple[int, int] | None = None
+        self._best_step = 0
+
+    def begin_evaluation(self, step: int) -> Path:
+        """The empty folder for the files of the evaluation at `step`."""
+        place = self._by_step / str(step)
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        return place
+
+    def save_best(self, step: int, weights: dict[str, Any]) -> None:
+        """Write the weights of an evaluation whose score is the highest, or the one that counts."""
+        place = self._by_step / str(step)
+        place.mkdir(parents=True, exist_ok=True)
+        save(place / BEST, {"model": weights, "step": step})
+
+    def commit(self, payload: dict[str, Any], state: State) -> None:
+        """Write the state of a run, unless it is the one that is committed."""
+        if self._committed == (state.step, state.evaluated_step):
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.last.exists():
+            _link(self.last, self.previous)
+        save(self.last, payload)
+        _sync(self.folder)
+        self._publish(state.best_step)
+        kept = {str(self._best_step), str(state.best_step)}
+        for place in self._by_step.glob("*"):
+            if place.name not in kept:
+                shutil.rmtree(place)
+        self._committed = state.step, state.evaluated_step
+        self._best_step = state.best_step
+
+    def load(self) -> tuple[dict[str, Any], State] | None:
+        """The committed payload and its state; None before there is any.
+
+        Where last.pt or its best weights are damaged, the state committed before takes its place,
+        and `warning` says so.
+
+        Raises:
+            RunError: both are damaged.
+        """
+        if not self.last.exists() and not self.previous.exists():
+            return None
+        try:
+            payload, state = self._whole(self.last)
+        except InputError as damage:
+            payload, state = self._fallen_back(damage)
+        self._committed = state.step, state.evaluated_step
+        self._best_step = state.best_step
+        self._publish(state.best_step)
+        return payload, state
+
+    def load_best(self, step: int) -> dict[str, Any]:
+        """The weights of the best step, by name.
+
+        Raises:
+            InputError: the file is missing or damaged.
+            RunError: it holds the weights of another step.
+        """
+        payload = load_checkpoint(self.best)
+        if payload.get("step") != step:
+            raise RunError(
+                f"{self.best} is of step {payload.get('step')}, the best evaluation of this run of "
+                f"step {step}; {self._begin_again()}"
+            )
+        weights: dict[str, Any] = payload["model"]
+        return weights
+
+    def tidy(self) -> None:
+        """Remove what only resuming needs, once nothing is left to train."""
+        self.previous.unlink(missing_ok=True)
+        shutil.rmtree(self._by_step, ignore_errors=True)
+
+    def _whole(self, path: Path) -> tuple[dict[str, Any], State]:
+        """A committed state whose best weights are there too.
+
+        Raises:
+            InputError: one of both is missing or damaged.
+        """
+        payload = load_checkpoint(path)
+        try:
+            state = State.of(payload)
+        except TypeError as error:
+            raise InputError(f"{path} holds no state of a training.") from error
+        named = self._by_step / str(state.best_step) / BEST
+        # Runs of before there was this folder have their best weights beside last.pt.
+        best = load_checkpoint(named if named.exists() else self.best) if state.best_step else {}
+        # A later one was written by a process that was killed before it committed it.
+        if best and best.get("step") != state.best_step and best["step"] <= state.step:
+            raise InputError(f"{self.best} is not of step {state.best_step}.")
+        return payload, state
+
+    def _fallen_back(self, damage: InputError) -> tuple[dict[str, Any], State]:
+        reason = str(damage).partition(";")[0].rstrip(".")
+        if not self.previous.exists():
+            raise RunError(f"{reason}; {self._begin_again()}") from damage
+        try:
+            payload, state = self._whole(self.previous)
+        except InputError as error:
+            raise RunError(
+                f"{reason}, and the checkpoint before it is no better ({self.previous.name}); "
+                f"{self._begin_again()}"
+            ) from error
+        if self.last.exists():
+            self.warning = f"{reason}; the run resumes from the checkpoint before it."
+        _link(self.previous, self.last)
+        return payload, state
+
+    def _begin_again(self) -> str:
+        return f"remove {self.folder} and rerun the command to train the run from its start."
+
+    def _publish(self, step: int) -> None:
+        """Let the names that others read stand for the files of the best step."""
+        for source in (self._by_step / str(step)).glob("*"):
+            _link(source, self.folder / source.name)
+
+
+def _link(source: Path, target: Path) -> None:
+    """Make `target` another name of `source`, replacing what it was; never a moment without."""
+    if target.exists() and target.samefile(source):
+        return
+    temporary = target.with_name(f".{target.name}.partial")
+    temporary.unlink(missing_ok=True)
+    try:
+        try:
+            os.link(source, temporary)
+        except OSError as error:
+            if error.errno not in NO_LINKS:
+                raise
+            shutil.copy2(source, temporary)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync(folder: Path) -> None:
+    """Bring the names in a folder to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

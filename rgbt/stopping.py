@@ -1,0 +1,139 @@
+"""Signals that end a command: answered at once, or between two steps of a training.
+
+Ctrl-C and SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away)
+raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file is left half
+done; inside `at_once` within it they are answered again.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+WORDS = {
+    signal.SIGINT: "interrupted",
+    signal.SIGTERM: "stopped by SIGTERM",
+    signal.SIGHUP: "stopped by SIGHUP",
+}
+
+
+class Stopped(KeyboardInterrupt):
+    """The first signal that ends a command, raised where nothing is half done.
+
+    Attributes:
+        number: of the signal.
+        step: of the checkpoint that was written for it; None where there was nothing to save.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+        self.step: int | None = None
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command."""
+        return 128 + self.number
+
+    def __str__(self) -> str:
+        saved = "" if self.step is None else f" at step {self.step}, which is saved"
+        return f"{WORDS[signal.Signals(self.number)]}{saved}; rerun the command to resume."
+
+
+@dataclass
+class _Signals:
+    """The first signal that came (0: none), whether it was raised, whether it waits."""
+
+    number: int = 0
+    is_raised: bool = False
+    is_deferred: bool = False
+
+
+_signals = _Signals()
+
+
+@contextmanager
+def answered() -> Iterator[None]:
+    """Answer the signals of `WORDS`, but for those that the process was started to ignore (nohup).
+
+    Clusters signal a process more than once: the first one counts. A second Ctrl-C stops at once.
+    """
+    process = os.getpid()
+    terminals = [stream for stream in (1, 2) if os.isatty(stream)]
+
+    def answer(number: int, frame: FrameType | None) -> None:
+        del frame
+        if os.getpid() != process:  # a process forked from us: it has nothing to tidy up
+            os._exit(128 + number)
+        if number == signal.SIGHUP:
+            _leave(terminals)
+        if _signals.number == 0:
+            _signals.number = number
+            if not _signals.is_deferred:
+                _raise_noted()
+        elif number == signal.SIGINT:
+            raise KeyboardInterrupt
+
+    global _signals
+    outer, _signals = _signals, _Signals()
+    before = {number: signal.getsignal(number) for number in WORDS}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, answer)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _signals = outer
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Note signals; the one that came is raised on leaving, or by `at_once`.
+
+    An error after it is taken for its consequence: processes that were started just now end.
+    """
+    before, _signals.is_deferred = _signals.is_deferred, True
+    try:
+        yield
+    except Exception:
+        _raise_noted()
+        raise
+    finally:
+        _signals.is_deferred = before
+    if not before:
+        _raise_noted()
+
+
+@contextmanager
+def at_once() -> Iterator[None]:
+    """Inside `deferred`: raise the signal that came, and others when they come.
+
+    Raises:
+        Stopped: a signal came.
+    """
+    before, _signals.is_deferred = _signals.is_deferred, False
+    try:
+        _raise_noted()
+        yield
+    finally:
+        _signals.is_deferred = before
+
+
+def _raise_noted() -> None:
+    if _signals.number and not _signals.is_raised:
+        _signals.is_raised = True
+        raise Stopped(_signals.number)
+
+
+def _leave(terminals: list[int]) -> None:
+    """What is written to a terminal that was closed is lost, and not an error."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in terminals:
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
