@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, is_typeddict
+from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the command line answers --help without waiting for torch
     from pydantic import TypeAdapter
@@ -138,6 +138,7 @@ def parse_json(text: bytes | str, form: Any) -> Any:
         ValueError: no JSON in UTF-8, another type than `form`, or another check sum.
     """
     import pydantic
+    from typing_extensions import is_typeddict
 
     try:
         found = json.loads(text)
@@ -176,19 +177,17 @@ def _adapter(form: Any) -> TypeAdapter[Any]:
     return TypeAdapter(form)
 
 
-def check_array(file: IO[bytes], path: Path, size: int) -> tuple[str, tuple[int, ...]]:
+def check_array(file: IO[bytes], size: int) -> tuple[str, tuple[int, ...]]:
     """Check the header of an array in NumPy's format before anything is allocated for it.
 
     Args:
         file: at the beginning of the array; afterwards behind its header.
-        path: for messages.
         size: bytes of header and values together.
 
     Returns:
         kind of its numbers (`numpy.dtype.kind`), and shape.
 
     Raises:
-        InputError: it is larger than `ARRAYS` allows.
         ValueError: no array, one of Python objects, or one of another size than its header says.
     """
     import math
@@ -207,7 +206,6 @@ def check_array(file: IO[bytes], path: Path, size: int) -> tuple[str, tuple[int,
     if dtype.hasobject:
         raise ValueError("it holds Python objects, which are not read")
     wanted = math.prod(shape) * dtype.itemsize
-    ARRAYS.check(path, wanted)
     if any(length < 0 for length in shape) or wanted != size - file.tell():
         raise ValueError(f"its header announces {wanted} bytes, there are {size - file.tell()}")
     return dtype.kind, tuple(shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +22,7 @@ from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.identity import run_key
 from rgbt.metrics import names, scores
+from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe
 from rgbt.prepared import Prepared, prepare
@@ -35,7 +35,6 @@ from rgbt.session import (
     result_tables,
     view_of,
 )
-from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.pair_pictures import draw_pairs
@@ -183,19 +182,25 @@ class Run:
     ) -> dict[str, dict[str, float | None]]:
         """What the best checkpoint reached on the selection split and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        found = {"val": lines["val", state.best_step], "test": lines["test", state.step]}
+        val = lines.get(("val", state.best_step)) or self._validated()
+        found = {"val": val, "test": lines["test", state.step]}
         found = {
             kind: {**values, **(consistency_values(pairs[kind]) if kind in pairs else {})}
             for kind, values in found.items()
         }
         return {kind: without_nan(values) for kind, values in found.items()}
 
+    def _validated(self) -> dict[str, float]:
+        """Scores of the best checkpoint from its counts, where their line was damaged."""
+        session = self.prepared.session
+        path = self.folder.counts_path(session.trainer.selection_split)
+        return scores.summary(Counts.load(path), session.regions.absent)
+
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was begun on other images."""
-        marker = self.folder.path / "dataset.json"
         dataset = session.dataset
         found = {"names": names_key(session), "files": dataset.fingerprint()}
-        begun = json.loads(marker.read_text()) if marker.exists() else found
+        begun = self.folder.marker() or found
         if begun["names"] != found["names"]:
             raise InputError(
                 f"{self.folder.path} was begun on other images than the lists of {dataset.root} "
@@ -204,7 +209,7 @@ class Run:
             )
         if begun["files"] != found["files"]:
             tell(f"files of {dataset.root} have changed since this run was begun.")
-        write_atomic(marker, json.dumps(found).encode())
+        self.folder.mark(**found)
         config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
         self.folder.write_config(config)
         self.folder.add_provenance(provenance())
@@ -214,13 +219,31 @@ class Run:
         trainer = self._trainer(session, state)
         if trainer.resume(state):
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
-        self.folder.truncate_after(state.step)
+        self._truncate(state.step)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = self.prepared.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
         self._tell_waiting(session)
         return state
+
+    def _truncate(self, step: int) -> None:
+        """Prepare ``metrics.jsonl`` for a run that resumes at `step`; say what of it is lost."""
+        damaged = self.folder.truncate_after(step)
+        logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
+        every = max([self.prepared.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
+        if step - logged[-1] >= every:
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
+                f"checkpoint is of step {step}; the lines between are missing, counts and "
+                "checkpoint are not affected."
+            )
+        if damaged:
+            more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} was damaged ({damaged[0]}{more}); "
+                "these lines are left out, metrics.jsonl.damaged holds the file as it was."
+            )
 
     def _tell_waiting(self, session: Session) -> None:
         """Say so where the training mostly waited for images, and what helps."""

@@ -170,7 +170,7 @@ def _headers(archive: zipfile.ZipFile, path: Path) -> dict[str, Header]:
         if name in headers or not is_ours:
             raise ValueError("its directory is damaged")
         with archive.open(entry) as member:
-            headers[name] = check_array(member, path, entry.file_size)
+            headers[name] = check_array(member, entry.file_size)
     return headers
 
 

@@ -58,7 +58,7 @@ def test_lines_are_read_as_written(tmp_path: Path) -> None:
     assert second.values["mIoU"] == 0.25
     assert math.isnan(second.values["class/bump"])
     written = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[1])
-    assert set(written) == {"step", "kind", "time", "values"}
+    assert set(written) == {"step", "kind", "time", "values", "crc32"}
     assert written["values"]["class/bump"] is None
 
 
@@ -156,7 +156,7 @@ def test_small_files_come_back(tmp_path: Path) -> None:
 
 def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("{")
-    with pytest.raises(InputError, match=r"result\.json is not JSON"):
+    with pytest.raises(InputError, match=r"result\.json is damaged \(.*\); restore it"):
         RunFolder(tmp_path).result()
     with pytest.raises(InputError, match="no such folder"):
         runs_in(tmp_path / "missing")
