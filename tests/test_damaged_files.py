@@ -6,6 +6,7 @@ import json
 import operator
 import re
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -17,7 +18,10 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError, RunError, sealed
+from tests.commands import Call, Trained, short, train
 from tests.damage import damaged
+
+WORDS = ("+experiment=grbm", *short(4))
 
 HEADROOM = 2**30
 """Bytes that reading a small damaged file may ask for at most."""
@@ -581,3 +585,40 @@ def test_fifty_damaged_files(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", KINDS)
 def test_a_thousand_damaged_files(name: str, tmp_path: Path) -> None:
     check(name, tmp_path, 1000)
+
+
+@pytest.mark.slow
+def test_a_run_resumes_with_damaged_lines_and_says_what_it_leaves_out(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    made = trained("+experiment=grbm", *short(4))
+    folder = tmp_path / "runs" / made.name
+    shutil.copytree(made, folder)
+    whole = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    before = json.loads((folder / "result.json").read_text())
+    (folder / "result.json").unlink()
+    kept = [
+        line.replace('"kind": "val"', '"kind": "vel"') for line in whole if '"test"' not in line
+    ]
+    (folder / "metrics.jsonl").write_text("".join(kept[:1] + kept))
+    code, _, err = train(call, made.parents[1] / "mf", tmp_path / "runs", *WORDS)
+    assert code == 0, err
+    assert "metrics.jsonl was damaged (line 2: step 1 comes after 1 and 1 more); these lines" in err
+    after = json.loads((folder / "result.json").read_text())
+    assert {**after["val"]} == before["val"], "recomputed from the counts of the best checkpoint"
+    assert after["test"] == before["test"]
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    assert lines[:4] == [line for line in whole if '"train"' in line]
+
+
+@pytest.mark.slow
+def test_a_log_that_was_cut_off_is_reported(call: Call, trained: Trained, tmp_path: Path) -> None:
+    made = trained("+experiment=grbm", *short(4))
+    folder = tmp_path / "runs" / made.name
+    shutil.copytree(made, folder)
+    (folder / "result.json").unlink()
+    first = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)[0]
+    (folder / "metrics.jsonl").write_text(first + first[:20])
+    code, _, err = train(call, made.parents[1] / "mf", tmp_path / "runs", *WORDS)
+    assert code == 0, err
+    assert "metrics.jsonl ends at step 1, the checkpoint is of step 4; the lines between" in err

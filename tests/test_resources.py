@@ -1,4 +1,4 @@
-"""A full disk and exhausted memory: one sentence, exit code 1, and nothing that was saved is lost."""
+"""A full disk and exhausted memory: one sentence, exit code 1, nothing that was saved is lost."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def hidden() -> BaseException:
         try:
             raise full()
         except OSError:
-            raise RuntimeError("unexpected pos 2680384 vs 2680304")
+            raise RuntimeError("unexpected pos 2680384 vs 2680304")  # noqa: B904 - as there
     except RuntimeError as error:
         return error
 
