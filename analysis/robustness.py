@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from analysis.results import Stored, open_counts, split_words
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, nearest, read_json
 from rgbt.metrics.counts import Counts
 
 FOLDER = Path("evaluations") / "robustness"
@@ -168,13 +167,9 @@ def _level(path: Path) -> Level:
 
 
 def _read(path: Path) -> Any:
-    try:
-        made = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path} cannot be read ({error}); remove it, and python -m rgbt.robustness makes it "
-            "again."
-        ) from error
-    if not isinstance(made, dict) or made.get("format") != FORMAT:
+    made = read_json(
+        path, dict[str, Any], "remove it, and python -m rgbt.robustness makes it again"
+    )
+    if made.get("format") != FORMAT:
         raise InputError(f"{path} is not of python -m rgbt.robustness; name another folder.")
     return made

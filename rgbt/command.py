@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.config import build, check, check_node, compose, conf_dir, register_resolvers
+from rgbt.resources import reporting_exhaustion
 from rgbt.stopping import Stopped, answered
 
 Main = Callable[[DictConfig], int | None]
@@ -114,7 +115,8 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
         catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
     """
     try:
-        return work() or 0
+        with reporting_exhaustion():
+            return work() or 0
     except InputError as error:
         return _say(str(error), 2)
     except RunError as error:
@@ -135,8 +137,11 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
 
 
 def _say(sentence: str, code: int) -> int:
-    sys.stdout.flush()
-    sys.stderr.write(f"rgbt: {sentence}\n")
+    with suppress(OSError):  # output may go to a file on a disk that is full
+        sys.stdout.flush()
+    # Names of files and words of damaged files may hold anything, such as codes of a terminal.
+    plain = "".join(each if each.isprintable() or each == "\n" else "?" for each in sentence)
+    sys.stderr.write(f"rgbt: {plain}\n")
     return code
 
 

@@ -5,7 +5,6 @@ TC says how far the predictions of two frames of a scene agree, CA how far both 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -178,9 +177,10 @@ def _keep_other_motions(session: Session, path: Path) -> None:
 
 def _other_images(folder: Path, session: Session) -> list[str]:
     """Part of a file's name where a run is measured on images that it was not trained with."""
-    marker = folder.parent / "dataset.json"
-    found = session.dataset.fingerprint()
-    if not marker.is_file() or json.loads(marker.read_text())["files"] == found:
+    from rgbt.tracking.formats import read_marker
+
+    marker, found = read_marker(folder.parent), session.dataset.fingerprint()
+    if marker is None or marker["files"] == found:
         return []
     return [f"{session.dataset.name}-{found[:8]}"]
 

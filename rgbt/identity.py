@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, nearest, read_json
 from rgbt.config import NODES, OF_THE_RUN, check, compose, conf_dir, typed
 
 SHARED = (
@@ -116,11 +116,8 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
             f"pseudo-labels that is finished, but there is no {path}; write it with "
             "python -m rgbt.predict ... pseudo_labels=true."
         )
-    try:
-        found = json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(f"{path} is damaged ({error}); remove it and predict again.") from error
-    if not isinstance(found, dict) or "digest" not in found:
+    found: dict[str, Any] = read_json(path, dict[str, Any], "remove it and predict again")
+    if "digest" not in found:
         raise InputError(f"{path} does not describe pseudo-labels; predict into another folder.")
     return found
 

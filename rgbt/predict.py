@@ -153,8 +153,11 @@ def _head(asked: str) -> TestedHead | None:
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
     import cv2
 
-    if not cv2.imwrite(str(path), image):
-        raise InputError(f"{path} could not be written; is the folder writable, the disk full?")
+    from rgbt.tracking.files import write_atomic
+
+    encoded, content = cv2.imencode(".png", image)
+    assert encoded, "8 bit images can be encoded"
+    write_atomic(path, content.tobytes())
 
 
 def _classes(

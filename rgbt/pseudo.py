@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from rgbt.checks import InputError, RunError, check_range
+from rgbt.checks import InputError, RunError, check_range, read_json, sealed
 from rgbt.command import composing
 from rgbt.config import build, check_node, compose
 from rgbt.data.batches import Dataset
@@ -266,7 +266,9 @@ def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     if finished:
         _refuse_others(out, PseudoLabels(out).manifest, settings)
     elif (out / BEGUN).exists():
-        _refuse_others(out, json.loads((out / BEGUN).read_text()), settings)
+        _refuse_others(
+            out, read_json(out / BEGUN, dict[str, Any], "remove it and predict again"), settings
+        )
     return finished
 
 
@@ -370,4 +372,4 @@ def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict
 
 
 def _text(values: dict[str, Any]) -> bytes:
-    return (json.dumps(values, indent=1) + "\n").encode()
+    return (json.dumps(sealed(values), indent=1) + "\n").encode()

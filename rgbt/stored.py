@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.session import Session, names_key, open_session
 from rgbt.stored_config import load_config
 from rgbt.tracking.folder import find_run
+from rgbt.tracking.formats import read_marker
 from rgbt.tracking.terminal import tell
 from rgbt.yaml_files import parse_yaml
 
@@ -151,14 +151,13 @@ def _tell_other_splits(folder: Path, trained_on: str | None, session: Session) -
     Lists that were changed, or shares that are drawn anew as files come and go: images of the
     training may be among those that are measured.
     """
-    marker = folder / "dataset.json"
     if trained_on is None or session.config.dataset.get("name") != trained_on:
         return
     try:
-        now, begun = names_key(session), json.loads(marker.read_text())["names"]
-    except (InputError, OSError, ValueError, KeyError):
+        now, begun = names_key(session), read_marker(folder)
+    except (InputError, OSError):
         return  # nothing to compare with
-    if now != begun:
+    if begun is not None and now != begun["names"]:
         tell(
             f"the splits of {session.dataset.name} ({session.dataset.root}) are not those that "
             f"{folder.name} was trained with: what is measured now may hold images of its training."

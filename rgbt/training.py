@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,6 +23,7 @@ from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.identity import run_key
 from rgbt.metrics import names, scores
+from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe
 from rgbt.prepared import Prepared, prepare
@@ -36,7 +36,6 @@ from rgbt.session import (
     result_tables,
     view_of,
 )
-from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.pair_pictures import draw_pairs
@@ -188,19 +187,25 @@ class Run:
     ) -> dict[str, dict[str, float | None]]:
         """What the best checkpoint reached on the selection split and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        found = {"val": lines["val", state.best_step], "test": lines["test", state.step]}
+        val = lines.get(("val", state.best_step)) or self._validated()
+        found = {"val": val, "test": lines["test", state.step]}
         found = {
             kind: {**values, **(consistency_values(pairs[kind]) if kind in pairs else {})}
             for kind, values in found.items()
         }
         return {kind: without_nan(values) for kind, values in found.items()}
 
+    def _validated(self) -> dict[str, float]:
+        """Scores of the best checkpoint from its counts, where their line was damaged."""
+        session = self.prepared.session
+        path = self.folder.counts_path(session.trainer.selection_split)
+        return scores.summary(Counts.load(path), session.regions.absent)
+
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was begun on other images."""
-        marker = self.folder.path / "dataset.json"
         dataset = session.dataset
         found = {"names": names_key(session), "files": dataset.fingerprint()}
-        begun = json.loads(marker.read_text()) if marker.exists() else found
+        begun = self.folder.marker() or found
         if begun["names"] != found["names"]:
             raise InputError(
                 f"{self.folder.path} was begun on other images than the lists of {dataset.root} "
@@ -209,7 +214,7 @@ class Run:
             )
         if begun["files"] != found["files"]:
             tell(f"files of {dataset.root} have changed since this run was begun.")
-        write_atomic(marker, json.dumps(found).encode())
+        self.folder.mark(**found)
         config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
         self.folder.write_config(config)
         self.folder.add_provenance(provenance())
@@ -221,8 +226,7 @@ class Run:
             if trainer.checkpoints.warning:
                 tell(trainer.checkpoints.warning)
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
-        self._tell_repeated(state.step)
-        self.folder.truncate_after(state.step, state.evaluated_step)
+        self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = self.prepared.batches(steps)
@@ -230,11 +234,27 @@ class Run:
         self._tell_waiting(session)
         return state
 
-    def _tell_repeated(self, step: int) -> None:
-        """Say how many steps of a process that was killed were not saved."""
-        reached = max((line.step for line in self.folder.lines()), default=0)
-        if reached > step:
-            tell(f"steps {step + 1} to {reached} were not saved before and are repeated.")
+    def _truncate(self, state: State) -> None:
+        """Prepare ``metrics.jsonl`` for a run that resumes; say what is repeated or lost of it."""
+        step = state.step
+        before = self.folder.truncate_after(step, state.evaluated_step)
+        if before.reached > step:
+            tell(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
+        logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
+        every = max([self.prepared.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
+        if step - logged[-1] >= every:
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
+                f"checkpoint is of step {step}; the lines between are missing, counts and "
+                "checkpoint are not affected."
+            )
+        if before.damaged:
+            more = f" and {len(before.damaged) - 1} more" if len(before.damaged) > 1 else ""
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} was damaged "
+                f"({before.damaged[0]}{more}); "
+                "these lines are left out, metrics.jsonl.damaged holds the file as it was."
+            )
 
     def _tell_waiting(self, session: Session) -> None:
         """Say so where the training mostly waited for images, and what helps."""

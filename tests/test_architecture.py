@@ -31,8 +31,9 @@ ALLOWED = {
     "identity.py": {"rgbt.checks", "rgbt.config"},
     "yaml_files.py": {"rgbt.checks"},
     "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
-    "command.py": {"rgbt.checks", "rgbt.config", "rgbt.stopping"},
     "stopping.py": set(),
+    "command.py": {"rgbt.checks", "rgbt.config", "rgbt.resources", "rgbt.stopping"},
+    "resources.py": {"rgbt.checks"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""

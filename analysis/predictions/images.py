@@ -7,6 +7,7 @@ one the method meant (PASCAL VOC's palette holds colours of MFNet at other indic
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Iterable
@@ -17,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, one_line
+from rgbt.data.integrity import PNG, UNREADABLE, read_image
 from rgbt.types import IGNORE
 
 Format = Literal["auto", "index", "colour"]
 Kind = Literal["one channel", "a palette", "colours"]
 Array = NDArray[np.uint8]
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KINDS: dict[int, Kind] = {0: "one channel", 2: "colours", 3: "a palette", 6: "colours"}
 """PNG's colour types (PNG specification, 11.2.2) as far as a label image can have them."""
 
@@ -49,7 +50,7 @@ def read_header(path: Path) -> Header:
     """
     with path.open("rb") as file:
         start = file.read(26)
-    if len(start) < 26 or not start.startswith(SIGNATURE):
+    if len(start) < 26 or not start.startswith(PNG):
         raise InputError(f"{path} is no PNG file, or a damaged one; write the prediction again.")
     bits, colour_type = struct.unpack("BB", start[24:26])
     if bits > 8:
@@ -227,20 +228,15 @@ def _decode(path: Path, mode: Literal["stored", "RGB"] = "stored") -> Array:
 
     Pillow, because OpenCV shows palettes as colours and cannot give their indices.
     """
+    data = read_image(path, "write the prediction again")
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(data)) as image:
             if mode == "stored":
                 return np.array(image, np.uint8)
             shown = image.convert("RGBA")
-    except Image.DecompressionBombError as error:
-        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+    except (*UNREADABLE, zlib.error) as error:
         raise InputError(
-            f"{path} says that it holds more than {most} pixels, too many for a label image; write "
-            "the prediction again."
-        ) from error
-    except (OSError, SyntaxError, ValueError, zlib.error) as error:
-        raise InputError(
-            f"{path} cannot be decoded ({error}); write the prediction again."
+            f"{path} cannot be decoded ({one_line(error)}); write the prediction again."
         ) from error
     rgba: Array = np.array(shown, np.uint8)
     if (rgba[..., 3] < 255).any():

@@ -14,7 +14,14 @@ from rgbt.metrics.counts import scored_classes
 from rgbt.metrics.metric import Absent
 
 ARCHIVE = Archive(
-    "rgbt pixel maps 1", "pixel maps", "it is the maps.npz that python -m analysis.score writes"
+    "rgbt pixel maps 1",
+    "pixel maps",
+    "it is the maps.npz that python -m analysis.score writes",
+    {
+        **{"intersection": "iu K H W", "union": "iu K H W", "images": "iu", "classes": "U K"},
+        **{"palette": "iu K 3", "dataset": "U", "split": "U", "name": "U", "unscored": "U L"},
+    },
+    optional=("unscored",),
 )
 
 BYTES_HOLD = 255
@@ -80,17 +87,18 @@ class PixelMaps:
             InputError: no such file, or not a file of pixel maps.
         """
         values = ARCHIVE.load(path)
-        return cls(
-            intersection=values["intersection"],
-            union=values["union"],
-            images=int(values["images"]),
-            classes=tuple(values["classes"].tolist()),
-            palette=tuple((r, g, b) for r, g, b in values["palette"].tolist()),
-            dataset=str(values["dataset"]),
-            split=str(values["split"]),
-            name=str(values["name"]),
-            unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
-        )
+        with ARCHIVE.refusing(path):
+            return cls(
+                intersection=values["intersection"],
+                union=values["union"],
+                images=int(values["images"]),
+                classes=tuple(values["classes"].tolist()),
+                palette=tuple((r, g, b) for r, g, b in values["palette"].tolist()),
+                dataset=str(values["dataset"]),
+                split=str(values["split"]),
+                name=str(values["name"]),
+                unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
+            )
 
 
 class MapSum:

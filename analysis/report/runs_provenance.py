@@ -10,6 +10,7 @@ from typing import Any
 
 from analysis.report.store import Files
 from rgbt.checks import InputError
+from rgbt.tracking.formats import read_provenance as provenance_of
 from rgbt.tracking.provenance import without_passwords
 
 COMMIT_LENGTH = 10
@@ -77,18 +78,16 @@ def read_provenance(files: Files, key: str, remarks: list[str]) -> list[dict[str
         remarks: gets a sentence where the file is damaged, or where the code changed on the way.
     """
     try:
-        text = files.text("provenance.json")
-        processes = [] if text is None else json.loads(text)
-        if not isinstance(processes, list):
-            raise InputError("it is no list")
-    except (InputError, json.JSONDecodeError) as error:
-        remarks.append(f"Run {key}: provenance.json cannot be read ({error}).")
+        found = files.find("provenance.json")
+        processes = [] if found is None else provenance_of(found)
+    except InputError as error:
+        remarks.append(f"Run {key}: provenance.json cannot be read ({str(error).rstrip('.')}).")
         return []
     commits = dict.fromkeys(commit_of(process) for process in processes)
     if len(commits) > 1:
         told = ", then ".join(commit or "no commit" for commit in commits)
         remarks.append(f"Run {key} was begun and continued by different code: {told}.")
-    return [dict(process) for process in processes]
+    return processes
 
 
 def commit_of(process: Mapping[str, Any]) -> str:

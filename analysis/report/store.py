@@ -227,17 +227,15 @@ class _Places:
 
 def _is_same(folder: Path, tags: Mapping[str, str], status: str) -> bool:
     """Whether a run folder holds what MLflow tells: the same configuration on the same images."""
-    import json
+    from rgbt.tracking.formats import read_result
 
-    path = folder / "result.json"
-    if not path.is_file():
-        return status != "FINISHED" and (folder / "run.json").is_file()
     try:
-        result = json.loads(path.read_text())
-    except (OSError, ValueError):
+        result = read_result(folder)
+    except InputError:
         return False
-    known = tags.get("rgbt.dataset", "")
-    return isinstance(result, dict) and known in ("", result.get("dataset"))
+    if result is None:
+        return status != "FINISHED" and (folder / "run.json").is_file()
+    return tags.get("rgbt.dataset", "") in ("", result.get("dataset"))
 
 
 def _stored(run: Any, places: _Places) -> StoredRun:

@@ -17,12 +17,6 @@ from rgbt.checks import InputError, check_choice
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.names import DAY, NIGHT
 
-ARCHIVE = Archive(
-    "rgbt spatial statistics 1",
-    "statistics",
-    "write it with python -m analysis.spatial dataset=... out=...",
-)
-
 MODALITIES = ("rgb", "thermal")
 """Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits."""
 
@@ -33,6 +27,19 @@ NOISE = "noise/"
 ARRAYS = ("palette", "region_map", "labels", "ignored", "occupied", "laplacian", "mean")
 TEXTS = ("dataset", "fingerprint", "split", "partition", "kernel")
 LISTS = ("classes", "names", "parts")
+
+ARCHIVE = Archive(
+    "rgbt spatial statistics 1",
+    "statistics",
+    "write it with python -m analysis.spatial dataset=... out=...",
+    {
+        **{"palette": "iu K 3", "region_map": "iu H W", "labels": "iu N R K"},
+        **{"ignored": "iu N R", "occupied": "iu P K H W", "laplacian": "f N 2 R"},
+        **{"mean": "f N 2 R", "night": "b M", NOISE: "f N 2 R"},
+        **{"classes": "U K", "names": "U N", "parts": "U P"},
+        **dict.fromkeys(TEXTS, "U"),
+    },
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,11 +180,14 @@ class SpatialStatistics:
             InputError: no such file, or not a file of statistics.
         """
         values = ARCHIVE.load(path)
-        night = values["night"].astype(bool)
-        fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
-        fields |= {key: str(values[key]) for key in TEXTS}
-        fields |= {key: tuple(values[key].tolist()) for key in LISTS}
-        fields["noise"] = {
-            key.removeprefix(NOISE): array for key, array in values.items() if key.startswith(NOISE)
-        }
-        return cls(night=night if len(night) else None, **fields)
+        with ARCHIVE.refusing(path):
+            night = values["night"].astype(bool)
+            fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
+            fields |= {key: str(values[key]) for key in TEXTS}
+            fields |= {key: tuple(values[key].tolist()) for key in LISTS}
+            fields["noise"] = {
+                key.removeprefix(NOISE): array
+                for key, array in values.items()
+                if key.startswith(NOISE)
+            }
+            return cls(night=night if len(night) else None, **fields)

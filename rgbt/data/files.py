@@ -7,8 +7,6 @@ thermal image lies in the alpha slot, so that nothing may treat the four channel
 from __future__ import annotations
 
 import io
-import tokenize
-import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -18,19 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rgbt.checks import InputError
-from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, read_image, read_whole
+from rgbt.checks import InputError, check_array, one_line
+from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
 from rgbt.data.integrity import within as within
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
 Counts = NDArray[np.uint16]
-
-NO_ARRAY = (
-    *(OSError, ValueError, SyntaxError, EOFError, MemoryError),
-    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
-"""What NumPy raises on files that are no arrays, or damaged ones."""
 
 
 def read_packed(
@@ -195,14 +187,18 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
         InputError: missing, damaged, or something else.
     """
     data = read_whole(path)
-    try:
-        array = np.load(io.BytesIO(data), allow_pickle=False)
-    except NO_ARRAY as error:
-        raise InputError(
-            f"{path} cannot be read as an array ({error}): the file is damaged or none; {LEFT_OUT}."
-        ) from error
-    if not isinstance(array, np.ndarray):
+    if data.startswith(b"PK"):
         raise InputError(f"{path}: expected {what}, got several arrays; use the original file.")
+    try:
+        check_array(io.BytesIO(data), len(data))
+        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path} cannot be read as an array ({one_line(error)}): the file is damaged or none; "
+            f"{LEFT_OUT}."
+        ) from error
     return array
 
 
@@ -256,7 +252,9 @@ def _decode(path: Path) -> Array:
 def _decoded(data: bytes, path: Path) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # a header that asks for more pixels than there can be
+    except cv2.error as error:  # a header that asks for more pixels than there can be
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError(f"{path} cannot be decoded, its pixels do not fit") from error
         image = None
     if image is None:
         raise InputError(f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}.")
@@ -268,7 +266,7 @@ def _palette_indices(data: bytes, path: Path) -> Array:
     try:
         with Image.open(io.BytesIO(data)) as image:
             return np.array(image, np.uint8)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (*UNREADABLE, zlib.error) as error:
         raise InputError(
             f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}."
         ) from error

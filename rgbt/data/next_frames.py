@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.decoded.dataset import Decoded
+from rgbt.data.files import read_array
 from rgbt.data.mfnet import MFNet
 
 FOLDER = "next"
@@ -90,18 +90,11 @@ class NextFrames:
 
     def _flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
         path = self._path(name)
-        try:
-            flow = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path} cannot be read as an array ({error}).") from error
-        is_array = isinstance(flow, np.ndarray) and np.issubdtype(flow.dtype, np.floating)
-        if not is_array or flow.shape != (*image_hw, 2):
-            what = (
-                f"{' x '.join(map(str, flow.shape))} {flow.dtype}" if is_array else "something else"
-            )
+        flow = read_array(path, "one array of rows and columns")
+        if flow.dtype.kind != "f" or flow.shape != (*image_hw, 2):
             raise InputError(
                 f"{path} must be an array of {image_hw[0]} x {image_hw[1]} x 2 real numbers (rows, "
-                f"columns) like its frame, got {what}."
+                f"columns) like its frame, got {' x '.join(map(str, flow.shape))} {flow.dtype}."
             )
         return np.asarray(flow, np.float32)
 

@@ -9,16 +9,19 @@ A folder of them (written by `rgbt.pseudo`) holds:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import (
+    Any,
+    Required,  # pydantic takes no other before Python 3.12
+)
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypedDict
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, read_json
 from rgbt.data.batches import Dataset
 from rgbt.data.files import decode, read_label
 from rgbt.types import Sample
@@ -27,6 +30,29 @@ FORMAT = "rgbt pseudo-labels 1"
 MANIFEST = "pseudo_labels.json"
 FULL = 65535
 """What confidence 1 is in a file."""
+
+
+class Manifest(TypedDict, total=False):
+    """Types in ``pseudo_labels.json``; what they mean: see `PseudoLabels`."""
+
+    format: Required[str]
+    teacher: str
+    weights: str
+    network: str
+    view: str | None
+    head: str | None
+    label_map: dict[str, Any] | None
+    threshold: float
+    dataset: str
+    fingerprint: str
+    split: str
+    classes: Required[list[str]]
+    images: int
+    skipped: list[str]
+    kept: float
+    mean_confidence: float
+    by_class: dict[str, dict[str, float | None]]
+    digest: Required[str]
 
 
 class PseudoLabels:
@@ -58,12 +84,7 @@ class PseudoLabels:
                 f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it; "
                 f"write it with python -m rgbt.predict ... out={self.folder} pseudo_labels=true."
             )
-        try:
-            self.manifest: dict[str, Any] = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise InputError(
-                f"{path} is damaged ({error}); remove it and predict again."
-            ) from error
+        self.manifest: dict[str, Any] = read_json(path, Manifest, "remove it and predict again")
         if self.manifest.get("format") != FORMAT:
             raise InputError(
                 f"{path}: expected the format '{FORMAT}', got '{self.manifest.get('format')}'; "

@@ -1,18 +1,49 @@
-"""One compressed file of arrays that says what it is: counts, pixel maps, statistics."""
+"""One compressed file of arrays that says what it is: counts, pixel maps, statistics.
+
+A file is a zip archive of arrays in NumPy's format. Nothing is unpacked before the directory of the
+archive and the headers of the arrays say that they are what the kind of file holds, and how large.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rgbt.checks import InputError
+from rgbt.checks import ARRAYS, InputError, check_array, one_line
+
+FORMAT, DIGEST = "format", "digest"
+"""Members of every archive: its mark, and the SHA-256 of all others (`_digest`)."""
+
+END = struct.Struct("<4s4H2LH")
+"""The last bytes of a zip archive without a comment: directory of how many entries and bytes."""
+
+ZIP64, ZIP64_MARK = struct.Struct("<4sLQL"), b"PK\6\7"
+"""What lies before `END` in archives of more than 4 GB, which are not read."""
+
+MOST_ENTRIES, MOST_DIRECTORY = 32, 2**14
+"""Entries and bytes of the directory; the largest kind of file has 17 entries in 1.2 kB."""
+
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+Header: TypeAlias = tuple[str, tuple[int, ...]]
+"""`numpy.dtype.kind` and shape of an array."""
+
+DAMAGED = (
+    *(ValueError, TypeError, KeyError, OSError, EOFError, OverflowError, struct.error, zlib.error),
+    *(zipfile.BadZipFile, NotImplementedError, RuntimeError),
+)
+"""What `zipfile` and NumPy raise on damaged files; RuntimeError: an encrypted member."""
 
 
 @dataclass(frozen=True)
@@ -23,18 +54,27 @@ class Archive:
         mark: written into every file; another number in it means another layout.
         what: is in it, for messages: "counts".
         advice: how such a file is made.
+        members: name -> kinds of numbers (`numpy.dtype.kind`) and sizes by letter: "iu N R K K".
+            Equal letters are equal sizes, digits are sizes themselves; a name that ends in "/"
+            stands for all that begin so.
+        optional: names of members that files of earlier versions lack.
     """
 
     mark: str
     what: str
     advice: str
+    members: Mapping[str, str]
+    optional: tuple[str, ...] = ()
 
     def save(self, path: Path, values: Mapping[str, Any]) -> None:
         """Write arrays under a temporary name, then rename: never half a file."""
+        arrays: dict[str, Any] = {FORMAT: np.array(self.mark)}
+        arrays |= {name: np.asanyarray(value) for name, value in values.items()}
+        arrays[DIGEST] = np.array(_digest(arrays))
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         try:
             with partial.open("wb") as stream:
-                np.savez_compressed(stream, **{"format": np.array(self.mark), **values})
+                np.savez_compressed(stream, **arrays)
                 stream.flush()
                 os.fsync(stream.fileno())
             partial.replace(path)
@@ -45,23 +85,106 @@ class Archive:
         """What `save` wrote, by name; nothing in the file is executed.
 
         Raises:
-            InputError: no such file, one that may not be read, or another kind of file.
+            InputError: no such file, one that may not be read, is damaged or larger than `ARRAYS`
+                allows, or another kind of file.
         """
         if not path.is_file():
             raise InputError(f"there is no file of {self.what} '{path}'; {self.advice}.")
         if not os.access(path, os.R_OK):
             raise InputError(f"'{path}' may not be read; change its permissions.")
+        with self.refusing(path), path.open("rb") as file:
+            _check_directory(file)
+            with zipfile.ZipFile(file) as archive:
+                return self._read(archive, path)
+
+    @contextmanager
+    def refusing(self, path: Path) -> Iterator[None]:
+        """Turn what is raised on a damaged file into the sentence that names it and the advice."""
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                values = {key: stored[key] for key in stored.files}
-        # TypeError: a lone array of NumPy's other format opens, but is no archive.
-        except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            yield
+        except InputError:
+            raise
+        except DAMAGED as error:
             raise InputError(
-                f"'{path}' is not a readable file of {self.what}; {self.advice}."
+                f"'{path}' is not a readable file of {self.what} ({one_line(error)}); "
+                f"{self.advice}."
             ) from error
-        if str(values.get("format")) != self.mark:
+
+    def _read(self, archive: zipfile.ZipFile, path: Path) -> dict[str, NDArray[Any]]:
+        headers = _headers(archive, path)
+        is_text = headers.get(FORMAT, ("", ()))[0] == "U"
+        mark = one_line(_array(archive, FORMAT)) if is_text else "none"
+        if mark != self.mark:
             raise InputError(
                 f"'{path}' is no file of {self.what}: expected the mark '{self.mark}', got "
-                f"'{values.get('format')}'; {self.advice}."
+                f"'{mark}'; {self.advice}."
             )
+        self._check_members(headers)
+        values = {name: _array(archive, name) for name in headers}
+        stored = values.pop(DIGEST, None)
+        if stored is not None and str(stored) != _digest(values):
+            raise ValueError("its digest is another one")
         return values
+
+    def _check_members(self, headers: Mapping[str, Header]) -> None:
+        missing = [
+            name
+            for name in self.members
+            if name not in (*headers, *self.optional) and not name.endswith("/")
+        ]
+        if missing:
+            raise ValueError(f"'{missing[0]}' is missing")
+        members = {FORMAT: "U", DIGEST: "U", **self.members}
+        sizes: dict[str, int] = {}
+        for name, (kind, shape) in headers.items():
+            group = re.sub("/.*", "/", name)
+            kinds, *letters = members.get(group, "").split() or [""]
+            fits = kind in kinds and len(shape) == len(letters)
+            for letter, size in zip(letters, shape, strict=False):
+                fits &= size == (int(letter) if letter.isdecimal() else sizes.get(letter, size))
+                sizes[letter] = size
+            if not fits:
+                raise ValueError(f"'{name}' has the unexpected shape {shape}")
+
+
+def _check_directory(file: IO[bytes]) -> None:
+    """Refuse what `zipfile` would read whole before it says how many entries there are."""
+    end = file.seek(0, os.SEEK_END)
+    file.seek(max(0, end - END.size - ZIP64.size))
+    tail = file.read()
+    if len(tail) < END.size or not tail[-END.size :].startswith(b"PK\5\6"):
+        raise ValueError("it is no zip archive, or its end is missing")
+    _, _, _, _, entries, size, _, comment = END.unpack(tail[-END.size :])
+    if tail.startswith(ZIP64_MARK) or comment or entries > MOST_ENTRIES or size > MOST_DIRECTORY:
+        raise ValueError("its directory is not one of these files")
+
+
+def _headers(archive: zipfile.ZipFile, path: Path) -> dict[str, Header]:
+    """Kind of numbers and shape by name; no array is unpacked."""
+    entries = archive.infolist()
+    ARRAYS.check(path, sum(entry.file_size for entry in entries))
+    headers: dict[str, Header] = {}
+    for entry in entries:
+        name = entry.filename.removesuffix(".npy")
+        is_ours = entry.filename == f"{name}.npy" and entry.compress_type in COMPRESSIONS
+        if name in headers or not is_ours:
+            raise ValueError("its directory is damaged")
+        with archive.open(entry) as member:
+            headers[name] = check_array(member, entry.file_size)
+    return headers
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    with archive.open(f"{name}.npy") as member:
+        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
+        member.read(1)  # the check sum is compared where a member ends
+    return array
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """SHA-256 in hexadecimal over names, types, shapes and values."""
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

@@ -13,7 +13,16 @@ from rgbt.checks import InputError, nearest
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.names import DAY, NIGHT
 
-ARCHIVE = Archive("rgbt counts 1", "counts", "evaluate the run to write it")
+ARCHIVE = Archive(
+    "rgbt counts 1",
+    "counts",
+    "evaluate the run to write it",
+    {
+        **{"counts": "iu N R K K", "names": "U N", "night": "b M", "classes": "U K"},
+        **{"partition": "U", "dataset": "U", "split": "U", "unscored": "U L"},
+    },
+    optional=("unscored",),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,16 +125,17 @@ class Counts:
             InputError: no such file, or not a file of counts.
         """
         values = ARCHIVE.load(path)
-        return cls(
-            counts=values["counts"],
-            names=tuple(values["names"].tolist()),
-            night=tuple(values["night"].tolist()) or None,
-            classes=tuple(values["classes"].tolist()),
-            partition=str(values["partition"]),
-            dataset=str(values["dataset"]),
-            split=str(values["split"]),
-            unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
-        )
+        with ARCHIVE.refusing(path):
+            return cls(
+                counts=values["counts"],
+                names=tuple(values["names"].tolist()),
+                night=tuple(values["night"].tolist()) or None,
+                classes=tuple(values["classes"].tolist()),
+                partition=str(values["partition"]),
+                dataset=str(values["dataset"]),
+                split=str(values["split"]),
+                unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
+            )
 
     def _take(self, indices: list[int]) -> Counts:
         night = None if self.night is None else tuple(self.night[index] for index in indices)

@@ -5,7 +5,8 @@ config.yaml         the resolved configuration
 provenance.json     a list: one entry per process that worked on the run (`provenance.py`)
 diff.patch          uncommitted changes of the code at the first of these, if there were any
 run.json            name, tags and parameters, as a tracker shall show them
-metrics.jsonl       one JSON object per line, see `MetricLine`
+metrics.jsonl       one JSON object per line, see `MetricLine`; metrics.jsonl.damaged: as it was
+                    before a run that resumed left damaged lines out
 counts_<split>.npz  integer counts that every score is derived from; counts_<split>_<view>.npz: of a
                     target domain that is seen in another view than the source
 tables.json         the last region and class tables (`tables.py`)
@@ -29,18 +30,20 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-from rgbt.checks import InputError
-from rgbt.tracking.files import (
-    holder_of,
-    holding,
-    is_held,
-    remove_left_behind,
-    write_atomic,
+from rgbt.checks import TEXT, InputError, one_line, parse_json, read_bytes, read_json, sealed
+from rgbt.tracking.files import holder_of, holding, is_held, remove_left_behind, write_atomic
+from rgbt.tracking.formats import (
+    Kind,
+    LineForm,
+    read_description,
+    read_marker,
+    read_provenance,
+    read_result,
+    read_tables,
 )
 
-Kind = Literal["train", "val", "test"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
@@ -48,8 +51,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 class MetricLine:
     """One line of ``metrics.jsonl``.
 
-    On disk: ``{"step": 200, "kind": "val", "time": 1763690000.5, "values": {"mIoU": 0.41}}``;
-    a value that is not finite is written as null and read as NaN.
+    On disk: ``{"step": 200, "kind": "val", "time": 1763690000.5, "values": {"mIoU": 0.41},
+    "crc32": "0c1f94a2"}``; a value that is not finite is written as null and read as NaN.
 
     Attributes:
         step: optimiser steps done; increases strictly within a kind.
@@ -71,6 +74,19 @@ class Description:
     name: str
     tags: dict[str, str]
     params: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Truncation:
+    """What `RunFolder.truncate_after` found.
+
+    Attributes:
+        reached: last step of any line before, 0 without lines.
+        damaged: of each line that cannot be read, its number and the reason.
+    """
+
+    reached: int
+    damaged: list[str]
 
 
 class RunFolder:
@@ -123,26 +139,25 @@ class RunFolder:
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
-        earlier = self.provenance()
+        earlier = [sealed(each) for each in self.provenance()]
         diff = entry.get("diff") or ""
         name = f"diff_{len(earlier) + 1}.patch" if earlier else "diff.patch"
         if diff:
             write_atomic(self.path / name, diff.encode())
         plain = {**entry, "diff": name if diff else None}
-        self._write_json("provenance.json", [*earlier, plain])
+        self._write_json("provenance.json", [*earlier, sealed(plain)])
 
     def provenance(self) -> list[dict[str, Any]]:
         """Entries of all processes that worked on this run, first one first."""
-        entries = self._read_json("provenance.json")
-        return list(entries) if entries else []
+        return read_provenance(self.path / "provenance.json")
 
     def describe(self, description: Description) -> None:
         """Write how a tracker shall show this run."""
-        self._write_json("run.json", vars(description))
+        self._write_json("run.json", sealed(vars(description)))
 
     def description(self) -> Description | None:
         """What `describe` wrote, or None."""
-        plain = self._read_json("run.json")
+        plain = read_description(self.path)
         return None if plain is None else Description(**plain)
 
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
@@ -155,37 +170,69 @@ class RunFolder:
             "values": {key: v if math.isfinite(v) else None for key, v in plain.items()},
         }
         with (self.path / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(line, allow_nan=False) + "\n")
+            file.write(json.dumps(sealed(line), allow_nan=False) + "\n")
 
     def lines(self) -> list[MetricLine]:
-        """Lines of ``metrics.jsonl`` in order; one cut short by a crash is left out."""
-        path = self.path / "metrics.jsonl"
-        if not path.exists():
-            return []
-        whole, newline, _ = path.read_text().rpartition("\n")
-        return [metric_line(text) for text in (whole + newline).splitlines()]
+        """Lines of ``metrics.jsonl`` in order; one cut short by a crash is left out.
 
-    def truncate_after(self, step: int, evaluated_step: int | None = None) -> None:
-        """Drop what a run that resumes at `step` will write again.
+        Raises:
+            InputError: a line is damaged, or its step does not follow that of the one before.
+        """
+        found, damaged = self._read_lines()
+        if damaged:
+            raise InputError(
+                f"{self.path / 'metrics.jsonl'} is damaged ({damaged[0]}); delete the line to do "
+                "without it. A run that is not finished does so when it resumes."
+            )
+        return found
 
-        These are the lines beyond `step`, every "test" line (the last evaluation is repeated) and
-        a line cut short by a crash.
+    def truncate_after(self, step: int, evaluated_step: int | None = None) -> Truncation:
+        """Drop what a run that resumes at `step` will write again, and what cannot be read.
+
+        These are the lines beyond `step`, every "test" line (the last evaluation is repeated), a
+        line cut short by a crash, and damaged or repeated lines. Where there are any of the last,
+        the file is kept as ``metrics.jsonl.damaged``.
 
         Args:
             step: of the checkpoint.
             evaluated_step: "val" lines beyond this one are dropped too; None: as `step`.
         """
+        found, damaged = self._read_lines()
+        if damaged:
+            content = (self.path / "metrics.jsonl").read_bytes()
+            write_atomic(self.path / "metrics.jsonl.damaged", content)
         ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
-        kept = [line for line in self.lines() if line.step <= ends.get(line.kind, -1)]
         plain = (
             {
                 **vars(line),
                 "values": {k: None if math.isnan(v) else v for k, v in line.values.items()},
             }
-            for line in kept
+            for line in sorted(found, key=lambda line: line.step)
+            if line.step <= ends.get(line.kind, -1)
         )
-        text = "".join(json.dumps(line) + "\n" for line in plain)
+        text = "".join(json.dumps(sealed(line)) + "\n" for line in plain)
         write_atomic(self.path / "metrics.jsonl", text.encode())
+        return Truncation(max((line.step for line in found), default=0), damaged)
+
+    def _read_lines(self) -> tuple[list[MetricLine], list[str]]:
+        """Whole lines, each step of a kind once; and what is wrong with the others."""
+        path = self.path / "metrics.jsonl"
+        if not path.exists():
+            return [], []
+        found: dict[tuple[Kind, int], MetricLine] = {}
+        damaged = []
+        last = {kind: -1 for kind in KINDS}
+        for number, text in enumerate(read_bytes(path, TEXT).split(b"\n")[:-1], 1):
+            try:
+                line = metric_line(text)
+            except ValueError as error:
+                damaged.append(f"line {number}: {one_line(error)}")
+                continue
+            if line.step <= last[line.kind]:
+                damaged.append(f"line {number}: step {line.step} comes after {last[line.kind]}")
+            last[line.kind] = max(line.step, last[line.kind])
+            found.setdefault((line.kind, line.step), line)
+        return list(found.values()), damaged
 
     def counts_path(self, split: str) -> Path:
         """Where the counts of a split lie."""
@@ -199,38 +246,35 @@ class RunFolder:
 
     def write_tables(self, tables: Mapping[str, Any]) -> None:
         """Write the tables (`ResultTables.to_json`)."""
-        self._write_json("tables.json", tables)
+        self._write_json("tables.json", sealed(tables))
 
     def tables(self) -> dict[str, Any] | None:
         """What `write_tables` wrote last, or None."""
-        plain = self._read_json("tables.json")
-        return None if plain is None else dict(plain)
+        return read_tables(self.path)
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Mark the run as finished; everything else must be written before."""
-        self._write_json("result.json", result)
+        self._write_json("result.json", sealed(result))
 
     def result(self) -> dict[str, Any] | None:
         """What the finished run returned; None while it is not finished."""
-        plain = self._read_json("result.json")
-        return None if plain is None else dict(plain)
+        return read_result(self.path)
+
+    def mark(self, names: str, files: str) -> None:
+        """Write ``dataset.json``: digests of the names of the images and of the files."""
+        self._write_json("dataset.json", sealed({"names": names, "files": files}))
+
+    def marker(self) -> dict[str, Any] | None:
+        """What `mark` wrote: "names" and "files"; None before."""
+        return read_marker(self.path)
 
     def _write_json(self, name: str, value: Any) -> None:
         write_atomic(self.path / name, (json.dumps(value, indent=1) + "\n").encode())
 
-    def _read_json(self, name: str) -> Any:
-        path = self.path / name
-        if not path.exists():
-            return None
-        try:
-            return json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path} is not JSON ({error}); remove it or the run.") from error
 
-
-def metric_line(text: str) -> MetricLine:
-    """One line of ``metrics.jsonl``, read."""
-    plain = json.loads(text)
+def metric_line(text: bytes) -> MetricLine:
+    """One line of ``metrics.jsonl``, read; ValueError where it is damaged."""
+    plain = parse_json(text, LineForm)
     values = {name: math.nan if v is None else float(v) for name, v in plain["values"].items()}
     return MetricLine(plain["step"], plain["kind"], plain["time"], values)
 
@@ -268,7 +312,7 @@ def find_run(run: str, runs_dir: Path) -> Path:
 def _sent_as(sent: Path) -> str | None:
     """The MLflow run id in ``mlflow.json``; None where the file is damaged."""
     try:
-        found = json.loads(sent.read_text())
-    except ValueError:
+        found = read_json(sent, dict[str, Any], "")
+    except InputError:
         return None
-    return found.get("run_id") if isinstance(found, dict) else None
+    return str(found.get("run_id"))

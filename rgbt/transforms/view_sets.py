@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import TEXT, InputError, nearest, one_line, read_bytes
 from rgbt.transforms.virtual_view import VirtualView
 
 HEADER = "yaw,pitch,roll"
@@ -96,7 +96,7 @@ def read_angles(name: str) -> Tensor:
             f"{nearest(name, published)}, or give a CSV file with the columns {HEADER}."
         )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bytes(path, TEXT).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"consistency.sets: {path} is no text in UTF-8; save it as a CSV file with the columns "
@@ -106,7 +106,7 @@ def read_angles(name: str) -> Tensor:
     if header != HEADER or not lines:
         raise InputError(
             f"consistency.sets: {path} must begin with the line '{HEADER}', then one triple of "
-            f"degrees per line, got '{header}' and {len(lines)} lines."
+            f"degrees per line, got '{one_line(header)}' and {len(lines)} lines."
         )
     return torch.tensor([_triple(path, line) for line in lines], dtype=torch.float64)
 
@@ -118,6 +118,6 @@ def _triple(path: Path, line: str) -> list[float]:
         triple = []
     if len(triple) != 3 or not all(map(math.isfinite, triple)):
         raise InputError(
-            f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got '{line}'."
+            f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got '{one_line(line)}'."
         )
     return triple

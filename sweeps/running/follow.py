@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -11,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rgbt.tracking.folder import MetricLine, metric_line
+from rgbt.tracking.formats import read_result
 
 FULL = 1_000_000
 """Bytes; a disk with less is full."""
@@ -33,7 +33,10 @@ class Follower:
         """Last step seen."""
 
     def new_lines(self) -> list[MetricLine]:
-        """Whole lines since the last call; all of them again where the run has resumed."""
+        """Whole lines since the last call; all of them again where the run has resumed.
+
+        Damaged lines are left out here: the run itself reports them when it resumes.
+        """
         try:
             with self._path.open("rb") as file:
                 inode = os.fstat(file.fileno()).st_ino
@@ -44,7 +47,10 @@ class Follower:
         except FileNotFoundError:
             return []
         self._offset += len(whole) + len(newline)
-        lines = [metric_line(text) for text in whole.decode().splitlines()]
+        lines = []
+        for text in whole.splitlines():
+            with suppress(ValueError):
+                lines.append(metric_line(text))
         if lines:
             self.step = lines[-1].step
         return lines
@@ -96,8 +102,5 @@ def stop_holder(folder: Path, number: signal.Signals) -> None:
 
 def known_seconds(folder: Path) -> float | None:
     """How long the finished run in `folder` took, as far as its last process knows."""
-    path = folder / "result.json"
-    if not path.exists():
-        return None
-    seconds = json.loads(path.read_text()).get("seconds_of_last_process")
+    seconds = (read_result(folder) or {}).get("seconds_of_last_process")
     return None if seconds is None else float(seconds)

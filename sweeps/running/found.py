@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.config import build
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.formats import ADVICE, read_provenance, read_result
 from rgbt.tracking.mlflow_fill import shown
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.provenance import without_passwords
@@ -45,7 +45,12 @@ class Found:
     @property
     def result(self) -> dict[str, Any]:
         """``result.json`` of the run (see `rgbt.training`)."""
-        return dict(json.loads((self.folder / "result.json").read_text()))
+        result = read_result(self.folder)
+        if result is None or "dataset" not in result:
+            raise InputError(
+                f"{self.folder / 'result.json'} is missing or says no data set; {ADVICE}."
+            )
+        return result
 
     @property
     def dataset(self) -> str:
@@ -55,10 +60,7 @@ class Found:
     @property
     def commit(self) -> str | None:
         """Git commit of the code that made it; "+" is added for changes that were not committed."""
-        path = self.folder / "provenance.json"
-        if not path.exists():
-            return None
-        first = json.loads(path.read_text())[0]
+        first = next(iter(read_provenance(self.folder / "provenance.json")), {})
         commit = first.get("git_commit")
         return None if commit is None else f"{commit[:10]}{'+' if first.get('git_dirty') else ''}"
 
@@ -139,11 +141,8 @@ class Runs:
         found = Found(key, folder)
         try:
             made_on = found.dataset
-        except (ValueError, KeyError) as error:
-            raise RunError(
-                f"{folder / 'result.json'} cannot be read ({error}); remove the folder to train it "
-                "again."
-            ) from error
+        except InputError as error:
+            raise RunError(str(error)) from error
         if made_on != dataset:
             raise RunError(
                 f"{folder} was made on other files of the data set ({made_on[:8]}, now "

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, nearest, one_line
 from rgbt.tracking.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.settings import Objective
@@ -48,15 +48,29 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
         InputError: the storage cannot be opened, or a package for it is missing.
     """
     import optuna
-    from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     url = _checked(storage, runs_dir)
     if url.endswith(".journal"):
         path = Path(url).expanduser().resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
-        return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
+        return _replayed(path)
     return _patiently(lambda: _database(_with_driver(url)), url)
+
+
+def _replayed(path: Path) -> optuna.storages.JournalStorage:
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    try:
+        return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # The border to Optuna, which assumes that a journal is whole.
+        raise InputError(
+            f"storage={path} is damaged ({type(error).__name__}: {one_line(error)}); restore it "
+            "from a copy, or remove it: finished runs are reused, other trials are begun anew."
+        ) from error
 
 
 def _checked(storage: str | None, runs_dir: Path) -> str:

@@ -98,7 +98,7 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
     with pytest.raises(InputError, match=r"noise-8.json is not of python -m rgbt.robustness"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{")
-    with pytest.raises(InputError, match=r"noise-8.json cannot be read"):
+    with pytest.raises(InputError, match=r"noise-8.json is damaged"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
     with pytest.raises(InputError, match=r"noise-8.json does not say what was measured \('row'\)"):

@@ -141,7 +141,7 @@ def below_the_image(root: Path) -> str:
 
 def missing(root: Path) -> str:
     (root / "next" / "flow" / f"{NAMES[0]}.npy").unlink()
-    return "cannot be read"
+    return "is missing"
 
 
 def cut_short(root: Path) -> str:

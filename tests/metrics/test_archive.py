@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+import io
 import os
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.archive import Archive
+from rgbt.metrics.counts import Counts
 
-KIND = Archive("rgbt things 1", "things", "make it with make-things")
+KIND = Archive(
+    "rgbt things 1", "things", "make it", {"numbers": "iu N", "name": "U"}, ("numbers", "name")
+)
 
 
 def test_what_is_saved_is_loaded_with_its_mark(tmp_path) -> None:
@@ -22,12 +28,14 @@ def test_what_is_saved_is_loaded_with_its_mark(tmp_path) -> None:
 
 def test_pickles_are_not_read(tmp_path) -> None:
     np.savez(tmp_path / "a.npz", format=np.array(KIND.mark), bad=np.array([{}], object))
-    with pytest.raises(InputError, match="not a readable file of things; make it with make-things"):
+    with pytest.raises(
+        InputError, match=r"not a readable file of things \(it holds Python objects.*\); make it"
+    ):
         KIND.load(tmp_path / "a.npz")
 
 
 def test_other_kinds_are_refused(tmp_path) -> None:
-    Archive("rgbt things 2", "things", "x").save(tmp_path / "a.npz", {})
+    Archive("rgbt things 2", "things", "x", {}).save(tmp_path / "a.npz", {})
     with pytest.raises(InputError, match="expected the mark 'rgbt things 1', got 'rgbt things 2'"):
         KIND.load(tmp_path / "a.npz")
     with pytest.raises(InputError, match="there is no file of things"):
@@ -39,3 +47,80 @@ def test_a_file_that_may_not_be_read_is_said(tmp_path, monkeypatch: pytest.Monke
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.R_OK)  # root may read anything
     with pytest.raises(InputError, match="may not be read; change its permissions"):
         KIND.load(tmp_path / "a.npz")
+
+
+def counts_of(path, images: int, classes: int = 3):
+    """Counts that agree with each other, mostly zeros, so that they are packed a thousandfold."""
+    values = Counts(
+        counts=np.zeros((images, 9, classes, classes), np.int64),
+        names=tuple(map(str, range(images))),
+        night=None,
+        classes=tuple(map(str, range(classes))),
+        partition="ring9",
+        dataset="0",
+        split="test",
+    )
+    values.save(path)
+    return path
+
+
+def test_a_file_above_the_limit_is_refused_before_it_is_unpacked(tmp_path, monkeypatch) -> None:
+    path = counts_of(tmp_path / "c.npz", images=300, classes=30)  # 19 MB
+    monkeypatch.setenv("RGBT_MAX_ARRAY_MB", "15")
+    tracemalloc.start()
+    with pytest.raises(InputError, match="holds 19 million bytes.* set RGBT_MAX_ARRAY_MB=20"):
+        Counts.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 2e6
+    tracemalloc.stop()
+    monkeypatch.setenv("RGBT_MAX_ARRAY_MB", "20")
+    assert Counts.load(path).counts.shape == (300, 9, 30, 30)
+    monkeypatch.setenv("RGBT_MAX_ARRAY_MB", "no limit")
+    with pytest.raises(InputError, match="RGBT_MAX_ARRAY_MB=no limit: expected a whole number"):
+        Counts.load(path)
+
+
+def rewritten(path, change) -> None:
+    """The archive with its arrays changed, as a stranger would write it."""
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    np.savez_compressed(path, **change(arrays))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda a: {**a, "counts": np.zeros((4, 9, 3, 3), int)}, "'names' has the unexpected"),
+        (lambda a: {**a, "more": np.zeros(3)}, "'more' has the unexpected shape"),
+        (lambda a: {**a, "names": np.arange(2)}, "'names' has the unexpected shape"),
+        (lambda a: {k: v for k, v in a.items() if k != "night"}, "'night' is missing"),
+        (lambda a: {**a, "counts": a["counts"] + 1}, "its digest is another one"),
+        (lambda a: {**a, "unscored": np.array(["0", "1", "2"])}, "its digest is another one"),
+        (lambda a: {**{k: v for k, v in a.items() if k != "digest"}, "unscored": np.array(["x"])},
+         "unscored: expected some of the classes"),
+        (lambda a: a | {f"n{i}": np.zeros(1) for i in range(40)}, "its directory is not one of"),
+    ],
+)  # fmt: skip
+def test_another_content_than_the_kind_has_is_refused(tmp_path, change, reason) -> None:
+    path = counts_of(tmp_path / "c.npz", images=2)
+    rewritten(path, change)
+    with pytest.raises(InputError, match=reason):
+        Counts.load(path)
+
+
+def test_a_header_that_announces_more_than_there_is_allocates_nothing(tmp_path) -> None:
+    path = counts_of(tmp_path / "c.npz", images=2)
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        content, {"descr": "<i8", "fortran_order": False, "shape": (2, 9, 1500, 1500)}
+    )
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(tmp_path / "d.npz", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, content.getvalue() if name == "counts.npy" else old.read(name))
+    with pytest.raises(InputError, match="header announces 324000000 bytes, there are 0"):
+        Counts.load(tmp_path / "d.npz")
+
+
+def test_files_of_before_the_digest_are_read(tmp_path) -> None:
+    path = counts_of(tmp_path / "c.npz", images=2)
+    rewritten(path, lambda a: {k: v for k, v in a.items() if k not in ("digest", "unscored")})
+    assert Counts.load(path).unscored == ()

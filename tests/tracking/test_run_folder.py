@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,7 @@ def test_lines_are_read_as_written(tmp_path: Path) -> None:
     assert second.values["mIoU"] == 0.25
     assert math.isnan(second.values["class/bump"])
     written = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[1])
-    assert set(written) == {"step", "kind", "time", "values"}
+    assert set(written) == {"step", "kind", "time", "values", "crc32"}
     assert written["values"]["class/bump"] is None
 
 
@@ -78,6 +79,68 @@ def test_truncate_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
     assert math.isnan(after[1].values["odd"])
     folder.append(30, "train", {"loss": 0.1})
     assert [line.step for line in folder.lines()] == [10, 20, 30]
+
+
+def logged(tmp_path: Path) -> tuple[RunFolder, list[bytes]]:
+    folder = RunFolder(tmp_path)
+    for step in (10, 20, 30, 40):
+        folder.append(step, "train", {"loss": 1.0 / step})
+    return folder, (tmp_path / "metrics.jsonl").read_bytes().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda a, b, c, d: [a, b[:30], b"\n", c, d], "line 2: Expecting property"),
+        (lambda a, b, c, d: [a, b.replace(b"0.05", b"0.07"), c, d], "line 2: its check sum is an"),
+        (lambda a, b, c, d: [a, b"\xff\n", c, d], "line 2: 'utf-8' codec"),
+        (lambda a, b, c, d: [a, b'{"step": 20}\n', c, d], "line 2: kind: Field required"),
+        (lambda a, b, c, d: [a, b, b, c, d], "line 3: step 20 comes after 20"),
+        (lambda a, b, c, d: [c, d, a, b], "line 3: step 10 comes after 40"),
+    ],
+)
+def test_damaged_lines_are_refused_and_a_run_that_resumes_leaves_them_out(
+    tmp_path: Path, damage: Callable[..., list[bytes]], reason: str
+) -> None:
+    folder, lines = logged(tmp_path)
+    whole = folder.lines()
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b"".join(damage(*lines)))
+    damaged = path.read_bytes()
+    with pytest.raises(InputError, match=r"metrics.jsonl is damaged \(line") as told:
+        folder.lines()
+    assert reason in str(told.value)
+    assert folder.truncate_after(30).damaged[0].startswith(reason)
+    kept = folder.lines()
+    assert kept in (whole[:3], [whole[0], whole[2]])
+    assert (tmp_path / "metrics.jsonl.damaged").read_bytes() == damaged
+    assert folder.truncate_after(30).damaged == []
+
+
+def test_lines_and_files_of_before_check_sums_are_read(tmp_path: Path) -> None:
+    line = {"step": 10, "kind": "val", "time": 1.5, "values": {"mIoU": 0.25}}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    (tmp_path / "result.json").write_text('{"dataset": "0123", "test": {"mIoU": null}}')
+    (tmp_path / "provenance.json").write_text('[{"command": "a"}]')
+    folder = RunFolder(tmp_path)
+    assert folder.lines()[0].values == {"mIoU": 0.25}
+    assert folder.result() == {"dataset": "0123", "test": {"mIoU": None}}
+    folder.add_provenance({"command": "b"})
+    assert [each["command"] for each in folder.provenance()] == ["a", "b"]
+    (tmp_path / "result.json").write_text('{"datasft": "0123"}')
+    with pytest.raises(InputError, match="unknown key 'datasft'"):
+        folder.result()
+
+
+def test_json_that_is_nested_or_large_without_end_is_refused(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "result.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(InputError, match="is damaged .it is nested too deeply"):
+        RunFolder(tmp_path).result()
+    monkeypatch.setenv("RGBT_MAX_JSON_MB", "1")
+    path.write_text('{"skipped": [' + '"a", ' * 300_000 + '"a"]}')
+    with pytest.raises(InputError, match="holds 2 million bytes.*set RGBT_MAX_JSON_MB=2"):
+        RunFolder(tmp_path).result()
 
 
 def test_lock_refuses_a_second_holder_and_names_the_first(tmp_path: Path) -> None:
@@ -156,7 +219,7 @@ def test_small_files_come_back(tmp_path: Path) -> None:
 
 def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("{")
-    with pytest.raises(InputError, match=r"result\.json is not JSON"):
+    with pytest.raises(InputError, match=r"result\.json is damaged \(.*\); restore it"):
         RunFolder(tmp_path).result()
     with pytest.raises(InputError, match="no such folder"):
         runs_in(tmp_path / "missing")

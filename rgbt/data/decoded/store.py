@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, read_json, sealed
 from rgbt.data.decoded.file import Frame, FrameFile, FrameWriter
 from rgbt.data.decoded.stamps import Stamp
 from rgbt.types import Sample
@@ -254,10 +254,10 @@ def _fitting(file: FrameFile, notes: dict[str, dict[str, Any]]) -> dict[str, Any
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found: dict[str, Any] = read_json(path, dict[str, Any], "")
+    except InputError:  # missing or damaged: what it said is found out again
         return {}
-    return found if isinstance(found, dict) else {}
+    return found
 
 
 def _read_notes(path: Path) -> dict[str, dict[str, Any]]:
@@ -268,7 +268,7 @@ def _write_whole(path: Path, content: dict[str, Any]) -> None:
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with temporary.open("w", encoding="utf-8") as file:
-            json.dump(content, file)
+            json.dump(sealed(content), file)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, read_json
 from rgbt.data.prepare.source import Entry
 
 PLAN = ".prepare.json"
@@ -79,8 +79,8 @@ def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> Non
             )
         return
     try:
-        begun = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+        begun = read_json(path, dict[str, str], "")
+    except InputError:
         begun = None
     if begun != plan:
         raise InputError(

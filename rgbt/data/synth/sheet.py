@@ -96,7 +96,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"rgbt: {error}\n")
         return 2
     sheet = contact_sheet(own["seed"], own["first"], factors, own["columns"], own["zoom"])
-    cv2.imwrite(str(out), sheet[..., ::-1])
+    out.write_bytes(cv2.imencode(out.suffix, sheet[..., ::-1])[1].tobytes())
     sys.stdout.write(f"{out}\n")
     return 0
 

@@ -1,0 +1,110 @@
+"""A disk that is full, or memory that is exhausted, as one sentence with what to do.
+
+Libraries report both in many ways: PyTorch hides a full disk behind a RuntimeError of its file
+writer, OpenCV has an error of its own for missing memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rgbt.checks import InputError, RunError, one_line
+
+DISK = {
+    errno.ENOSPC: "is full",
+    errno.EDQUOT: "has no space left for this user (quota)",
+    errno.EROFS: "cannot be written, it is mounted read-only",
+}
+
+MEMORY = re.compile(
+    r"out of memory|can't allocate memory|not enough memory|Insufficient memory|alloc_cpu\.cpp"
+    r"|Cannot allocate memory|bad_alloc|CUDNN_STATUS_ALLOC_FAILED",
+    re.IGNORECASE,
+)
+"""In messages of PyTorch (CPU and CUDA), OpenCV, the C++ library and the system."""
+
+RESUME = "rerun the command to resume from the last checkpoint"
+
+
+@contextmanager
+def reporting_exhaustion() -> Iterator[None]:
+    """Turn what is raised on a full disk or exhausted memory into a RunError.
+
+    Raises:
+        RunError: with path and free space, or with the settings that take less memory.
+    """
+    try:
+        yield
+    except Exception as error:  # A border: all else is raised on.
+        sentence = _sentence(error)
+        if sentence is None:
+            raise
+        raise RunError(sentence) from error
+
+
+def _sentence(error: BaseException) -> str | None:
+    """What ran out, if `error` or one that led to it says so."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in DISK:
+            return _disk_sentence(error, cause)
+        if _is_memory(cause):
+            return _memory_sentence(cause)
+        cause = cause.__cause__ or cause.__context__
+    return None
+
+
+def _disk_sentence(error: BaseException, cause: OSError) -> str:
+    file = cause.filename
+    place = _existing(Path(file)) if isinstance(file, str) else _fullest()
+    left = f"the disk of {place} {DISK[cause.errno or 0]} ({_free(place) / 1e6:.1f} MB free)"
+    if isinstance(error, InputError):  # says itself what cannot be written, and what to set
+        return f"{str(error).rstrip('.')}; {left}."
+    return f"{left}; free some space, or name a folder on another disk; {RESUME}."
+
+
+def _fullest() -> Path:
+    """Of the folders that the command may write to, the one whose disk has least space left."""
+    named = [word.partition("=")[2] for word in sys.argv[1:] if "=" in word]
+    places = [Path(), Path(tempfile.gettempdir()), *(Path(name).expanduser() for name in named)]
+    return min(map(_existing, places), key=_free).resolve()
+
+
+def _existing(path: Path) -> Path:
+    """`path`, or the nearest folder above it that exists."""
+    for each in (path, *path.parents):
+        try:
+            if each.exists():
+                return each
+        except OSError:  # no path at all: longer than a file's name may be
+            continue
+    return Path()
+
+
+def _free(place: Path) -> int:
+    return shutil.disk_usage(place).free
+
+
+def _is_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    is_of_library = isinstance(error, RuntimeError) or type(error).__module__.startswith("cv2")
+    return is_of_library and MEMORY.search(str(error)) is not None
+
+
+def _memory_sentence(error: BaseException) -> str:
+    whose = "the GPU" if "CUDA" in str(error) else "this machine"
+    said = one_line(str(error).partition("\n")[0]) or type(error).__name__
+    return (
+        f"the memory of {whose} is exhausted ({said}); lower scale.batch_size, "
+        f"scale.eval_batch_size, scale.crop_hw or data.num_workers; {RESUME}."
+    )
