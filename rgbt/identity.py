@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
 from rgbt.config import NODES, OF_THE_RUN, check, compose, conf_dir, typed
+from rgbt.source_code import user_code
 
 SHARED = (
     *("seed", "runs_dir", "pretrained", "dataset", "data", "metric", "tracking"),
@@ -74,8 +76,20 @@ def run_key(config: DictConfig) -> str:
         parent, last = _parent(plain, dotted)
         if parent.get(last) == first:
             del parent[last]
+    code = user_code(_targets(plain))
+    if code:
+        plain["code"] = code
     text = json.dumps(plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _targets(value: Any) -> Iterator[str]:
+    """Every `_target_` inside plain values."""
+    if isinstance(value, dict) and "_target_" in value:
+        yield value["_target_"]
+    children = value.values() if isinstance(value, dict) else value
+    for child in children if isinstance(value, dict | list) else ():
+        yield from _targets(child)
 
 
 def _parent(plain: dict[str, Any], dotted: str) -> tuple[dict[str, Any], str]:
