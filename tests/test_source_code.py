@@ -14,7 +14,13 @@ from rgbt.source_code import user_code
 from tests.composed import composed
 
 Write = Callable[..., None]
-LOSS = "from . import helper\nfrom .deep.parts import part\n\n\ndef loss(x):\n    return helper.f(x)\n"
+LOSS = """from . import helper
+from .deep.parts import part
+
+
+def loss(x):
+    return helper.f(x)
+"""
 TREE = {
     "my_lab/__init__.py": "",
     "my_lab/losses.py": LOSS,
