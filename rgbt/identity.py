@@ -30,13 +30,14 @@ NOT_IN_KEY = (
     *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
     *("data.prefetch", "data.augment", "data.cache"),
-    *("trainer.accelerator", "trainer.threads", "trainer.log_every", "trainer.checkpoint_every"),
+    *("trainer.accelerator", "trainer.log_every", "trainer.checkpoint_every"),
 )
 """What may differ between two runs that are the same run: labels, paths, hardware, tracking, what
 is measured beside, and the sizes of `scale` and `recipe`, which count where others take them up."""
 
 LATER: dict[str, Any] = {
     "trainer.tested": "best",
+    "trainer.threads": 2,
     "domains": {
         "_target_": "rgbt.data.domains.Domains",
         "source": {

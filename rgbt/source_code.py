@@ -14,7 +14,6 @@ import pkgutil
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,10 @@ INSTALLED = {"site-packages", "dist-packages"}
 
 Used = tuple[str, str]
 """Name of a module and SHA-256 of its code, or name and version of an installed distribution."""
+
+
+_used_by: dict[str, tuple[Used, ...]] = {}
+"""What each module used when this process first asked."""
 
 
 def user_code(targets: Iterable[str]) -> tuple[Used, ...]:
@@ -40,8 +43,16 @@ def user_code(targets: Iterable[str]) -> tuple[Used, ...]:
         distribution and its version. () where every target is released. Each module is read once
         per process, so that the answer belongs to the code that this process has loaded.
     """
-    own = {target for target in targets if target.split(".")[0] not in RELEASED}
-    return tuple(sorted({used for target in own for used in _used_by(_module_of(target))}))
+    own = {_module_of(each) for each in targets if each.split(".")[0] not in RELEASED}
+    for module in own - set(_used_by):
+        _used_by[module] = tuple(_follow(module))
+    return tuple(sorted({used for module in own for used in _used_by[module]}))
+
+
+def counted_modules() -> list[str]:
+    """Modules of the user's own tree that `user_code` has read and this process has imported."""
+    names = {name for used in _used_by.values() for name, _ in used}
+    return sorted(name for name in names & set(sys.modules) if name != "__main__")
 
 
 def loaded_modules() -> list[str]:
@@ -58,13 +69,12 @@ def _module_of(target: str) -> str:
     return name
 
 
-@cache
-def _used_by(module: str) -> tuple[Used, ...]:
+def _follow(module: str) -> Iterator[Used]:
     """What `user_code` gives for one module."""
     place = _place(module)
     if place is not None and INSTALLED & set(Path(place[0] or "").parts):
-        return tuple(_distributions(module.split(".")[0]))
-    used: dict[str, str] = {}
+        yield from _distributions(module.split(".")[0])
+        return
     waiting = [*_with_packages(module)]
     seen: set[str] = set()
     while waiting:
@@ -72,9 +82,9 @@ def _used_by(module: str) -> tuple[Used, ...]:
         place = None if name in seen or name.split(".")[0] in RELEASED else _place(name)
         seen.add(name)
         if place is not None and place[0] is not None and _is_own(place[0]):
-            used[name], imported = _read(name, Path(place[0]))
+            digest, imported = _read(name, Path(place[0]))
             waiting += imported
-    return tuple(used.items())
+            yield name, digest
 
 
 def _distributions(package: str) -> Iterator[Used]:

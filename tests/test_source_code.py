@@ -44,7 +44,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Write]:
         monkeypatch.syspath_prepend(str(tmp_path / folder))
 
     def forget() -> None:
-        source_code._used_by.cache_clear()
+        source_code._used_by.clear()
         for name in [name for name in sys.modules if name.startswith("my_")]:
             del sys.modules[name]
 

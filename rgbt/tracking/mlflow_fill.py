@@ -21,6 +21,7 @@ from rgbt.metrics import names
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import MetricLine, RunFolder
 from rgbt.tracking.mlflow_client import Store
+from rgbt.tracking.replaced import description_of
 from rgbt.tracking.tables import ResultTables, result_grids
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
@@ -110,7 +111,7 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     sent.later += later
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
-    description = folder.description()
+    description = description_of(folder)
     if description is not None and short_name(description.name) != name:
         store.client.update_run(sent.run_id, name=short_name(description.name))
     if status == "RUNNING" and seen != status:
@@ -134,7 +135,7 @@ def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], st
             # A run deleted in the pages takes nothing more; a folder that goes on gets a new one.
             if run.info.lifecycle_stage == "active":
                 return set(run.data.params), str(run.info.status), str(run.info.run_name)
-    description = folder.description()
+    description = description_of(folder)
     assert description is not None, f"{folder.path}: describe() comes before fill()"
     run_name = short_name(description.name)
     run = store.client.create_run(
@@ -236,7 +237,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
     """Parameters the run does not have yet; MLflow refuses to change one."""
     from mlflow.entities import Param
 
-    description = folder.description()
+    description = description_of(folder)
     params = {} if description is None else description.params
     return [Param(k, v[:PARAM_LENGTH]) for k, v in params.items() if k not in known]
 
@@ -244,7 +245,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
 def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
     from mlflow.entities import RunTag
 
-    description = folder.description()
+    description = description_of(folder)
     first = (folder.provenance() or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
