@@ -175,7 +175,7 @@ def test_what_of_an_earlier_run_counts_in_the_key() -> None:
 
 def test_where_runs_lie_and_how_they_are_tracked_does_not_count() -> None:
     base = alone("multi_head_night")
-    for typed in (["runs_dir=/elsewhere"], ["tracking=none"], ["trainer.threads=1"]):
+    for typed in (["runs_dir=/elsewhere"], ["tracking=none"], ["fresh=true"]):
         assert alone("multi_head_night", *typed) == base
 
 

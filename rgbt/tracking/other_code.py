@@ -7,6 +7,7 @@ show a result compare.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -57,13 +58,15 @@ def warn_of_steps(folder: RunFolder, step: int) -> None:
 def _contributing(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Entries of the processes that the state of a run comes from.
 
-    A process that another one followed at the same step, or at an earlier one, left nothing.
+    What a process did after the step at which a later one began is not in the state.
     """
     found = []
-    for entry, after in zip(entries, [*entries[1:], None], strict=True):
-        begun = None if after is None else after.get("from_step")
-        if begun is None or begun > entry.get("from_step", 0):
-            found.append(entry)
+    kept_until = math.inf
+    for entry in reversed(entries):
+        begin = entry.get("from_step")  # None: of before it was noted
+        if (begin or 0) < kept_until:
+            found.insert(0, entry)
+        kept_until = kept_until if begin is None else min(kept_until, begin)
     return found
 
 
