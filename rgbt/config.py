@@ -27,6 +27,7 @@ from rgbt.checks import InputError, nearest
 
 TOP_LEVEL: dict[str, Any] = {
     **{"seed": int, "name": str, "runs_dir": str, "out": str | None, "pretrained": str | None},
+    "fresh": bool,
 }
 """Keys of the configuration that are plain values; every other one is a node with `_target_`."""
 

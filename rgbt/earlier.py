@@ -26,6 +26,8 @@ from rgbt.identity import DOMAINS, SHARED, earlier_config, earlier_run, run_key
 from rgbt.naming import TAGS
 from rgbt.stored_config import targets
 from rgbt.tracking.files import is_held
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.other_code import other_code
 from rgbt.tracking.terminal import tell
 
 LOOK_S = 1.0
@@ -113,6 +115,18 @@ def finish_earlier(
                 _finish(earlier, train, typed)
         if earlier.key != "model.weights":
             _write_labels(earlier, config, earlier.key.split(".")[1])
+
+
+def warn_of_other_code(needed: Sequence[Earlier]) -> None:
+    """Say which finished runs that a run needs were made by other code: fresh=true keeps them."""
+    for earlier in needed:
+        made_by = other_code(RunFolder(earlier.folder)) if earlier.is_finished else None
+        if made_by is not None:
+            tell(
+                f"warning: the upstream run {earlier.folder} ({earlier.key}) was made by other "
+                f"code ({made_by}) and is used as it is; to train it again, run "
+                f"+experiment={earlier.experiment} with fresh=true."
+            )
 
 
 def reads_pretrained(config: DictConfig) -> bool:

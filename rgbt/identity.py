@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest, read_json
 from rgbt.config import NODES, OF_THE_RUN, check, compose, conf_dir, typed
+from rgbt.source_code import user_code
 
 SHARED = (
     *("seed", "runs_dir", "pretrained", "dataset", "data", "metric", "tracking"),
@@ -28,13 +30,14 @@ NOT_IN_KEY = (
     *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
     *("data.prefetch", "data.augment", "data.cache"),
-    *("trainer.accelerator", "trainer.threads", "trainer.log_every", "trainer.checkpoint_every"),
+    *("trainer.accelerator", "trainer.log_every", "trainer.checkpoint_every"),
 )
 """What may differ between two runs that are the same run: labels, paths, hardware, tracking, what
 is measured beside, and the sizes of `scale` and `recipe`, which count where others take them up."""
 
 LATER: dict[str, Any] = {
     "trainer.tested": "best",
+    "trainer.threads": 2,
     "domains": {
         "_target_": "rgbt.data.domains.Domains",
         "source": {
@@ -74,8 +77,20 @@ def run_key(config: DictConfig) -> str:
         parent, last = _parent(plain, dotted)
         if parent.get(last) == first:
             del parent[last]
+    code = user_code(_targets(plain))
+    if code:
+        plain["code"] = code
     text = json.dumps(plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _targets(value: Any) -> Iterator[str]:
+    """Every `_target_` inside plain values."""
+    if isinstance(value, dict) and "_target_" in value:
+        yield value["_target_"]
+    children = value.values() if isinstance(value, dict) else value
+    for child in children if isinstance(value, dict | list) else ():
+        yield from _targets(child)
 
 
 def _parent(plain: dict[str, Any], dotted: str) -> tuple[dict[str, Any], str]:

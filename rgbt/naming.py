@@ -22,7 +22,16 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
     Only what differs from the experiment is named; keys are cut to their last part where that
     says enough.
     """
-    silent = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed")
+    silent = (
+        "experiment",
+        "search",
+        "runs_dir",
+        "tracking",
+        "dataset.root",
+        "name",
+        "seed",
+        "fresh",
+    )
     pairs = [item.lstrip("+").partition("=")[::2] for item in overrides]
     # What is measured beside is no part of the run, and neither are its trackers.
     beside = ("tracking.", "consistency")
@@ -45,7 +54,7 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
         key: str(value)
         for key, value in flatten(config).items()
         # Paths and passwords of the tracker are no property of the run.
-        if not key.endswith("_target_") and not key.startswith("tracking.")
+        if not key.endswith("_target_") and not key.startswith("tracking.") and key != "fresh"
     }
     return Description(f"{group} seed={config.seed}", tags, params)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def main(config: DictConfig) -> int:
     """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
     # torch loads here, after --help
-    from rgbt.earlier import earlier_runs, finish_earlier, reads_pretrained
+    from rgbt.earlier import earlier_runs, finish_earlier, reads_pretrained, warn_of_other_code
     from rgbt.prepared import rehearse
     from rgbt.tracking.terminal import tell
     from rgbt.training import is_finished, train
@@ -26,7 +26,10 @@ def main(config: DictConfig) -> int:
     if config.pretrained is not None and not reads_pretrained(config):
         tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")
     # A key may hash a large file of weights: it is asked for only where it decides something.
-    if any(earlier_runs(config)) and not is_finished(config):
+    needed = list(earlier_runs(config))
+    if needed and config.fresh:
+        warn_of_other_code(needed)
+    if needed and (config.fresh or not is_finished(config)):
         finish_earlier(config, train, rehearse, task_overrides())
     train(config, task_overrides())
     return 0

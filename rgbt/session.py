@@ -29,6 +29,7 @@ from rgbt.engine.allocator import keep_memory
 from rgbt.engine.evaluate import HeadsOf, predictions
 from rgbt.engine.progress import progress
 from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.threads import fix_threads
 from rgbt.metrics import scores
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
@@ -91,8 +92,7 @@ def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Sessi
     """
     keep_memory()
     trainer: TrainerSettings = build(config.trainer)
-    if trainer.threads is not None:
-        torch.set_num_threads(trainer.threads)
+    fix_threads(trainer.threads)
     fabric = _fabric(trainer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(config.seed, "weights"))

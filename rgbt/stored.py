@@ -123,6 +123,8 @@ def open_run(
     for key, value in _plain(defaults.data).items():
         if key not in config.data:
             config.data[key] = value
+    if config.trainer.threads is None:  # of before it had a number: one thread per core
+        config.trainer.threads = defaults.trainer.threads
     trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all

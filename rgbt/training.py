@@ -38,9 +38,11 @@ from rgbt.session import (
 )
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
+from rgbt.tracking.other_code import warn_of_result, warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
+from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
 from rgbt.transforms.view_sets import ViewSets
@@ -71,18 +73,23 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     """
     if config.out is not None:
         raise InputError(f"out={config.out}: a run is written to runs_dir=...; leave `out` away.")
+    fresh, config = config.fresh, config.copy()
+    config.fresh = False  # it is asked of this command, and no property of the run
     path = Path(config.runs_dir) / run_key(config)
     asked = describe(config, overrides)
     tracking: Tracking = build(config.tracking)
-    if (path / "result.json").exists():
+    if is_finished(config) and not fresh:
         folder = RunFolder(path)
         folder.clean()
         _show_again(folder, tracking, asked)
+        warn_of_result(folder)
         _tell_other_files(folder, config)
         _tell_unmeasured(folder, build(config.consistency))
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         prepared = prepare(config)
+        if is_finished(config):
+            replace_finished(RunFolder(path), tracking)
         folder = RunFolder(path)
         with folder.lock():
             Run(prepared, folder, tracking, asked).complete()
@@ -226,6 +233,8 @@ class Run:
             if trainer.checkpoints.warning:
                 tell(trainer.checkpoints.warning)
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
+        self.folder.begin_at(state.step)
+        warn_of_steps(self.folder, state.step)
         self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Arguments = Mapping[str, str]
 """Values by key, as typed."""
 
-OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out")
+OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
 """Arguments that are no settings of execution."""
 
 WEIGHTS = "weights."
@@ -42,11 +42,13 @@ class Place:
         runs_dir: the folder of runs.
         out: folder of the table's files; None: ``tables/<table>_<scale>`` inside `runs_dir`.
         tracker: overrides of the tracker.
+        fresh: see `Runs`.
     """
 
     runs_dir: Path
     out: Path | None
     tracker: tuple[str, ...] = ()
+    fresh: bool = False
 
     @property
     def base(self) -> tuple[str, ...]:
@@ -123,7 +125,8 @@ def place_of(arguments: Arguments, overrides: Sequence[str]) -> tuple[Place, tup
     tracker = tuple(word for word in overrides if word.lstrip("+~").startswith("tracking"))
     rest = tuple(word for word in overrides if word not in tracker)
     out = Path(arguments["out"]) if arguments["out"] else None
-    return Place(Path(arguments["runs_dir"]), out, tracker), rest
+    check_choice("fresh", arguments["fresh"], ("true", "false"))
+    return Place(Path(arguments["runs_dir"]), out, tracker, arguments["fresh"] == "true"), rest
 
 
 def _is_misspelt(word: str, arguments: Arguments) -> bool:
@@ -179,7 +182,7 @@ def runs_of(place: Place) -> Runs:
     from sweeps.running.found import open_runs
 
     with composing(place.base):
-        config = compose(place.base)
+        config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])
         check_node(config.tracking, "tracking")
     return open_runs(config)
 

@@ -19,6 +19,7 @@ OWN = {
     "scale": "demo",
     "runs_dir": "runs",
     "out": "",
+    "fresh": "false",
     "workers": "1",
     "retry": "none",
     "retries": "0",
@@ -26,7 +27,6 @@ OWN = {
     "wait": "true",
     "storage": "null",
     "gpus": "null",
-    "threads": "null",
     "timeout_minutes": "null",
     "max_failures": "null",
     "executor": "local",
@@ -43,8 +43,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     scale     demo (minutes, embedded data) or paper (as published)
     dry_run   true: show the cells, what is there already and how long the rest takes
     retry     failed: try again what failed in an earlier call; retries: how often in this one
-    workers   runs at a time; gpus=[0,1] gives each worker one, threads shares the cores out
+    workers   runs at a time; gpus=[0,1] gives each worker one
     storage   where machines agree on who runs what: file.journal, postgresql://user@host/name
+    fresh     true: train again what other code made; the old runs are kept in <runs_dir>/replaced
     wait      false: leave cells to the commands that run them, do not stay until they are done
     timeout_minutes, max_failures, executor, submitit as in conf/hydra/sweeper/study.yaml
     out       folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder of runs

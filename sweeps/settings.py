@@ -71,7 +71,6 @@ class Settings:
     storage: str | None
     workers: int
     gpus: tuple[int, ...] | None
-    threads: int | None
     executor: Literal["local", "submitit"]
     submitit: dict[str, Any] | None
     retries: int
@@ -92,8 +91,7 @@ class Settings:
     replicates: int
 
     def __post_init__(self) -> None:
-        at_least = {"workers": 1, "retries": 0, "replicates": 1, "threads": 1, "trials": 1}
-        at_least |= {"max_failures": 1}
+        at_least = {"workers": 1, "retries": 0, "replicates": 1, "trials": 1, "max_failures": 1}
         for name, least in at_least.items():
             value = getattr(self, name)
             if value is not None and value < least:
@@ -102,11 +100,6 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise InputError(f"{name} must be positive or null, got {value:g}.")
-        if self.executor == "submitit" and self.threads is not None:
-            raise InputError(
-                "threads are those of workers on this machine; with executor=submitit give "
-                "submitit={cpus_per_task: ...}."
-            )
         if self.gpus is not None and not self.gpus:
             raise InputError("gpus=[]: expected numbers of GPUs such as [0,1], or null.")
         if self.submitit and self.executor != "submitit":
@@ -121,7 +114,7 @@ class Settings:
 
 
 EXECUTION = (
-    *("storage", "workers", "gpus", "threads", "executor", "submitit", "retries", "retry"),
+    *("storage", "workers", "gpus", "executor", "submitit", "retries", "retry"),
     *("timeout_minutes", "max_failures", "wait", "dry_run"),
 )
 """Keys that say how points are run; the others say which."""

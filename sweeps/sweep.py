@@ -17,7 +17,14 @@ from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.points import Point
 from sweeps.running.found import Runs, open_runs
-from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey, work_off
+from sweeps.running.lists import (
+    Outcome,
+    PointList,
+    estimated_seconds,
+    other_code_line,
+    survey,
+    work_off,
+)
 from sweeps.running.live import duration
 from sweeps.running.sources import short
 from sweeps.search import Search, search
@@ -26,7 +33,7 @@ from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list
 from sweeps.space.merge import merge_space
 from sweeps.space.space import as_overrides
 
-PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking", "trainer.threads")
+PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""
 
 
@@ -43,6 +50,8 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         RunError: points failed; all others were run.
     """
     settings = read_settings(config.hydra.sweeper)
+    # A word to the sweep, which decides for each point: no setting of its runs.
+    arguments = [word for word in arguments if word.partition("=")[0] != "fresh"]
     typed = [*_params(settings), *arguments]
     fixed, swept, intervals = split(typed, loader)
     base = tuple(_forwarded(config))
@@ -122,6 +131,7 @@ def _grid(wanted: PointList, settings: Settings) -> None:
         missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
         guess = "" if seconds is None else f", about {duration(seconds)}"
         tell(f"{missing} of {len(outcomes)} points would be run{guess}.")
+        _tell_other_code(outcomes)
         return
     outcomes = survey(wanted, settings)
     wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
@@ -130,6 +140,7 @@ def _grid(wanted: PointList, settings: Settings) -> None:
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
     outcomes = work_off(wanted, settings)
     show(rich_table(grid_table(wanted, outcomes)))
+    _tell_other_code(outcomes)
     tell(f"study {wanted.study}; its figures: python -m sweeps.study name={wanted.study}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
@@ -137,6 +148,12 @@ def _grid(wanted: PointList, settings: Settings) -> None:
             f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
             f"{failed[0].reason} (hydra.sweeper.retry=failed tries them again)."
         )
+
+
+def _tell_other_code(outcomes: Sequence[Outcome]) -> None:
+    line = other_code_line(outcomes)
+    if line:
+        tell(line)
 
 
 def grid_table(wanted: PointList, outcomes: Sequence[Outcome]) -> Grid:

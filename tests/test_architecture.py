@@ -28,12 +28,13 @@ ALLOWED = {
     "geometry": {"rgbt.types", "rgbt.checks", "rgbt.geometry"},
     "randomness.py": set(),
     "config.py": {"rgbt.checks"},
-    "identity.py": {"rgbt.checks", "rgbt.config"},
     "yaml_files.py": {"rgbt.checks"},
     "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
     "stopping.py": set(),
     "command.py": {"rgbt.checks", "rgbt.config", "rgbt.resources", "rgbt.stopping"},
     "resources.py": {"rgbt.checks"},
+    "identity.py": {"rgbt.checks", "rgbt.config", "rgbt.source_code"},
+    "source_code.py": set(),
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""
@@ -75,8 +76,8 @@ def is_command(text: str) -> bool:
 
 
 SWEEPS_MAY = {
-    *("checks", "types", "config", "identity", "command", "naming", "metrics", "tracking"),
-    "yaml_files",
+    *("checks", "types", "config", "identity", "source_code", "command", "naming", "metrics"),
+    *("tracking", "yaml_files"),
 }
 """What of rgbt the sweeps may import: they call its commands and read what these leave."""
 

@@ -140,14 +140,26 @@ def test_deeplab_pools_as_released_and_counts_all_rates(name: str) -> None:
 def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
     same = [
         *("dataset.root=/a", "runs_dir=/b", "tracking=none", "data.num_workers=3"),
-        *("trainer.accelerator=cpu", "trainer.threads=1", "name=other", "data.eval_batch_size=1"),
+        *(
+            "trainer.accelerator=cpu",
+            "fresh=true",
+            "trainer.threads=2",
+            "name=other",
+            "data.eval_batch_size=1",
+        ),
     ]
     base = ["+experiment=grbm", "dataset=mfnet", "dataset.root=/elsewhere"]
     key = run_key(compose(*base))
     assert run_key(compose(*base, *same)) == key
     # The file says 4.0; a user types 4.
     assert run_key(compose(*base, "masker.sigma_div=4")) == key
-    for change in ("seed=1", "masker.sigma_div=2", "dataset.name=mine", "trainer.max_steps=7"):
+    for change in (
+        "seed=1",
+        "masker.sigma_div=2",
+        "dataset.name=mine",
+        "trainer.max_steps=7",
+        "trainer.threads=1",
+    ):
         assert run_key(compose(*base, change)) != key, change
 
 

@@ -36,18 +36,6 @@ STANDING = (
 )
 """Experiments that need others, each in another way."""
 
-OLD_KEYS = {
-    "baseline": ("d9d85f3fb51e", "1a5542b15e05"),
-    "cmx": ("ca4b6482473f", "0c9738d2f73d"),
-    "crm": ("2bb0ff2e4fa8", "478a6fb3482b"),
-    "grbm": ("a281d3f80222", "20d6aec51527"),
-    "mfnet": ("9bbd2b399176", "494e7542104f"),
-    "rtfnet_temporal_con": ("ee845de5c222", "018fd8a5e646"),
-    "spatialseg": ("8c3e59847adf", "f023baf07df7"),
-    "temporal_dice": ("9f25300a77cf", "eb6397709560"),
-}
-"""At scale=demo, and at scale=paper with dataset=mfnet, of before there were domains."""
-
 
 @pytest.fixture(autouse=True)
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,12 +113,6 @@ def bring(labels: list, rehearsed: list[str], tmp_path: Path) -> Any:
 # ---- keys -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("experiment", OLD_KEYS)
-def test_runs_of_before_keep_their_keys(experiment: str) -> None:
-    paper = ("scale=paper", "dataset=mfnet", "dataset.root=x")
-    assert (alone(experiment), alone(experiment, *paper)) == OLD_KEYS[experiment]
-
-
 TYPED = {
     "as it is": [],
     "seed": ["seed=3"],
@@ -193,7 +175,7 @@ def test_what_of_an_earlier_run_counts_in_the_key() -> None:
 
 def test_where_runs_lie_and_how_they_are_tracked_does_not_count() -> None:
     base = alone("multi_head_night")
-    for typed in (["runs_dir=/elsewhere"], ["tracking=none"], ["trainer.threads=1"]):
+    for typed in (["runs_dir=/elsewhere"], ["tracking=none"], ["fresh=true"]):
         assert alone("multi_head_night", *typed) == base
 
 

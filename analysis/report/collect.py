@@ -18,6 +18,7 @@ from analysis.report.tables import table_entries
 from analysis.report.tables_intervals import Track
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.replaced import TAG as REPLACED_TAG
 
 TITLE = "RGB-thermal segmentation: runs and tables"
 
@@ -59,6 +60,7 @@ def collect(asked: Asked, track: Track) -> ReportData:
             each
             for tracking in track([asked.tracking], "store")
             for each in read_store(tracking, asked.runs_dir, Path(copies))
+            if REPLACED_TAG not in each.tags
         ]
         runs = _open_all(stored, track, remarks)
         by_key = {run.entry.key: run for run in runs}

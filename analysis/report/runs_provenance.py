@@ -16,7 +16,7 @@ from rgbt.tracking.provenance import without_passwords
 COMMIT_LENGTH = 10
 COMMIT_TAG = "mlflow.source.git.commit"
 
-NOT_REPEATED = re.compile(r"-m|--multirun|runs_dir=|out=|\+*(tracking|hydra)[./=]")
+NOT_REPEATED = re.compile(r"-m|--multirun|runs_dir=|out=|fresh=|\+*(tracking|hydra)[./=]")
 """Words of a command that belong to a machine, or to a grid that the run was a point of."""
 
 IS_GRID = re.compile(r"(range|choice|interval|glob)\(")

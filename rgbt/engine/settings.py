@@ -22,7 +22,8 @@ class TrainerSettings:
         clip_norm: largest L2 norm of all gradients together; null leaves them as they are.
         precision: "32-true" or "bf16-mixed".
         accelerator: "auto" takes a GPU where there is one.
-        threads: CPU threads; null leaves torch's choice.
+        threads: of the CPU's arithmetic, >= 1, whatever cores a machine has: the bits of a result
+            depend on it. Runs of before it had a number (null) took one per core.
         selection_split: split whose mIoU picks the best checkpoint. Released: "test".
         tested: what the test split is evaluated with: "best", the checkpoint with the highest mIoU
             on the selection split, or "last", where that split says little (it holds no images
@@ -37,16 +38,15 @@ class TrainerSettings:
     clip_norm: float | None
     precision: Literal["32-true", "bf16-mixed"]
     accelerator: Literal["auto", "cpu", "cuda", "mps"]
-    threads: int | None
+    threads: int
     selection_split: str
     tested: Literal["best", "last"] = "best"
 
     def __post_init__(self) -> None:
-        for name in ("max_steps", "eval_every", "checkpoint_every", "log_every", "accumulate"):
+        durations = ("max_steps", "eval_every", "checkpoint_every", "log_every")
+        for name in (*durations, "accumulate", "threads"):
             if getattr(self, name) < 1:
                 raise InputError(f"trainer.{name} must be at least 1, got {getattr(self, name)}.")
-        if self.threads is not None and self.threads < 1:
-            raise InputError(f"trainer.threads must be at least 1 or null, got {self.threads}.")
         if self.clip_norm is not None and self.clip_norm <= 0:
             raise InputError(f"trainer.clip_norm must be positive or null, got {self.clip_norm}.")
 

@@ -151,6 +151,11 @@ class RunFolder:
         """Entries of all processes that worked on this run, first one first."""
         return read_provenance(self.path / "provenance.json")
 
+    def begin_at(self, step: int) -> None:
+        """Note the step at which the last process of `provenance` began."""
+        entries = self.provenance()
+        self._write_json("provenance.json", [*entries[:-1], {**entries[-1], "from_step": step}])
+
     def describe(self, description: Description) -> None:
         """Write how a tracker shall show this run."""
         self._write_json("run.json", sealed(vars(description)))
@@ -300,7 +305,7 @@ def find_run(run: str, runs_dir: Path) -> Path:
     for folder in (Path(run), runs_dir / run):
         if (folder / "config.yaml").is_file():
             return folder.resolve()
-    for sent in sorted(runs_dir.glob("*/mlflow.json")):
+    for sent in sorted((*runs_dir.glob("*/mlflow.json"), *runs_dir.glob("replaced/*/mlflow.json"))):
         if _sent_as(sent) == run:
             return sent.parent.resolve()
     raise InputError(

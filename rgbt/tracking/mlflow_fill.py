@@ -22,6 +22,7 @@ from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import MetricLine, RunFolder
 from rgbt.tracking.mlflow_client import Store
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
+from rgbt.tracking.replaced import description_of
 from rgbt.tracking.tables import ResultTables, result_grids
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
@@ -122,7 +123,7 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     sent.later += later
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
-    description = folder.description()
+    description = description_of(folder)
     if description is not None and short_name(description.name) != name:
         store.client.update_run(sent.run_id, name=short_name(description.name))
     if status == "RUNNING" and seen != status:
@@ -227,7 +228,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
     """Parameters the run does not have yet; MLflow refuses to change one."""
     from mlflow.entities import Param
 
-    description = folder.description()
+    description = description_of(folder)
     params = {} if description is None else description.params
     return [Param(k, v[:PARAM_LENGTH]) for k, v in params.items() if k not in known]
 
@@ -235,7 +236,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
 def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
     from mlflow.entities import RunTag
 
-    description = folder.description()
+    description = description_of(folder)
     first = (folder.provenance() or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
@@ -244,8 +245,8 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
         "rgbt.command": first.get("command", ""),
         "mlflow.source.git.commit": first.get("git_commit") or "",
         "rgbt.dataset": (folder.result() or {}).get("dataset", ""),
-        **({} if description is None else description.tags),
         **identity(folder),
+        **({} if description is None else description.tags),
     }
     if tables is not None:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))

@@ -8,6 +8,7 @@ from typing import Any
 
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_client import Store
+from rgbt.tracking.replaced import description_of
 
 NAME_LENGTH = 250
 """Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
@@ -46,7 +47,7 @@ def unnoted_run(store: Store, folder: RunFolder) -> Any:
 
 def new_run(store: Store, folder: RunFolder) -> Any:
     """A run made for this folder, found again by `unnoted_run`."""
-    description = folder.description()
+    description = description_of(folder)
     assert description is not None, f"{folder.path}: describe() comes before fill()"
     return store.client.create_run(
         store.experiment_id,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import re
@@ -14,6 +15,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+PACKAGE = Path(__file__).resolve().parents[1]
+CODE = (".py", ".csv")
+"""Files of the package that a result may depend on; the configuration is in the run's key."""
+
 DIFF_LIMIT = 2_000_000
 """Characters of uncommitted changes that are kept; a longer diff ends with a line that says so."""
 
@@ -24,7 +29,8 @@ def provenance() -> dict[str, Any]:
     Returns:
         ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords in addresses hidden), ``cwd``,
         ``pid``, ``git_commit`` and ``git_dirty`` (None where this code is not under git),
-        ``untracked`` (files the diff does not show), ``diff`` (text), ``python``, ``packages``
+        ``untracked`` (files the diff does not show), ``diff`` (text), ``code`` (`package_digest`),
+        ``threads`` (of torch on the CPU), ``python``, ``packages``
         (name -> version), ``host``, ``platform``, ``cpu``, ``cpu_count``, ``cpu_usable``,
         ``memory_gib``, ``gpus`` (names), ``cuda``.
     """
@@ -33,11 +39,26 @@ def provenance() -> dict[str, Any]:
         "command": without_passwords(shlex.join(sys.orig_argv)),
         "cwd": str(Path.cwd()),
         "pid": os.getpid(),
-        **_code(Path(__file__).resolve()),
+        **code(),
         "python": platform.python_version(),
         "packages": _packages(),
         **_machine(),
     }
+
+
+@cache
+def code() -> dict[str, Any]:
+    """The code of this package as this process first saw it: the part of `provenance` on it."""
+    return {**_code(Path(__file__).resolve()), "code": package_digest(PACKAGE)}
+
+
+def package_digest(package: Path) -> str:
+    """SHA-256 in hexadecimal over the names and contents of a package's code and tables."""
+    digest = hashlib.sha256()
+    for path in sorted(found for suffix in CODE for found in package.rglob(f"*{suffix}")):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(package)} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
 
 
 def without_passwords(text: str) -> str:
@@ -101,6 +122,7 @@ def _machine() -> dict[str, Any]:
     gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return {
+        "threads": torch.get_num_threads(),
         "host": platform.node(),
         "platform": platform.platform(),
         "cpu": _cpu_model(Path("/proc/cpuinfo")),

@@ -15,6 +15,7 @@ from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_fill import Status, read_sent
 from rgbt.tracking.mlflow_server import ui_command
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.replaced import REPLACED, runs_dir_of
 
 KEYS = ("run", "runs_dir", "uri", "artifact_uri", "experiment")
 EXPERIMENT = "rgbt"
@@ -46,7 +47,8 @@ def folders_of(options: dict[str, str]) -> list[RunFolder]:
         InputError: the folder is missing or is no run folder.
     """
     if "runs_dir" in options:
-        return runs_in(options["runs_dir"])
+        replaced = Path(options["runs_dir"]) / REPLACED
+        return [*runs_in(options["runs_dir"]), *(runs_in(replaced) if replaced.is_dir() else ())]
     path = Path(options["run"])
     if not (path / "run.json").exists():
         raise InputError(f"{path} is not a run folder (it has no run.json).")
@@ -69,7 +71,7 @@ def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
         uri,
         artifact_uri=options.get("artifact_uri", artifact_uri),
         experiment=options.get("experiment", sent.experiment if sent else EXPERIMENT),
-        runs_dir=str(folder.path.parent),
+        runs_dir=str(runs_dir_of(folder)),
     )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -50,7 +49,7 @@ class Driver:
         source: gives the work.
         runs: where finished runs are found.
         executor: makes processes.
-        settings: workers, GPUs, threads, budget.
+        settings: workers, GPUs, budget.
         view: what a person sees.
         metrics: names of the study's objectives.
     """
@@ -159,9 +158,6 @@ class Driver:
         self, command: Sequence[str], log: Path, *, slot: int, tags: Mapping[str, str]
     ) -> Job:
         environment = {TAGS: json.dumps(dict(tags))}
-        if self.settings.executor == "local":
-            threads = self.settings.threads or max(1, usable_cores() // self.settings.workers)
-            environment |= {"OMP_NUM_THREADS": str(threads)}
         if self.settings.gpus:
             gpu = self.settings.gpus[slot % len(self.settings.gpus)]
             environment |= {"CUDA_VISIBLE_DEVICES": str(gpu)}
@@ -211,11 +207,6 @@ class Driver:
         with suppress(StorageInternalError):
             for work in self.works.values():
                 self.ledger.release(work.number, "its driver was stopped", again=self.source.again)
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def _finite(name: str, scores: Mapping[str, float]) -> float:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 
 import rgbt
+from rgbt.source_code import counted_modules
 
 PRELOADED = (
     *("sweeps.running.executors", "torch", "hydra"),
@@ -62,11 +63,17 @@ class LocalExecutor:
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([*PRELOADED, *own_modules()])
+        self._is_preloaded = False
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
         """See `Executor.start`."""
         log.parent.mkdir(parents=True, exist_ok=True)
+        if not self._is_preloaded:
+            # Now, when the points are planned and have imported what the user wrote for them.
+            last = "sweeps.running.preload"
+            modules = (*PRELOADED, *own_modules(), *counted_modules(), last)
+            self._context.set_forkserver_preload(list(modules))
+            self._is_preloaded = True
         process = self._context.Process(
             target=_run_module, args=(tuple(command), dict(environment), str(log), str(Path.cwd()))
         )
@@ -116,10 +123,6 @@ def _run_module(
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(environment)
-    if "OMP_NUM_THREADS" in environment:  # too late for the library, which is loaded already
-        import torch
-
-        torch.set_num_threads(int(environment["OMP_NUM_THREADS"]))
     os.chdir(folder)
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     for stream in (1, 2):

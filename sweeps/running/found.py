@@ -16,7 +16,9 @@ from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.formats import ADVICE, read_provenance, read_result
 from rgbt.tracking.mlflow_fill import shown
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.other_code import other_code
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.terminal import tell
 from sweeps.points import Evaluation
 
@@ -63,6 +65,11 @@ class Found:
         first = next(iter(read_provenance(self.folder / "provenance.json")), {})
         commit = first.get("git_commit")
         return None if commit is None else f"{commit[:10]}{'+' if first.get('git_dirty') else ''}"
+
+    @property
+    def is_of_other_code(self) -> bool:
+        """Whether it was made by other code than that of this process."""
+        return other_code(RunFolder(self.folder)) is not None
 
     def scores(self) -> dict[str, float]:
         """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
@@ -113,7 +120,8 @@ def in_percent(name: str, value: float) -> float:
 
 def open_runs(config: DictConfig) -> Runs:
     """Finished runs where a configuration says that runs lie and how they are tracked."""
-    return Runs(Path(config.runs_dir).expanduser().resolve(), build(config.tracking))
+    runs_dir = Path(config.runs_dir).expanduser().resolve()
+    return Runs(runs_dir, build(config.tracking), fresh=config.fresh)
 
 
 class Runs:
@@ -122,11 +130,13 @@ class Runs:
     Args:
         runs_dir: the folder of runs.
         tracking: as the configuration builds it; MLflow is asked for runs that have no result here.
+        fresh: finished runs that other code made do not count: they are trained again.
     """
 
-    def __init__(self, runs_dir: Path, tracking: Tracking) -> None:
+    def __init__(self, runs_dir: Path, tracking: Tracking, *, fresh: bool = False) -> None:
         self.runs_dir = runs_dir
         self.tracking = tracking
+        self.fresh = fresh
         self._is_away = False
 
     def find(self, key: str, dataset: str) -> Found | None:
@@ -135,6 +145,20 @@ class Runs:
         Raises:
             RunError: the run folder is finished, but on other files of the data set.
         """
+        found = self._any(key, dataset)
+        return None if found is not None and self._is_outdated(found) else found
+
+    def replace_outdated(self, key: str) -> None:
+        """Make room for a training of `key` where `find` passes over a finished run of it."""
+        folder = self.runs_dir / key
+        if (folder / "result.json").exists() and self._is_outdated(Found(key, folder)):
+            replace_finished(RunFolder(folder), self.tracking)
+
+    def _is_outdated(self, found: Found) -> bool:
+        return self.fresh and found.is_of_other_code
+
+    def _any(self, key: str, dataset: str) -> Found | None:
+        """See `find`; whatever code made it."""
         folder = self.runs_dir / key
         if not (folder / "result.json").exists():
             return self._remote(key, dataset)

@@ -84,6 +84,18 @@ class PointList:
     distributions: Mapping[str, Any] | None = None
 
 
+def other_code_line(outcomes: Sequence[Outcome]) -> str:
+    """How many runs other code made, in a sentence; "" for none."""
+    found = {run.key: run for outcome in outcomes for run in outcome.found}
+    others = sum(run.is_of_other_code for run in found.values())
+    if not others:
+        return ""
+    return (
+        f"{others} of {len(found)} runs were made by other code; fresh=true trains these again and "
+        "keeps the old runs."
+    )
+
+
 def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
     """What is known of the points; nothing is run and nothing written."""
     prepared = _Prepared(wanted)

@@ -149,8 +149,8 @@ class Work:
                 found = runs.find(run.key, run.dataset)
             if found is None:
                 raise PointError(
-                    f"the run ended, but not as {run.key}: its configuration or its data set was "
-                    "changed while the sweep was going on; give the command again"
+                    f"the run ended, but not as {run.key}: its configuration, its data set or your "
+                    "own code was changed during the sweep; rerun the command"
                 )
             runs.tag(found, self.plan.point.tags)
             for evaluation in self.plan.point.evaluations:
@@ -162,6 +162,7 @@ class Work:
         folder = self._around.runs.runs_dir / run.key
         self._follower = Follower(folder)
         log = self._log(run)
+        self._around.runs.replace_outdated(run.key)
         while not (folder / "result.json").exists():
             if is_held(folder / "lock"):
                 # Left by a driver that was killed, or run by hand: its result is taken when it

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from rgbt.tracking.tables import ABSENT, Grid
-from sweeps.running.lists import Outcome, estimated_seconds
+from sweeps.running.lists import Outcome, estimated_seconds, other_code_line
 from sweeps.running.live import duration
 from sweeps.running.sources import State
 from sweeps.table.cell_points import Wanted
@@ -58,6 +58,7 @@ def summary(wanted: Wanted, outcomes: Sequence[Outcome], workers: int) -> list[s
         seconds = estimated_seconds(outcomes, workers)
         known = duration(seconds) if seconds is not None else "known once a run is finished"
         lines.append(f"Time left with workers={workers}: {known}.")
+    lines += [line for line in (other_code_line(outcomes),) if line]
     lines += _evaluations(wanted, outcomes)
     if wanted.table.needs is not None:
         lines.append(f"The table cannot be run yet; it needs {wanted.table.needs}.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.terminal import place_lines, show, tell
 from sweeps.report.records import record
-from sweeps.running.lists import Outcome
+from sweeps.running.lists import Outcome, other_code_line
 from sweeps.sheet.figure import draw_table
 from sweeps.sheet.files import latex, markdown, tidy_csv
 from sweeps.sheet.sheet import Sheet, sheet_of
@@ -105,4 +105,7 @@ def _tell_what_is_missing(scored: Scored, outcomes: Sequence[Outcome]) -> bool:
         )
     if empty:
         tell("some cells have no value although nothing is missing, see the footnotes.")
+    other = other_code_line(outcomes)
+    if other:
+        tell(other)
     return bool(failed) or empty

@@ -29,7 +29,7 @@ SETTINGS = {
     "clip_norm": 1.0,
     "precision": "32-true",
     "accelerator": "cpu",
-    "threads": None,
+    "threads": 1,
     "selection_split": "val",
 }
 

@@ -122,7 +122,7 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     settings: dict[str, Any] = {
         **{"max_steps": steps, "eval_every": 1000, "checkpoint_every": 1000, "log_every": 1},
         **{"accumulate": 1, "clip_norm": None, "precision": "32-true", "accelerator": "cpu"},
-        **{"threads": None, "selection_split": "val", **changes},
+        **{"threads": 1, "selection_split": "val", **changes},
     }
     log: list[dict[str, float]] = []
     made = Trainer(

@@ -51,7 +51,6 @@ def settings(**changes: Any) -> Settings:
         "storage": None,
         "workers": 1,
         "gpus": None,
-        "threads": 1,
         "executor": "local",
         "submitit": {},
         "retries": 0,

@@ -84,7 +84,7 @@ def test_interpolations_of_spaces_grids_and_points_are_left_to_the_runs(
         ({"workers": 1.5}, "hydra.sweeper.workers"),
         ({"retries": -1}, "retries must be at least 0"),
         ({"replicates": 0}, "replicates must be at least 1"),
-        ({"threads": 0}, "threads must be at least 1"),
+        ({"threads": 1}, "'hydra.sweeper.threads' is not a setting"),
         ({"trials": 0}, "trials must be at least 1"),
         ({"hours": 0}, "hours must be positive or null, got 0"),
         ({"timeout_minutes": -2}, "timeout_minutes must be positive or null, got -2"),

@@ -97,7 +97,7 @@ def test_the_same_command_is_the_same_study_wherever_its_runs_lie(
 ) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=1,2")
     call(tmp_path / "a", *words)
-    call(tmp_path / "b", *words, "trainer.threads=1", "dataset.cache_dir=/c")
+    call(tmp_path / "b", *words, "fresh=true", "dataset.cache_dir=/c")
     call(tmp_path / "a", *words, "trainer.max_steps=3")
     first, moved, other = (wanted.study for wanted in asked.lists)
     assert first == moved != other
@@ -114,7 +114,7 @@ def test_the_same_search_is_the_same_study_in_any_order(asked: Asked, tmp_path: 
         "+experiment=grbm",
         interval,
         "seed=1",
-        "trainer.threads=1",
+        "fresh=true",
         "trainer.max_steps=3",
         **budget,
     )

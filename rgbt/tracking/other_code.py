@@ -1,0 +1,99 @@
+"""Whether a run was made by the code that is here now.
+
+The key of a run does not hold the code of this package: every change of it would hide all
+results. Instead each process notes what it ran (`rgbt.tracking.provenance`), and commands that
+show a result compare.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.provenance import code
+from rgbt.tracking.terminal import tell
+
+COMMIT_LENGTH = 7
+
+
+def other_code(folder: RunFolder) -> str | None:
+    """What made a run, if it was other code than that of this process; None if it was the same.
+
+    Compared is the digest of the package's source, so that changed documents and tests are no
+    other code. Of runs that did not note it: the commit and the uncommitted changes. None as well
+    where neither is known.
+
+    Returns:
+        such as "commit abc1234 of 2026-11-20, now def5678 with uncommitted changes".
+    """
+    now = code()
+    for entry in _contributing(folder.provenance()):
+        if _differs(entry, _diff(folder, entry), now):
+            return f"{_version(entry)} of {str(entry.get('started'))[:10]}, now {_now(entry, now)}"
+    return None
+
+
+def warn_of_result(folder: RunFolder) -> None:
+    """Say so where a finished run was made by other code."""
+    made_by = other_code(folder)
+    if made_by is not None:
+        tell(
+            f"This result was made by other code ({made_by}); fresh=true trains again and keeps "
+            "the old run."
+        )
+
+
+def warn_of_steps(folder: RunFolder, step: int) -> None:
+    """Say so where a run that resumes at a step was trained by other code before."""
+    made_by = other_code(folder)
+    if made_by is not None:
+        tell(
+            f"warning: the first {step} steps were trained by other code ({made_by}); to train all "
+            f"steps by the present code, remove {folder.path} and rerun the command."
+        )
+
+
+def _contributing(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Entries of the processes that the state of a run comes from.
+
+    What a process did after the step at which a later one began is not in the state.
+    """
+    found = []
+    kept_until = math.inf
+    for entry in reversed(entries):
+        begin = entry.get("from_step")  # None: of before it was noted
+        if (begin or 0) < kept_until:
+            found.insert(0, entry)
+        kept_until = kept_until if begin is None else min(kept_until, begin)
+    return found
+
+
+def _differs(entry: Mapping[str, Any], diff: str | None, now: Mapping[str, Any]) -> bool:
+    if entry.get("code"):
+        return bool(entry["code"] != now["code"])
+    if not entry.get("git_commit") or not now["git_commit"]:
+        return False
+    is_other_diff = diff is not None and diff != now["diff"]
+    return bool(entry["git_commit"] != now["git_commit"] or is_other_diff)
+
+
+def _diff(folder: RunFolder, entry: Mapping[str, Any]) -> str | None:
+    """Uncommitted changes of an entry; None where the folder does not hold them."""
+    if not entry.get("diff"):
+        return ""
+    path = folder.path / str(entry["diff"])
+    return path.read_text() if path.is_file() else None
+
+
+def _now(entry: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    same = entry.get("git_commit") and entry["git_commit"] == now["git_commit"]
+    return "with other uncommitted changes" if same else _version(now).removeprefix("commit ")
+
+
+def _version(entry: Mapping[str, Any]) -> str:
+    if not entry.get("git_commit"):
+        return f"code {str(entry.get('code'))[:COMMIT_LENGTH]}"
+    changes = " with uncommitted changes" if entry.get("git_dirty") else ""
+    return f"commit {entry['git_commit'][:COMMIT_LENGTH]}{changes}"

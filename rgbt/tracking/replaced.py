@@ -1,0 +1,79 @@
+"""Finished runs that were replaced by another training of the same key (``fresh=true``).
+
+They lie in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
+no second seed for what looks at the runs of a folder.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.terminal import tell
+
+if TYPE_CHECKING:
+    from rgbt.tracking.mlflow_store import Tracking
+
+REPLACED = "replaced"
+TAG = "rgbt.replaced"
+GROUP = "rgbt.group"
+
+
+def set_aside(folder: RunFolder) -> RunFolder | None:
+    """Move a finished run away from its key.
+
+    Returns:
+        its new folder; None where the run is not finished, or not any more.
+
+    Raises:
+        InputError: a process trains there.
+    """
+    with folder.lock():
+        if folder.result() is None:
+            return None
+        number = 1
+        while _place(folder, number).exists():
+            number += 1
+        _place(folder, number).parent.mkdir(exist_ok=True)
+        folder.path.rename(_place(folder, number))
+    return RunFolder(_place(folder, number))
+
+
+def replace_finished(folder: RunFolder, tracking: Tracking) -> None:
+    """Set a finished run aside and show it so in its tracker."""
+    kept = set_aside(folder)
+    known = None if kept is None else kept.description()
+    if kept is None or known is None:
+        return
+    tracking.start(kept, known.name, known.tags, known.params)
+    tracking.finish("FINISHED")
+    tell(f"the finished run was moved to {kept.path}; run={kept.path} opens it.")
+
+
+def runs_dir_of(folder: RunFolder) -> Path:
+    """The folder of runs that a run belongs to, replaced or not."""
+    return folder.path.parents[1 if _is_replaced(folder) else 0]
+
+
+def description_of(folder: RunFolder) -> Description | None:
+    """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
+    known = folder.description()
+    if known is None or not _is_replaced(folder):
+        return known
+    tags = {
+        **known.tags,
+        TAG: "true",
+        GROUP: f"{known.tags.get(GROUP, known.name)} (replaced)",
+        "rgbt.key": f"{REPLACED}/{folder.path.name}",
+    }
+    return replace(known, name=f"{known.name} (replaced)", tags=tags)
+
+
+def _is_replaced(folder: RunFolder) -> bool:
+    return folder.path.parent.name == REPLACED
+
+
+def _place(folder: RunFolder, number: int) -> Path:
+    return folder.path.parent / REPLACED / f"{folder.path.name}-{number}"
