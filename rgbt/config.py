@@ -139,7 +139,7 @@ def typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any])
     """Values of a node as its constructor takes them; `nested` turns a node inside it into one."""
     target = _target(node, path)
     parameters = inspect.signature(target).parameters
-    hints = _annotations(target)
+    hints = annotations(target)
     values = {}
     for key, value in _items(node, path):
         if key in OF_THE_RUN.get(path, {}):
@@ -184,7 +184,8 @@ def _target(node: DictConfig, path: str) -> Any:
         ) from error
 
 
-def _annotations(target: Any) -> dict[str, Any]:
+def annotations(target: Any) -> dict[str, Any]:
+    """What the settings of a constructor take, by key: types with their ranges."""
     function = target.__init__ if inspect.isclass(target) else target
     hints = typing.get_type_hints(function, include_extras=True)
     hints.pop("return", None)

@@ -22,8 +22,11 @@ from rgbt.checks import InputError
 Place = tuple[int | str, ...]
 """Where in a value: indices of lists and keys of mappings."""
 
-NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
-NAMES |= {type(None): "null", dict: "a mapping", list: "a list", tuple: "a list"}
+NAMES: dict[Any, str] = {
+    **{float: "a number", int: "a whole number", str: "a text", bool: "true or false"},
+    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list"},
+    Any: "a finite value",
+}
 
 SHOWN = 80
 """Characters of a refused value that a sentence quotes."""
@@ -142,7 +145,7 @@ def expected(annotation: Any) -> str:
         return f"a mapping whose values are each {expected(args[1])}"
     if dataclasses.is_dataclass(annotation):
         return "a mapping with " + ", ".join(each.name for each in dataclasses.fields(annotation))
-    return f"{NAMES.get(annotation, 'an object')}{_range(limits)}{_remarks(limits)}"
+    return f"{NAMES.get(annotation, 'a mapping with `_target_`')}{_range(limits)}{_remarks(limits)}"
 
 
 def _one_of(words: list[str]) -> str:

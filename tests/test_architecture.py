@@ -26,11 +26,12 @@ ALLOWED = {
     "checks.py": set(),
     "geometry": {"rgbt.types", "rgbt.checks", "rgbt.geometry"},
     "randomness.py": set(),
-    "config.py": {"rgbt.checks"},
+    "values.py": {"rgbt.checks"},
+    "config.py": {"rgbt.checks", "rgbt.values"},
     "identity.py": {"rgbt.checks", "rgbt.config"},
     "command.py": {"rgbt.checks", "rgbt.config"},
 }
-COMMANDS = {"rgbt.command", "rgbt.config"}
+COMMANDS = {"rgbt.command", "rgbt.config", "rgbt.values"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""
 
 MEETING_PLACES = {

@@ -177,9 +177,11 @@ class VirtualView:
     def _check_ranges(self) -> None:
         for name, (low, high) in self.ranges.items():
             whole = float(low).is_integer() and float(high).is_integer()
-            if low > high or (self.angles == "integer" and not (whole and low < high)):
-                wanted = "whole degrees, low < high" if self.angles == "integer" else "low <= high"
-                raise InputError(f"view.{name} must be (low, high) with {wanted}, got {low, high}.")
+            if self.angles == "integer" and not (whole and low < high):
+                raise InputError(
+                    f"view.{name} must be (low, high) with whole degrees, low < high, got "
+                    f"{low, high}; see view.angles=integer."
+                )
         self._check_turns()
 
     def _check_turns(self) -> None:
