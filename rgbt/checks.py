@@ -7,7 +7,7 @@ A constructor that a configuration names declares the range of each setting in i
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import Interval, Len, Predicate, doc
@@ -127,6 +127,13 @@ def check_choice(name: str, value: str, known: Iterable[str]) -> None:
     names = list(known)
     if value not in names:
         raise InputError(f"{name}: '{value}' is not a choice; {nearest(value, names)}.")
+
+
+def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
+    """Names of the tensors that hold NaN or infinity, in their order."""
+    # All are looked at before any is waited for, which costs a GPU one wait and not one each.
+    finite = {name: tensor.isfinite().all() for name, tensor in tensors.items()}
+    return [name for name, each in finite.items() if not each]
 
 
 def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[str, int]:

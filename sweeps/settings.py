@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, Positive, Text, Threads, nearest
+from rgbt.checks import InputError, Names, Positive, Text, Threads, nearest
 from rgbt.config import build
 from rgbt.metrics import names as scores
 
@@ -86,7 +86,7 @@ class Settings:
     dry_run: bool
     study: Text | None
     params: dict[str, Any]
-    points: tuple[tuple[str, ...], ...]
+    points: tuple[Names, ...]
     space: dict[str, dict[str, Any]]
     objectives: Annotated[tuple[Objective, ...], Len(1, 10)]
     sampler: dict[str, Any]

@@ -244,6 +244,27 @@ def test_exponential_falls_by_the_epoch() -> None:
     assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]
 
 
+@pytest.mark.parametrize(("poisoned", "value"), [(2, "nan"), (3, "inf")])
+def test_weights_that_are_not_finite_are_neither_saved_nor_evaluated(
+    tmp_path: Path, poisoned: int, value: str
+) -> None:
+    trainer, _ = make(tmp_path)
+    evaluated: list[int] = []
+    trainer.validate = lambda step: float(evaluated.append(step) or step)
+
+    def poison(step: int, values: dict[str, float]) -> None:
+        if step == poisoned:
+            trainer.model.get_submodule("2").bias.data[0] = float(value)
+
+    trainer.record = poison
+    said = rf"step {poisoned}: '2.bias' holds NaN or infinity \(1 of 6 tensors do\)\. The last"
+    with pytest.raises(RunError, match=said):
+        trainer.fit(batches(0), State(seed=7))
+    assert evaluated == []
+    # Step 2 writes a checkpoint, step 3 would evaluate.
+    assert trainer.last.exists() == (poisoned == 3)
+
+
 def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
     path = tmp_path / "other.pt"
     save_checkpoint(path, {"model": nn.Linear(2, 3).state_dict()})
