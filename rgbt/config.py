@@ -12,6 +12,7 @@ import inspect
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -176,14 +177,15 @@ def _target(node: DictConfig, path: str) -> Any:
         raise InputError(
             f"'{path}' must be a mapping with `_target_`; choose a file of conf/{path}/"
         )
+    name = check_value(f"{path}._target_", node["_target_"], Text)
     try:
-        return get_object(node["_target_"])
+        return get_object(name)
     except Exception as error:
-        raise InputError(
-            f"'{path}._target_': cannot import {node['_target_']} ({error.__cause__ or error})."
-        ) from error
+        reason = " ".join(str(error.__cause__ or error).split())
+        raise InputError(f"'{path}._target_': cannot import {name} ({reason}).") from error
 
 
+@cache
 def annotations(target: Any) -> dict[str, Any]:
     """What the settings of a constructor take, by key: types with their ranges."""
     function = target.__init__ if inspect.isclass(target) else target
