@@ -2,17 +2,18 @@
 
 The schema of a node is the constructor that its ``_target_`` names: keys and values are checked
 against the constructor's signature and annotations before anything is built, so that a misspelt
-key in an experiment file or after ``+`` is refused as well (Hydra lets both through).
+key in an experiment file or after ``+`` is refused as well (Hydra lets both through). Ranges are
+part of the annotations (`rgbt.checks`).
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import json
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,11 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, Seed, Text, nearest
+from rgbt.values import check_value
 
 TOP_LEVEL: dict[str, Any] = {
-    **{"seed": int, "name": str, "runs_dir": str, "out": str | None, "pretrained": str | None},
+    **{"seed": Seed, "name": Text, "runs_dir": Text, "out": Text | None, "pretrained": Text | None},
     "fresh": bool,
 }
 """Keys of the configuration that are plain values; every other one is a node with `_target_`."""
@@ -37,7 +39,7 @@ NODES = (
 )
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
-    "model": {"weights": str | None, "fresh": tuple[str, ...]},
+    "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
 }
 """Keys of a node that the run reads itself and the constructor does not take, by node."""
 
@@ -93,7 +95,7 @@ def check(config: DictConfig) -> None:
                 f"'{key!s}' is not a key of the configuration; {nearest(str(key), known)}."
             )
     for key, annotation in TOP_LEVEL.items():
-        _check_value(key, config[key], annotation)
+        check_value(key, config[key], annotation)
     for key in NODES:
         check_node(config[key], key)
 
@@ -146,11 +148,11 @@ def typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any])
     """Values of a node as its constructor takes them; `nested` turns a node inside it into one."""
     target = _target(node, path)
     parameters = inspect.signature(target).parameters
-    hints = _annotations(target)
+    hints = setting_types(target)
     values = {}
     for key, value in _items(node, path):
         if key in OF_THE_RUN.get(path, {}):
-            _check_value(f"{path}.{key}", value, OF_THE_RUN[path][key])
+            check_value(f"{path}.{key}", value, OF_THE_RUN[path][key])
             continue
         if key not in parameters:
             known = [*OF_THE_RUN.get(path, ()), *(name for name in parameters if name in hints)]
@@ -160,7 +162,7 @@ def typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any])
         if isinstance(value, DictConfig) and "_target_" in value:
             values[key] = nested(value, f"{path}.{key}")
         else:
-            values[key] = _check_value(f"{path}.{key}", value, hints.get(key, Any))
+            values[key] = check_value(f"{path}.{key}", value, hints.get(key, Any))
     return values
 
 
@@ -202,8 +204,7 @@ def constructor(target: Any, path: str) -> Any:
 
 def _authorized(target: Any, path: str) -> functools.partial[Any]:
     """`target` as Hydra's `instantiate` returns it; what executes code is refused there."""
-    if not isinstance(target, str):
-        raise InputError(f"'{path}._target_': expected a dotted path, got {target!r}.")
+    target = check_value(f"{path}._target_", target, Text)
     try:
         found = _partial(target)
         if found.func is not get_object(target):  # its module was imported anew
@@ -231,9 +232,11 @@ def _refused(target: str, path: str, error: Exception) -> InputError:
     return InputError(f"'{path}._target_': cannot import {target} ({said}).")
 
 
-def _annotations(target: Any) -> dict[str, Any]:
+@cache
+def setting_types(target: Any) -> dict[str, Any]:
+    """What the settings of a constructor take, by key: types with their ranges."""
     function = target.__init__ if inspect.isclass(target) else target
-    hints = typing.get_type_hints(function)
+    hints = typing.get_type_hints(function, include_extras=True)
     hints.pop("return", None)
     return hints
 
@@ -249,20 +252,3 @@ def _items(node: DictConfig, path: str) -> Iterator[tuple[str, Any]]:
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"'{path}.{key!s}' cannot be resolved: {reason}") from error
-
-
-def _check_value(path: str, value: Any, annotation: Any) -> Any:
-    """`value` as the annotated type; as in JSON, a list may be a tuple and an int a float."""
-    import pydantic  # not at the top: --help does not need it
-
-    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-    try:
-        return pydantic.TypeAdapter(annotation).validate_json(json.dumps(plain), strict=True)
-    except pydantic.errors.PydanticSchemaGenerationError:
-        raise InputError(f"'{path}' is not a setting: the run itself provides it.") from None
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        inner = "".join(f"[{part}]" for part in first["loc"] if isinstance(part, int))
-        reason = first["msg"].removeprefix("Value error, ")
-        reason = reason[0].lower() + reason[1:]
-        raise InputError(f"'{path}'{inner}: {reason}, got {json.dumps(plain)}.") from None

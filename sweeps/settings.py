@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, Names, Positive, Text, nearest
 from rgbt.config import build
 from rgbt.metrics import names as scores
 
@@ -37,7 +38,7 @@ class Objective:
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
-    metric: str
+    metric: Text
     direction: Literal["maximize", "minimize"]
 
     def __post_init__(self) -> None:
@@ -64,44 +65,36 @@ class Objective:
         return self.metric.startswith("val/") and not self.is_consistency
 
 
+NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
 
-    storage: str | None
-    workers: int
-    gpus: tuple[int, ...] | None
+    storage: Text | None
+    workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at a time")]
+    gpus: Annotated[tuple[Annotated[int, Interval(ge=0, le=1023)], ...], Len(1, 1024)] | None
     executor: Literal["local", "submitit"]
     submitit: dict[str, Any] | None
-    retries: int
+    retries: Annotated[int, Interval(ge=0, le=1000)]
     retry: Literal["none", "failed"]
-    timeout_minutes: float | None
-    max_failures: int | None
+    timeout_minutes: Positive | None
+    max_failures: NumRuns | None
     wait: bool
     dry_run: bool
-    study: str | None
+    study: Text | None
     params: dict[str, Any]
-    points: tuple[tuple[str, ...], ...]
+    points: tuple[Names, ...]
     space: dict[str, dict[str, Any]]
-    objectives: tuple[Objective, ...]
+    objectives: Annotated[tuple[Objective, ...], Len(1, 10)]
     sampler: dict[str, Any]
     pruner: dict[str, Any] | None
-    trials: int | None
-    hours: float | None
-    replicates: int
+    trials: NumRuns | None
+    hours: Positive | None
+    replicates: Annotated[int, Interval(ge=1, le=1000)]
 
     def __post_init__(self) -> None:
-        at_least = {"workers": 1, "retries": 0, "replicates": 1, "trials": 1, "max_failures": 1}
-        for name, least in at_least.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{name} must be at least {least}, got {value}.")
-        for name in ("hours", "timeout_minutes"):
-            value = getattr(self, name)
-            if value is not None and value <= 0:
-                raise InputError(f"{name} must be positive or null, got {value:g}.")
-        if self.gpus is not None and not self.gpus:
-            raise InputError("gpus=[]: expected numbers of GPUs such as [0,1], or null.")
         if self.submitit and self.executor != "submitit":
             raise InputError("submitit={...} are options of executor=submitit; add that.")
         if self.executor == "submitit" and self.timeout_minutes is not None:
@@ -109,8 +102,6 @@ class Settings:
                 "timeout_minutes would count the time in the queue too; with executor=submitit "
                 "give submitit={timeout_min: ...}."
             )
-        if not self.objectives:
-            raise InputError("objectives: expected at least one, such as val/mIoU.")
 
 
 EXECUTION = (

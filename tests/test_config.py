@@ -175,10 +175,10 @@ def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"size": [1]}, "'knob.size'"),
-        ({"size": [1, 2.5]}, r"'knob.size'\[1\]"),
-        ({"size": [1, True]}, r"'knob.size'\[1\]"),
-        ({"kind": "c"}, "'knob.kind': input should be 'a' or 'b', got \"c\""),
+        ({"size": [1]}, r"'knob.size' must be a list of 2, each a whole number, got \[1\]"),
+        ({"size": [1, 2.5]}, r"'knob.size\[1\]' must be a whole number, got"),
+        ({"size": [1, True]}, r"'knob.size\[1\]' must be a whole number, got"),
+        ({"kind": "c"}, "'knob.kind' must be 'a' or 'b', got \"c\""),
         ({"kin": "a"}, "'knob.kin' is not a setting of .*did you mean 'kind'"),
         ({"kind": "???"}, "'knob.kind' has no value"),
         ({"kind": "${nowhere}"}, "'knob.kind' cannot be resolved"),

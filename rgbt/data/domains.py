@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, ShareBelowOne, Text
 from rgbt.types import View
 
 GIVEN, NONE = "given", "none"
@@ -37,20 +37,15 @@ class Domain:
         InputError: a setting that has no effect with these labels.
     """
 
-    split: str
+    split: Text
     view: View | None
-    head: str | None
-    labels: str
+    head: Text | None
+    labels: Text
     teacher_view: View | None = None
-    threshold: float = 0.0
+    threshold: ShareBelowOne = 0.0
     confidence: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.threshold < 1:
-            raise InputError(
-                f"domains: threshold must lie in [0, 1), got {self.threshold:g}; 0 keeps every "
-                "pseudo-label."
-            )
         predicts = self.labels.startswith("experiment:")
         if not predicts and (self.threshold or self.teacher_view is not None):
             raise InputError(

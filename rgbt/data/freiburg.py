@@ -9,13 +9,14 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import Colour, InputError, Names, NumClasses, Text, check_choice, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb, within
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
@@ -42,6 +43,10 @@ SPLITS = {
 }
 CROP = (5, 645, 360, 1640)
 THERMAL_RANGE = (21800, 23700)
+Count = Annotated[int, Interval(ge=0, lt=2**16)]
+Counts = tuple[Count, Count]
+Edge = Annotated[int, Interval(ge=0, le=8192)]
+Crop = tuple[Edge, Edge, Edge, Edge]
 
 MOST_STRETCH = 0.02
 """How far the aspect of a label may be from that of its frame: what rounding a size leaves."""
@@ -97,17 +102,17 @@ class Freiburg:
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
-        root: str,
+        root: Text,
         *,
-        name: str = "freiburg",
-        num_classes: int = len(CLASSES),
-        classes: tuple[str, ...] = CLASSES,
-        palette: tuple[tuple[int, int, int], ...] = PALETTE,
-        unscored: tuple[str, ...] = ("background", "ignore"),
-        crop: tuple[int, int, int, int] | None = CROP,
-        thermal_range: tuple[int, int] = THERMAL_RANGE,
-        ignored_test: tuple[str, ...] = ("ignore",),
-        val_sequences: tuple[str, ...] = ("seq_04_day",),
+        name: Text = "freiburg",
+        num_classes: NumClasses = len(CLASSES),
+        classes: Names = CLASSES,
+        palette: tuple[Colour, ...] = PALETTE,
+        unscored: Names = ("background", "ignore"),
+        crop: Crop | None = CROP,
+        thermal_range: Counts = THERMAL_RANGE,
+        ignored_test: Names = ("ignore",),
+        val_sequences: Names = ("seq_04_day",),
     ) -> None:
         self.root = Path(root).expanduser()
         self.name = name

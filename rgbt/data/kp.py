@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import Colour, InputError, Names, NumClasses, Text, check_choice, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label, read_rgb
 from rgbt.data.grey import read_grey
@@ -95,13 +95,13 @@ class KP:
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
-        root: str,
+        root: Text,
         *,
-        name: str = "kp",
-        num_classes: int = len(CLASSES),
-        classes: tuple[str, ...] = CLASSES,
-        palette: tuple[tuple[int, int, int], ...] = PALETTE,
-        splits: dict[str, str] = SPLITS,
+        name: Text = "kp",
+        num_classes: NumClasses = len(CLASSES),
+        classes: Names = CLASSES,
+        palette: tuple[Colour, ...] = PALETTE,
+        splits: dict[Text, Text] = SPLITS,
         lists: Lists = "auto",
     ) -> None:
         self.root = Path(root).expanduser()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Len
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_range, nearest
+from rgbt.checks import Byte, InputError, Names, NumClasses, Text, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,12 +28,11 @@ class LabelMap:
         InputError: a name that is no target, an id that is missing, unknown or there twice.
     """
 
-    num_source: int
-    targets: tuple[str, ...]
-    groups: dict[str, tuple[int, ...]]
+    num_source: NumClasses
+    targets: Annotated[Names, Len(1, 255)]
+    groups: dict[Text, tuple[Byte, ...]]
 
     def __post_init__(self) -> None:
-        check_range("label_map.num_source", self.num_source, 1, 255)
         for name in self.groups:
             if name not in self.targets:
                 raise InputError(

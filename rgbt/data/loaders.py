@@ -13,12 +13,13 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import torch
+from annotated_types import Interval
 from torch.utils.data import DataLoader
 
-from rgbt.checks import InputError, RunError, check_choice, check_range
+from rgbt.checks import BatchSize, InputError, RunError, Text, Workers
 from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
 from rgbt.data.decoded.dataset import check_cache
 from rgbt.data.reader import (
@@ -65,22 +66,16 @@ class LoaderSettings:
             next readable sample of the list instead (training) or leaves it out (evaluation).
     """
 
-    batch_size: int
-    eval_batch_size: int
-    num_workers: int
-    prefetch: int = 2
+    batch_size: BatchSize
+    eval_batch_size: BatchSize
+    num_workers: Workers
+    prefetch: Annotated[int, Interval(ge=1, le=1024)] = 2
     augment: Literal["auto", "loader", "device"] = "auto"
-    cache: str | None = None
+    cache: Text | None = None
     on_error: Literal["raise", "skip"] = "raise"
 
     def __post_init__(self) -> None:
-        check_range("data.batch_size", self.batch_size, 1, 2**20)
-        check_range("data.eval_batch_size", self.eval_batch_size, 1, 2**20)
-        check_range("data.num_workers", self.num_workers, 0, 2**10)
-        check_range("data.prefetch", self.prefetch, 1, 2**10)
-        check_choice("data.augment", self.augment, ("auto", "loader", "device"))
         check_cache("data.cache", self.cache)
-        check_choice("data.on_error", self.on_error, ("raise", "skip"))
 
 
 class Batches(Iterator[Kind]):

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import Colour, InputError, Names, NumClasses, Text, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_channels, read_label, read_packed, within
 from rgbt.data.integrity import read_names
@@ -72,13 +72,13 @@ class MFNet:
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
-        root: str,
+        root: Text,
         *,
-        name: str = "mfnet",
-        num_classes: int = len(CLASSES),
-        classes: tuple[str, ...] = CLASSES,
-        palette: tuple[tuple[int, int, int], ...] = PALETTE,
-        splits: dict[str, str] = SPLITS,
+        name: Text = "mfnet",
+        num_classes: NumClasses = len(CLASSES),
+        classes: Names = CLASSES,
+        palette: tuple[Colour, ...] = PALETTE,
+        splits: dict[Text, Text] = SPLITS,
         layout: Layout = "auto",
     ) -> None:
         self.root = Path(root).expanduser()

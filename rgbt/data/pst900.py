@@ -9,12 +9,13 @@ import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import Colour, InputError, Names, NumClasses, Text, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label, read_rgb
 from rgbt.data.grey import read_grey
@@ -27,6 +28,7 @@ from rgbt.data.named_files import (
 )
 from rgbt.types import Sample
 
+Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
 CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
 PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
 FOLDERS = ("rgb", "thermal", "labels")
@@ -90,13 +92,13 @@ class PST900:
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
-        root: str,
+        root: Text,
         *,
-        name: str = "pst900",
-        num_classes: int = len(CLASSES),
-        classes: tuple[str, ...] = CLASSES,
-        palette: tuple[tuple[int, int, int], ...] = PALETTE,
-        val_bags: tuple[int, ...] = (),
+        name: Text = "pst900",
+        num_classes: NumClasses = len(CLASSES),
+        classes: Names = CLASSES,
+        palette: tuple[Colour, ...] = PALETTE,
+        val_bags: Bags = (),
     ) -> None:
         self.root = Path(root).expanduser()
         self.name = name

@@ -14,6 +14,7 @@ from rgbt.degradations.degradation import (
     REFERENCE_HEIGHT,
     Images,
     RngOf,
+    Severities,
     at_height,
     check_ladder,
 )
@@ -33,7 +34,7 @@ class Blur:
 
     unit = "pixels at 480 rows (sigma)"
 
-    def __init__(self, *, image: Images, severities: tuple[float, ...]) -> None:
+    def __init__(self, *, image: Images, severities: Severities) -> None:
         self.image: Images = image
         self.severities = severities
         self.title = f"blur, {NAMES[image]}"

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Interval, Len
 
 from rgbt.checks import InputError
 from rgbt.types import Sample
@@ -34,6 +35,10 @@ NAMES: dict[Images, str] = {"rgb": "RGB", "thermal": "thermal", "both": "RGB and
 RngOf = Callable[[str], np.random.Generator]
 """Purpose -> generator of a sample. It does not depend on the severity: a higher one hides the
 same blocks and more, so that the severities of a ladder differ in nothing else."""
+
+
+Severities = Annotated[tuple[Annotated[float, Interval(gt=0, le=1000)], ...], Len(1, 100)]
+"""A ladder; the range of each kind is in its `check`."""
 
 
 class Kind(Protocol):

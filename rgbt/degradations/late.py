@@ -8,7 +8,7 @@ step of one longer than the time between two frames of the camera.
 from __future__ import annotations
 
 from rgbt.checks import InputError
-from rgbt.degradations.degradation import check_ladder, check_whole
+from rgbt.degradations.degradation import Severities, check_ladder, check_whole
 
 
 class Frozen:
@@ -27,7 +27,7 @@ class Frozen:
     title = "frozen thermal"
     unit = "frames between two images"
 
-    def __init__(self, *, severities: tuple[float, ...]) -> None:
+    def __init__(self, *, severities: Severities) -> None:
         self.severities = severities
         check_ladder(self)
 
@@ -60,7 +60,7 @@ class Delayed:
     title = "delayed thermal"
     unit = "frames"
 
-    def __init__(self, *, severities: tuple[float, ...]) -> None:
+    def __init__(self, *, severities: Severities) -> None:
         self.severities = severities
         check_ladder(self)
 

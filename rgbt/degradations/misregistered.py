@@ -11,6 +11,7 @@ from rgbt.checks import InputError, check_range
 from rgbt.degradations.degradation import (
     REFERENCE_HEIGHT,
     RngOf,
+    Severities,
     at_height,
     check_ladder,
     nearest_whole,
@@ -38,7 +39,7 @@ class Misregistered:
     title = "misregistered thermal"
     unit = "pixels at 480 rows"
 
-    def __init__(self, *, severities: tuple[float, ...]) -> None:
+    def __init__(self, *, severities: Severities) -> None:
         self.severities = severities
         check_ladder(self)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import check_range
-from rgbt.degradations.degradation import IMAGES, NAMES, Images, RngOf, check_ladder
+from rgbt.degradations.degradation import IMAGES, NAMES, Images, RngOf, Severities, check_ladder
 from rgbt.types import Sample
 
 
@@ -28,7 +28,7 @@ class Noise:
 
     unit = "grey levels (std)"
 
-    def __init__(self, *, image: Images, severities: tuple[float, ...]) -> None:
+    def __init__(self, *, image: Images, severities: Severities) -> None:
         self.image: Images = image
         self.severities = severities
         self.title = f"noise, {NAMES[image]}"

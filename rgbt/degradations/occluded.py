@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_range
@@ -15,6 +16,7 @@ from rgbt.degradations.degradation import (
     REFERENCE_HEIGHT,
     Images,
     RngOf,
+    Severities,
     at_height,
     check_ladder,
     nearest_whole,
@@ -41,12 +43,17 @@ class Occluded:
 
     unit = "share of blocks"
 
-    def __init__(self, *, image: Images, block: int, severities: tuple[float, ...]) -> None:
+    def __init__(
+        self,
+        *,
+        image: Images,
+        block: Annotated[int, Interval(ge=1, le=REFERENCE_HEIGHT)],
+        severities: Severities,
+    ) -> None:
         self.image: Images = image
         self.block = block
         self.severities = severities
         self.title = f"occluded, {NAMES[image]}"
-        check_range("degradation.block", block, 1, REFERENCE_HEIGHT)
         check_ladder(self)
 
     def check(self, severity: float) -> None:

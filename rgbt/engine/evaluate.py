@@ -10,6 +10,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rgbt.checks import RunError
 from rgbt.types import Batch, View
 
 HeadsOf = Callable[[tuple[str, ...]], tuple[str | None, ...]]
@@ -41,6 +42,9 @@ def predictions(
         fabric: device and precision.
         view: what is predicted from; None leaves it to the network.
         heads_of: which of several heads predicts an image; None leaves it to the network.
+
+    Raises:
+        RunError: a score is NaN or infinite, with the name of the image.
     """
     model.eval()
     for batch in batches:
@@ -78,13 +82,32 @@ def label_scores(
     view: View | None = None,
     heads: Sequence[str | None] = (),
 ) -> Tensor:
-    """(B, K, H', W') float32 scores at every pixel of the labels; arguments as in `class_maps`."""
+    """(B, K, H', W') float32 scores at every pixel of the labels; arguments as in `class_maps`.
+
+    Raises:
+        RunError: a score is NaN or infinite.
+    """
     with torch.inference_mode(), fabric.autocast():
         scores = class_scores(model, batch, view, heads).float()
         label_hw = batch.label.shape[-2:]
         if scores.shape[-2:] != label_hw:
             scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
+        _check_finite(scores, batch.name)
     return scores
+
+
+def _check_finite(scores: Tensor, names: Sequence[str]) -> None:
+    # One fast pass: a sum is not finite if any score is not. Only then is looked at which.
+    if bool(scores.sum().isfinite()):
+        return
+    finite = scores.isfinite().flatten(1).all(1).tolist()
+    broken = [name for name, is_finite in zip(names, finite, strict=True) if not is_finite]
+    if broken:
+        raise RunError(
+            f"image '{broken[0]}': the network's class scores are NaN or infinite, so that nothing "
+            "can be counted; use a checkpoint of an earlier step or other weights, or train again "
+            "with a lower optimizer.lr."
+        )
 
 
 def class_scores(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from torch import nn
 
-from rgbt.checks import InputError, check_range
+from rgbt.checks import Epsilon, LearningRate, NonNegative, ShareBelowOne
 
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table",)
 BIASES = ("bias", "in_proj_bias")
-BELOW_ONE = 1.0 - 1e-12
+Decay = Annotated[float, Interval(ge=0, le=100)]
+"""Of weights; times the learning rate it is what a step takes away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +37,12 @@ class AdamW:
         eps: added to the denominator.
     """
 
-    lr: float
-    backbone_multiplier: float
-    weight_decay: float
+    lr: LearningRate
+    backbone_multiplier: NonNegative
+    weight_decay: Decay
     decay_biases: bool
-    betas: tuple[float, float]
-    eps: float
-
-    def __post_init__(self) -> None:
-        _check(self.lr, self.backbone_multiplier, self.weight_decay)
-        _check_betas(self.betas)
+    betas: tuple[ShareBelowOne, ShareBelowOne]
+    eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
@@ -74,14 +73,10 @@ class SGD:
         weight_decay: of every parameter.
     """
 
-    lr: float
-    backbone_multiplier: float
-    momentum: float
-    weight_decay: float
-
-    def __post_init__(self) -> None:
-        _check(self.lr, self.backbone_multiplier, self.weight_decay)
-        check_range("optimizer.momentum", self.momentum, 0.0, BELOW_ONE)
+    lr: LearningRate
+    backbone_multiplier: NonNegative
+    momentum: ShareBelowOne
+    weight_decay: Decay
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
@@ -112,13 +107,9 @@ class RMSprop:
         eps: added to the denominator.
     """
 
-    lr: float
-    alpha: float
-    eps: float
-
-    def __post_init__(self) -> None:
-        _check(self.lr)
-        check_range("optimizer.alpha", self.alpha, 0.0, BELOW_ONE)
+    lr: LearningRate
+    alpha: ShareBelowOne
+    eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
@@ -140,14 +131,10 @@ class Adam:
         eps: added to the denominator.
     """
 
-    lr: float
-    betas: tuple[float, float]
-    weight_decay: float
-    eps: float
-
-    def __post_init__(self) -> None:
-        _check(self.lr, weight_decay=self.weight_decay)
-        _check_betas(self.betas)
+    lr: LearningRate
+    betas: tuple[ShareBelowOne, ShareBelowOne]
+    weight_decay: Decay
+    eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
@@ -155,18 +142,6 @@ class Adam:
         return torch.optim.Adam(
             settings, betas=self.betas, weight_decay=self.weight_decay, eps=self.eps, fused=True
         )
-
-
-def _check(lr: float, backbone_multiplier: float = 1.0, weight_decay: float = 0.0) -> None:
-    if lr <= 0:
-        raise InputError(f"optimizer.lr must be positive, got {lr:g}.")
-    check_range("optimizer.backbone_multiplier", backbone_multiplier, 0.0, 1e6)
-    check_range("optimizer.weight_decay", weight_decay, 0.0, 1e6)
-
-
-def _check_betas(betas: tuple[float, float]) -> None:
-    for beta in betas:
-        check_range("optimizer.betas", beta, 0.0, BELOW_ONE)
 
 
 def _rates(lr: float, factor: float) -> dict[str, float]:

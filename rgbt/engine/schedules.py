@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
-from rgbt.checks import check_range
+from annotated_types import Interval
+
+from rgbt.checks import InputError, NumSteps, NumStepsOrZero, Power, Share
 
 
 class Schedule(Protocol):
@@ -32,13 +34,9 @@ class Poly:
             decay, counted from step 0, takes over after them (as in the temporal release).
     """
 
-    power: float
+    power: Power
     per: Literal["iteration", "epoch"]
-    warmup_steps: int
-
-    def __post_init__(self) -> None:
-        check_range("schedule.power", self.power, 0.0, 100.0)
-        check_range("schedule.warmup_steps", self.warmup_steps, 0, 2**40)
+    warmup_steps: NumStepsOrZero
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
         """See `Schedule`."""
@@ -57,10 +55,7 @@ class ThesisPoly:
         power: 0.9 there.
     """
 
-    power: float
-
-    def __post_init__(self) -> None:
-        check_range("schedule.power", self.power, 0.0, 100.0)
+    power: Power
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""
@@ -93,18 +88,18 @@ class LatePoly:
         counted_steps: C, >= E.
     """
 
-    power: float
-    warmup_steps: int
-    epochs: int
-    epoch_steps: int
-    counted_steps: int
+    power: Power
+    warmup_steps: NumStepsOrZero
+    epochs: NumSteps
+    epoch_steps: NumSteps
+    counted_steps: NumSteps
 
     def __post_init__(self) -> None:
-        check_range("schedule.power", self.power, 0.0, 100.0)
-        check_range("schedule.warmup_steps", self.warmup_steps, 0, 2**40)
-        check_range("schedule.epochs", self.epochs, 1, 2**40)
-        check_range("schedule.epoch_steps", self.epoch_steps, 1, 2**40)
-        check_range("schedule.counted_steps", self.counted_steps, self.epoch_steps, 2**40)
+        if self.counted_steps < self.epoch_steps:
+            raise InputError(
+                f"schedule.counted_steps={self.counted_steps} must be at least "
+                f"schedule.epoch_steps={self.epoch_steps}: see rgbt.engine.schedules.LatePoly."
+            )
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""
@@ -132,13 +127,8 @@ class Exponential:
             null: the list's own.
     """
 
-    factor: float
-    epoch_steps: int | None
-
-    def __post_init__(self) -> None:
-        check_range("schedule.factor", self.factor, 0.0, 1.0)
-        if self.epoch_steps is not None:
-            check_range("schedule.epoch_steps", self.epoch_steps, 1, 2**40)
+    factor: Share
+    epoch_steps: NumSteps | None
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""
@@ -156,12 +146,8 @@ class Steps:
         every: share of the run, in (0, 1]; 0.3 there.
     """
 
-    factor: float
-    every: float
-
-    def __post_init__(self) -> None:
-        check_range("schedule.factor", self.factor, 0.0, 1.0)
-        check_range("schedule.every", self.every, 1e-6, 1.0)
+    factor: Share
+    every: Annotated[float, Interval(ge=1e-6, le=1)]
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
         """See `Schedule`."""

@@ -3,9 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from rgbt.checks import InputError
+from annotated_types import Interval
+
+from rgbt.checks import (
+    BaseWidth,
+    BatchSize,
+    LearningRate,
+    Lengths,
+    NonNegative,
+    NumPoints,
+    NumSteps,
+    NumStepsOrZero,
+    Pixels,
+    Positive,
+    Size,
+    Text,
+    Threads,
+    Workers,
+)
+
+Precision = Literal["32-true", "bf16-mixed"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,25 +49,17 @@ class TrainerSettings:
             of the target domain).
     """
 
-    max_steps: int
-    eval_every: int
-    checkpoint_every: int
-    log_every: int
-    accumulate: int
-    clip_norm: float | None
-    precision: Literal["32-true", "bf16-mixed"]
+    max_steps: NumSteps
+    eval_every: NumSteps
+    checkpoint_every: NumSteps
+    log_every: NumSteps
+    accumulate: Annotated[int, Interval(ge=1, le=10_000)]
+    clip_norm: Positive | None
+    precision: Precision
     accelerator: Literal["auto", "cpu", "cuda", "mps"]
-    threads: int
-    selection_split: str
+    threads: Threads
+    selection_split: Text
     tested: Literal["best", "last"] = "best"
-
-    def __post_init__(self) -> None:
-        durations = ("max_steps", "eval_every", "checkpoint_every", "log_every")
-        for name in (*durations, "accumulate", "threads"):
-            if getattr(self, name) < 1:
-                raise InputError(f"trainer.{name} must be at least 1, got {getattr(self, name)}.")
-        if self.clip_norm is not None and self.clip_norm <= 0:
-            raise InputError(f"trainer.clip_norm must be positive or null, got {self.clip_norm}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,19 +83,19 @@ class Recipe:
         demo_sizes: shortest edges at scale=demo, which takes nothing else from here.
     """
 
-    dataset: str
-    batch_size: int
-    max_steps: int
-    eval_every: int
-    train_sizes: tuple[int, ...]
-    crop_hw: tuple[int, int]
-    lr: float
-    backbone_multiplier: float
-    critic_lr: float
-    clip_norm: float | None
-    warmup_steps: int
-    demo_steps: int
-    demo_sizes: tuple[int, ...]
+    dataset: Text
+    batch_size: BatchSize
+    max_steps: NumSteps
+    eval_every: NumSteps
+    train_sizes: Lengths
+    crop_hw: Size
+    lr: LearningRate
+    backbone_multiplier: NonNegative
+    critic_lr: LearningRate
+    clip_norm: Positive | None
+    warmup_steps: NumStepsOrZero
+    demo_steps: NumSteps
+    demo_sizes: Lengths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,22 +125,22 @@ class Scale:
         pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
     """
 
-    name: str
-    pixel_factor: float
-    train_sizes: tuple[int, ...]
-    crop_hw: tuple[int, int]
-    test_short_edge: int | None
-    num_points: int
-    batch_size: int
-    eval_batch_size: int
-    num_workers: int
-    max_steps: int
-    eval_every: int
-    lr: float
-    backbone_multiplier: float
-    critic_width: int
-    critic_lr: float
-    clip_norm: float | None
-    warmup_steps: int
-    precision: str
+    name: Text
+    pixel_factor: Annotated[float, Interval(gt=0, le=16)]
+    train_sizes: Lengths
+    crop_hw: Size
+    test_short_edge: Pixels | None
+    num_points: NumPoints
+    batch_size: BatchSize
+    eval_batch_size: BatchSize
+    num_workers: Workers
+    max_steps: NumSteps
+    eval_every: NumSteps
+    lr: LearningRate
+    backbone_multiplier: NonNegative
+    critic_width: BaseWidth
+    critic_lr: LearningRate
+    clip_norm: Positive | None
+    warmup_steps: NumStepsOrZero
+    precision: Precision
     pretrained: bool

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import InputError, RunError, not_finite
 from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.progress import progress
@@ -31,6 +31,13 @@ StepData = Batch | TwoDomains
 
 WAIT_SHARE = "wait_share"
 """Share of the time of a step that the loop waited for its images, 0..1."""
+
+
+ADVICE = (
+    "The last checkpoint is kept; lower optimizer.lr, or use trainer.precision=32-true if it was "
+    "mixed."
+)
+"""What to do about numbers that are not finite."""
 
 
 class Loaded(Protocol):
@@ -135,7 +142,7 @@ class Trainer:
             state: where the run stands; changed in place.
 
         Raises:
-            RunError: a loss part or the gradient is not finite.
+            RunError: a loss part, the gradient or a weight is not finite.
             Stopped: a signal came; its `step` is saved.
         """
         total = self.settings.max_steps
@@ -161,6 +168,8 @@ class Trainer:
         is_last = state.step == self.settings.max_steps
         due = is_last or state.step % self.settings.eval_every == 0
         due = due and state.evaluated_step < state.step
+        if due:
+            check_weights({"model": self.model, **self.others}, state.step)
         try:
             with at_once():
                 score = self.validate(state.step) if due else -math.inf
@@ -184,6 +193,7 @@ class Trainer:
         state.evaluated_step = state.step
 
     def _save(self, state: State) -> None:
+        check_weights({"model": self.model, **self.others}, state.step)
         payload = training_payload(self.model, self.others, self.optimizers, state)
         self.checkpoints.commit(payload, state)
 
@@ -262,6 +272,26 @@ def _parameters(optimizers: Sequence[torch.optim.Optimizer]) -> list[nn.Paramete
     return list({id(each): each for group in groups for each in group}.values())
 
 
+def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
+    """Refuse to evaluate or save parameters and buffers that are not finite.
+
+    Args:
+        modules: by the name that they have in checkpoints.
+        step: optimiser steps done, for the message.
+
+    Raises:
+        RunError: naming the first tensor with NaN or infinity.
+    """
+    for module in modules.values():
+        tensors = module.state_dict()
+        broken = not_finite(tensors)
+        if broken:
+            raise RunError(
+                f"step {step}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
+                f"{len(tensors)} tensors do). {ADVICE}"
+            )
+
+
 def torch_generator_of(
     purpose: str, *, seed: int, index: int, device: torch.device
 ) -> torch.Generator:
@@ -274,10 +304,7 @@ def _naming(step: int) -> Iterator[None]:
     try:
         yield
     except RunError as error:
-        raise RunError(
-            f"step {step + 1}: {error} The last checkpoint is kept; lower optimizer.lr, or use "
-            "trainer.precision=32-true if it was mixed."
-        ) from error
+        raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
 
 
 def _add(values: dict[str, float], more: dict[str, float]) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from torch import Tensor
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, Pixels, Positive
+
+Coordinate = Annotated[float, Interval(ge=-0.5, le=8192)]
 
 
 @dataclass(frozen=True)
@@ -24,24 +27,18 @@ class Camera:
         width: their columns.
 
     Raises:
-        InputError: a size or a focal length that is not positive, or a principal point outside
-            the image: then these are the intrinsics of images of another size.
+        InputError: a principal point outside the image: then these are the intrinsics of images of
+            another size.
     """
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    height: int
-    width: int
+    fx: Positive
+    fy: Positive
+    cx: Coordinate
+    cy: Coordinate
+    height: Pixels
+    width: Pixels
 
     def __post_init__(self) -> None:
-        positive = all(0 < focal < math.inf for focal in (self.fx, self.fy))
-        if not positive or min(self.height, self.width) < 1:
-            raise InputError(
-                f"camera: expected fx, fy, height and width above 0, got fx={self.fx:g}, "
-                f"fy={self.fy:g}, height={self.height}, width={self.width}."
-            )
         inside = -0.5 <= self.cx <= self.width - 0.5 and -0.5 <= self.cy <= self.height - 0.5
         if not inside:
             raise InputError(

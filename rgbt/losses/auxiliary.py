@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, check_range
+from rgbt.checks import InputError, NonNegative
 from rgbt.types import Batch, Loss, Output
 
 
@@ -26,8 +26,7 @@ class WithAuxiliary:
         InputError: a weight out of range.
     """
 
-    def __init__(self, *, loss: Loss, weight: float) -> None:
-        check_range("loss.weight", weight, 0.0, 1e6)
+    def __init__(self, *, loss: Loss, weight: NonNegative) -> None:
         self.loss = loss
         self.weight = weight
         self.reads_confidence = getattr(loss, "reads_confidence", False)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
+from annotated_types import Len
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import InputError, NonNegative, check_shape
 from rgbt.types import IGNORE, Batch, Output, Predicts
+
+ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
 
 class CrossEntropy:
@@ -28,11 +33,7 @@ class CrossEntropy:
     reads: Predicts = "scores"
     reads_confidence = True
 
-    def __init__(self, *, class_weights: tuple[float, ...] | None) -> None:
-        if class_weights is not None and min(class_weights, default=-1.0) < 0:
-            raise InputError(
-                f"loss.class_weights needs one number of at least 0 per class, got {class_weights}."
-            )
+    def __init__(self, *, class_weights: ClassWeights | None) -> None:
         self.class_weights = class_weights
 
     def __call__(

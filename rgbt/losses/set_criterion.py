@@ -7,12 +7,22 @@ targets of the batch: one per class present in an image, by image, then by class
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 import torch
+from annotated_types import Interval
 from torch import Tensor, distributed
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_range, check_shape
+from rgbt.checks import (
+    InputError,
+    NonNegative,
+    NumClasses,
+    NumPoints,
+    Share,
+    check_shape,
+)
 from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
 from rgbt.losses.points import Points, PointSource
@@ -55,22 +65,17 @@ class SetCriterion:
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         *,
-        num_classes: int,
-        num_points: int,
-        oversample_ratio: float,
-        importance_ratio: float,
-        class_weight: float,
-        mask_weight: float,
-        dice_weight: float,
-        no_object_weight: float,
+        num_classes: NumClasses,
+        num_points: NumPoints,
+        oversample_ratio: Annotated[float, Interval(ge=1, le=100)],
+        importance_ratio: Share,
+        class_weight: NonNegative,
+        mask_weight: NonNegative,
+        dice_weight: NonNegative,
+        no_object_weight: NonNegative,
         deep_supervision: bool,
         spatial: SpatialWeight = PLAIN,
     ) -> None:
-        if num_points < 1:
-            raise InputError(f"loss.num_points must be at least 1, got {num_points}.")
-        if not oversample_ratio >= 1:
-            raise InputError(f"loss.oversample_ratio must be at least 1, got {oversample_ratio}.")
-        check_range("loss.importance_ratio", importance_ratio, 0.0, 1.0)
         self.num_classes = num_classes
         kept = int(num_points * importance_ratio)
         candidates = int(num_points * oversample_ratio)

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import InputError, NonNegative, check_shape
 from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import sample
 from rgbt.types import Batch
@@ -46,7 +46,7 @@ class SpatialWeight:
         InputError: alpha below 0.
     """
 
-    alpha: float
+    alpha: NonNegative
     focus: Literal["none", "edge", "center"]
     centre: Literal["tracked", "crop"]
     d_max: Literal["original", "crop"]
@@ -55,10 +55,6 @@ class SpatialWeight:
     dice_smoothing: Literal["one", "none"]
     match: Literal["unweighted", "weighted"]
     passes: Literal["all", "fused"]
-
-    def __post_init__(self) -> None:
-        if not self.alpha >= 0:
-            raise InputError(f"loss.spatial.alpha must be at least 0, got {self.alpha}.")
 
     @property
     def active(self) -> bool:

@@ -5,13 +5,12 @@ How the second frame is made and how the first prediction is brought into it is 
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, NonNegative
 from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.dice import Form, dice, single
 from rgbt.types import IGNORE, Frame, Loss
@@ -47,11 +46,14 @@ class TemporalLoss:
     """
 
     def __init__(
-        self, *, segmentation: Loss, alpha: float, beta: float, second: Second, form: Form
+        self,
+        *,
+        segmentation: Loss,
+        alpha: NonNegative,
+        beta: NonNegative,
+        second: Second,
+        form: Form,
     ) -> None:
-        for name, value in (("alpha", alpha), ("beta", beta)):
-            if not 0 <= value < math.inf:
-                raise InputError(f"loss.{name} must be finite and at least 0, got {value:g}.")
         if second == "none" and beta:
             raise InputError(
                 f"loss.beta={beta:g} weighs nothing with loss.second=none; set loss.beta=0, or "

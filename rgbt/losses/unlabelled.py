@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import check_choice, check_range
+from rgbt.checks import NonNegative, Share
 from rgbt.losses.dice import single
 
 Normalisation = Literal["pixels", "entries"]
@@ -43,12 +43,8 @@ class MaxSquares:
     """
 
     def __init__(
-        self, *, weight: float, normalisation: Normalisation, image_wise_ratio: float | None
+        self, *, weight: NonNegative, normalisation: Normalisation, image_wise_ratio: Share | None
     ) -> None:
-        check_range("max_squares.weight", weight, 0.0, 1e6)
-        check_choice("max_squares.normalisation", normalisation, ("pixels", "entries"))
-        if image_wise_ratio is not None:
-            check_range("max_squares.image_wise_ratio", image_wise_ratio, 0.0, 1.0)
         self.weight = weight
         self.normalisation = normalisation
         self.image_wise_ratio = image_wise_ratio
@@ -86,8 +82,7 @@ class Entropy:
         InputError: a weight out of range.
     """
 
-    def __init__(self, *, weight: float) -> None:
-        check_range("entropy.weight", weight, 0.0, 1e6)
+    def __init__(self, *, weight: NonNegative) -> None:
         self.weight = weight
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:

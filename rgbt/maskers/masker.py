@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval, MultipleOf, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, check_range, check_shape
+from rgbt.checks import InputError, Pixels, Share, check_shape
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.maskers import pairing as pairings
 from rgbt.maskers import pattern
@@ -17,6 +18,8 @@ from rgbt.types import MaskPair
 Sampler = Literal["none", "uniform", "square", "gaussian_count", "gaussian_bernoulli"]
 TOKEN = 4
 """Pixels per token side of the networks; a cell holds whole tokens."""
+
+PatchSize = Annotated[int, Interval(ge=TOKEN, le=8192), MultipleOf(TOKEN), doc("pixels")]
 
 THIRDS = (1 / 3, 1 / 3, 1 / 3)
 """The three patterns of `rand_comp` are equally likely in both releases."""
@@ -73,14 +76,14 @@ class Masker:
         self,
         *,
         sampler: Sampler,
-        patch_size: int | None,
-        ratio: float | None,
-        sigma_div: float | None,
-        sigma_height: int | None,
+        patch_size: PatchSize | None,
+        ratio: Share | None,
+        sigma_div: Annotated[float, Interval(ge=0.001, le=10_000)] | None,
+        sigma_height: Pixels | None,
         anchor: Literal["grid", "tracked"] | None,
         cell_position: Literal["index", "centre"] | None,
         pairing: Literal["comp", "rand_comp", "indiv"] | None,
-        pattern_probabilities: tuple[float, float, float] | None,
+        pattern_probabilities: tuple[Share, Share, Share] | None,
     ) -> None:
         self.sampler = sampler
         self.patch_size = patch_size
@@ -195,22 +198,13 @@ class Masker:
         return f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
 
     def _check_values(self) -> None:
-        if self.patch_size is not None and (self.patch_size < TOKEN or self.patch_size % TOKEN):
-            raise InputError(
-                f"masker.patch_size must be a positive multiple of {TOKEN} pixels (the token of "
-                f"the networks), got {self.patch_size}."
-            )
-        if self.ratio is not None:
-            check_range("masker.ratio", self.ratio, 0, 1)
-        if self.sigma_div is not None and not self.sigma_div > 0:
-            raise InputError(f"masker.sigma_div must be positive, got {self.sigma_div:g}.")
         if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
             raise InputError(
                 f"masker.sigma_height must hold one cell of masker.patch_size={self.patch_size} "
                 f"pixels or more, got {self.sigma_height}."
             )
         shares = self.pattern_probabilities
-        if shares is not None and (min(shares) < 0 or abs(sum(shares) - 1) > 1e-6):
+        if shares is not None and abs(sum(shares) - 1) > 1e-6:
             raise InputError(
                 "masker.pattern_probabilities must be three numbers >= 0 with sum 1 (only thermal, "
                 f"only RGB, both), got {list(shares)}."

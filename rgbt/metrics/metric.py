@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Annotated, Literal
 
-from rgbt.checks import InputError, check_range
+from annotated_types import Interval
+
+from rgbt.checks import InputError
 from rgbt.metrics.regions import (
     MAX_REGIONS,
     Aspect,
@@ -37,12 +39,11 @@ class Regions:
     """
 
     partition: Partition
-    regions: int
+    regions: Annotated[int, Interval(ge=1, le=MAX_REGIONS)]
     aspect: Aspect | None
     absent: Absent
 
     def __post_init__(self) -> None:
-        check_range("metric.regions", self.regions, 1, MAX_REGIONS)
         if (self.partition == "ring") != (self.aspect is not None):
             wanted = "image or released_3_4" if self.partition == "ring" else "null"
             raise InputError(

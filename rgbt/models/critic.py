@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import BaseWidth, Channels, InputError, check_shape
 
 STRIDE = 32
 
@@ -29,7 +29,7 @@ class Critic(nn.Module):
     """
 
     def __init__(
-        self, *, in_channels: int, base_width: int, upsample: bool, align_corners: bool
+        self, *, in_channels: Channels, base_width: BaseWidth, upsample: bool, align_corners: bool
     ) -> None:
         super().__init__()
         if align_corners and not upsample:

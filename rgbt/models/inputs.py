@@ -6,12 +6,13 @@ gives other numbers. `conf/model/inputs/` has one file per release.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
+from annotated_types import Interval, Len
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import GreyLevel, InputError, check_shape
 from rgbt.geometry.padding import pad_to, padded_hw
 from rgbt.types import MaskPair, View
 
@@ -24,6 +25,9 @@ class Images(NamedTuple):
 
     rgb: Tensor
     thermal: Tensor
+
+
+Deviation = Annotated[float, Interval(ge=0.001, le=10_000)]
 
 
 class Inputs(nn.Module):
@@ -54,10 +58,10 @@ class Inputs(nn.Module):
         self,
         *,
         rgb_order: Literal["rgb", "bgr", "gray"],
-        rgb_mean: tuple[float, float, float],
-        rgb_std: tuple[float, float, float],
-        thermal_mean: tuple[float, ...],
-        thermal_std: tuple[float, ...],
+        rgb_mean: tuple[GreyLevel, GreyLevel, GreyLevel],
+        rgb_std: tuple[Deviation, Deviation, Deviation],
+        thermal_mean: Annotated[tuple[GreyLevel, ...], Len(1, 3)],
+        thermal_std: Annotated[tuple[Deviation, ...], Len(1, 3)],
         thermal_scale: Literal["fixed", "image_max"],
     ) -> None:
         super().__init__()
@@ -66,8 +70,6 @@ class Inputs(nn.Module):
                 "model.inputs: thermal_mean and thermal_std need one value, or three where thermal "
                 f"is repeated for three channels, got {len(thermal_mean)} and {len(thermal_std)}."
             )
-        if min(*rgb_std, *thermal_std) <= 0:
-            raise InputError("model.inputs: rgb_std and thermal_std must be positive.")
         self.rgb_order = rgb_order
         self.thermal_scale = thermal_scale
         named: dict[str, tuple[float, ...]] = {"rgb_mean": rgb_mean, "rgb_std": rgb_std}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
+from rgbt.checks import Channels, InputError, NumClasses, Widths
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.types import MaskPair, Output, Predicts, View
 
@@ -105,10 +105,10 @@ class MFNet(nn.Module):
     def __init__(
         self,
         *,
-        num_classes: int,
-        rgb_widths: tuple[int, int, int, int],
-        thermal_widths: tuple[int, int, int, int],
-        decoder_width: int,
+        num_classes: NumClasses,
+        rgb_widths: Widths,
+        thermal_widths: Widths,
+        decoder_width: Channels,
         final_activation: bool,
         inputs: Inputs,
     ) -> None:

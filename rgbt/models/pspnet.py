@@ -8,10 +8,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import (
+    BaseWidth,
+    Channels,
+    Depths,
+    NumClasses,
+)
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.resnet import bottleneck_stage
-from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
+from rgbt.models.upsampling import DropRates, UpBlock, enlarge
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 8
@@ -61,22 +66,16 @@ class PSPNet(nn.Module):
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
         *,
-        num_classes: int,
-        depths: tuple[int, int, int, int],
-        base_width: int,
-        decoder_width: int,
+        num_classes: NumClasses,
+        depths: Depths,
+        base_width: BaseWidth,
+        decoder_width: Channels,
         modalities: Modalities,
         dropout: DropRates,
         align_corners: bool,
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        check_choice("model.modalities", modalities, VIEWS_OF)
-        check_rates(dropout)
-        if min(depths) < 1:
-            raise InputError(f"model.depths needs at least one block per stage, got {depths}.")
-        check_range("model.base_width", base_width, 1, 4096)
-        check_range("model.decoder_width", decoder_width, 1, 4096)
         self.num_classes = num_classes
         self.views = VIEWS_OF[modalities]
         self.modalities = modalities

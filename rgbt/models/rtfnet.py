@@ -5,13 +5,14 @@ Parameter names are the release's, so that its weights load as they are.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import BaseWidth, NumClasses
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.resnet import basic_stage, bottleneck_stage
 from rgbt.types import MaskPair, Output, Predicts, View
@@ -106,9 +107,6 @@ class RTFNet(nn.Module):
             RGB encoder's over its input channels (released), or a copy where `inputs` repeats
             thermal three times; "xavier": drawn anew (paper). Holds for weights from ImageNet too.
         inputs: normalisation of the images.
-
-    Raises:
-        InputError: a width that is not positive and even; unknown depth or stem.
     """
 
     views: tuple[View, ...] = ("rgbt",)
@@ -118,15 +116,14 @@ class RTFNet(nn.Module):
     def __init__(
         self,
         *,
-        num_classes: int,
+        num_classes: NumClasses,
         depth: Literal[18, 34, 50, 101, 152],
-        base_width: int,
+        base_width: Annotated[BaseWidth, MultipleOf(2)],
         final_relu: bool,
         thermal_stem: Literal["rgb_mean", "xavier"],
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        _check(depth, base_width, thermal_stem)
         self.num_classes = num_classes
         self.thermal_stem = thermal_stem
         self.encoder_rgb_conv1 = _stem(3, base_width)
@@ -239,12 +236,3 @@ def _stages(depth: int, base_width: int) -> tuple[nn.Sequential, ...]:
 
 def _upception(in_channels: int, out_channels: int, *, relu: bool = True) -> nn.Sequential:
     return nn.Sequential(UpceptionA(in_channels), UpceptionB(in_channels, out_channels, relu=relu))
-
-
-def _check(depth: int, base_width: int, thermal_stem: str) -> None:
-    check_choice("model.depth", str(depth), map(str, BLOCKS))
-    check_choice("model.thermal_stem", thermal_stem, ("rgb_mean", "xavier"))
-    if base_width < 2 or base_width % 2:
-        raise InputError(
-            f"model.base_width must be a positive even number, got {base_width}; ResNet's is 64."
-        )

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import check_range
+from rgbt.checks import ShareBelowOne
 from rgbt.models.stochastic import drop_channels
 
-DropRates = tuple[float, float]
+DropRates = tuple[ShareBelowOne, ShareBelowOne]
 """Channel dropout before the first block, and after every block; each in [0, 1)."""
 
 
@@ -61,12 +61,6 @@ def enlarge(
     for block in blocks:
         x = _drop(block(x), later, generator)
     return x
-
-
-def check_rates(rates: DropRates) -> None:
-    """Raise InputError unless both rates of model.dropout lie in [0, 1)."""
-    for rate in rates:
-        check_range("model.dropout", rate, 0, 0.999)
 
 
 def _drop(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:

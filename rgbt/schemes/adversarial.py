@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import InputError, NonNegative, check_choice
 from rgbt.schemes.domains import (
     Domains,
     Gradients,
@@ -25,6 +26,7 @@ JudgedMap = Callable[[Tensor, Judged], Tensor]
 """(B, K, H, W) scores -> what the critic sees (see `rgbt.losses.adversarial.judged`)."""
 
 VerdictLoss = Callable[[Tensor, float], Tensor]
+DomainValue = Annotated[float, Interval(ge=-10, le=10)]
 """Verdicts and the number they should be -> scalar (see `rgbt.losses.adversarial`)."""
 
 CRITIC = "critic"
@@ -82,13 +84,13 @@ class Adversarial:
         loss: Loss,
         masker: Masker,
         domains: Domains,
-        critic: Any,
-        critic_optimizer: Any,
+        critic: nn.Module,
+        critic_optimizer: Callable[..., torch.optim.Optimizer],
         judged: Judged,
         verdict_loss: Literal["least_squares", "cross_entropy"],
-        source_value: float,
-        target_value: float,
-        weight: float,
+        source_value: DomainValue,
+        target_value: DomainValue,
+        weight: NonNegative,
         both_ways: bool,
         weighed_by_confidence: bool,
         halved: bool,
@@ -101,7 +103,12 @@ class Adversarial:
         check_whole(masker, "adversarial")
         target = target_of(domains, "adversarial")
         check_choice("scheme.verdict_loss", verdict_loss, verdict_losses)
-        check_range("scheme.weight", weight, 0.0, 1e6)
+        outside = not 0 <= min(source_value, target_value) <= max(source_value, target_value) <= 1
+        if verdict_loss == "cross_entropy" and outside:
+            raise InputError(
+                "scheme.source_value and scheme.target_value must lie in [0, 1] with "
+                f"scheme.verdict_loss=cross_entropy, got {source_value:g} and {target_value:g}."
+            )
         if source_value == target_value:
             raise InputError(
                 f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "

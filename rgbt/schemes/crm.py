@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, NonNegative
 from rgbt.types import VIEWS, Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
 
 Distillation = Callable[..., Tensor]
@@ -50,9 +50,9 @@ class CRM:
         masker: Masker,
         sdc: Distillation,
         sdn: Distillation,
-        modality_weight: float,
-        complementary_weight: float,
-        nonlocal_weight: float,
+        modality_weight: NonNegative,
+        complementary_weight: NonNegative,
+        nonlocal_weight: NonNegative,
     ) -> None:
         if masker.hides_nothing and (complementary_weight or nonlocal_weight):
             raise InputError(

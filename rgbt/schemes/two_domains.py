@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_range
+from rgbt.checks import InputError, NonNegative, Share
 from rgbt.schemes.domains import (
     Domains,
     Gradients,
@@ -103,8 +103,8 @@ class UnlabelledTarget:
         masker: Masker,
         domains: Domains,
         unlabelled: UnlabelledLoss,
-        guidance_weight: float,
-        guidance_threshold: float,
+        guidance_weight: NonNegative,
+        guidance_threshold: Share,
         guide: Guide,
     ) -> None:
         check_whole(masker, "max_squares")
@@ -115,8 +115,6 @@ class UnlabelledTarget:
             wanted=False,
             advice="set domains.target.labels=none, or choose scheme=two_domains.",
         )
-        check_range("scheme.guidance_weight", guidance_weight, 0.0, 1e6)
-        check_range("scheme.guidance_threshold", guidance_threshold, 0.0, 1.0)
         if guidance_weight and getattr(model, "auxiliary", None) is None:
             raise InputError(
                 f"scheme.guidance_weight={guidance_weight:g} trains an auxiliary head, which "

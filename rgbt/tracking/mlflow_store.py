@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, Text
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_client import Store, locked, open_store
 from rgbt.tracking.mlflow_fill import Sent, Status, fill, read_sent, write_sent
@@ -91,7 +91,7 @@ class MlflowTracking:
     """
 
     def __init__(
-        self, uri: str | None, *, artifact_uri: str | None, experiment: str, runs_dir: str
+        self, uri: Text | None, *, artifact_uri: Text | None, experiment: Text, runs_dir: Text
     ) -> None:
         root = Path(runs_dir).resolve()
         self.uri = f"sqlite:///{root / 'mlflow.db'}" if uri is None else uri

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval, Len
 from numpy.typing import ArrayLike, NDArray
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import GreyLevel, Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
-from rgbt.transforms.joint import View, check_lengths
+from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample
+
+SizeFactor = Annotated[float, Interval(ge=0.01, le=16)]
 
 
 class CmxTransform:
@@ -39,25 +42,15 @@ class CmxTransform:
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         *,
-        flip_probability: float,
-        factors: tuple[float, ...],
-        crop_hw: tuple[int, int],
-        padding_rgb: tuple[float, float, float],
+        flip_probability: Share,
+        factors: Annotated[tuple[SizeFactor, ...], Len(1, 1000)],
+        crop_hw: Size,
+        padding_rgb: tuple[GreyLevel, GreyLevel, GreyLevel],
         padding_order: Literal["rgb", "bgr"],
-        padding_thermal: tuple[float, ...],
-        test_short_edge: int | None,
+        padding_thermal: Annotated[tuple[GreyLevel, ...], Len(1, 3)],
+        test_short_edge: Pixels | None,
         track_position: bool,
     ) -> None:
-        check_range("transform.flip_probability", flip_probability, 0, 1)
-        check_choice("transform.padding_order", padding_order, ("rgb", "bgr"))
-        check_lengths(crop_hw=crop_hw, test_short_edge=(test_short_edge,))
-        if not factors or min(factors) <= 0:
-            raise InputError(f"transform.factors must be positive numbers, got {list(factors)}.")
-        if not padding_thermal:
-            raise InputError("transform.padding_thermal must hold the mean of a channel, got [].")
-        for key, means in {"rgb": padding_rgb, "thermal": padding_thermal}.items():
-            for mean in means:
-                check_range(f"transform.padding_{key}", mean, 0, 255)
         self.flip_probability = flip_probability
         self.factors = factors
         self.crop_hw = crop_hw

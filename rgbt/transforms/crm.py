@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from rgbt.checks import check_choice, check_range
+from rgbt.checks import GreyLevel, Lengths, Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
-from rgbt.transforms.joint import View, check_lengths, draw_view, short_edge_hw
+from rgbt.transforms.joint import View, draw_view, short_edge_hw
 from rgbt.transforms.on_batch import Drawn, DrawnBatch
-from rgbt.transforms.photometric import ColourJitter, Colours
+from rgbt.transforms.photometric import ColourJitter, Colours, FactorRange, HueDelta
 from rgbt.types import Sample
 
 
@@ -54,18 +54,18 @@ class CrmTransform:
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         *,
-        sizes: tuple[int, ...] | None,
-        max_size: int | None,
-        crop_hw: tuple[int, int] | None,
-        flip_probability: float,
+        sizes: Lengths | None,
+        max_size: Pixels | None,
+        crop_hw: Size | None,
+        flip_probability: Share,
         colour: Literal["intended", "released"],
-        colour_probability: float,
-        brightness_delta: float,
-        contrast_range: tuple[float, float],
-        saturation_range: tuple[float, float],
-        hue_delta: int,
-        thermal_contrast_range: tuple[float, float],
-        test_short_edge: int | None,
+        colour_probability: Share,
+        brightness_delta: GreyLevel,
+        contrast_range: FactorRange,
+        saturation_range: FactorRange,
+        hue_delta: HueDelta,
+        thermal_contrast_range: FactorRange,
+        test_short_edge: Pixels | None,
         track_position: bool,
     ) -> None:
         self.sizes = sizes
@@ -82,14 +82,6 @@ class CrmTransform:
             saturation_range=saturation_range,
             hue_delta=hue_delta,
             thermal_contrast_range=thermal_contrast_range,
-        )
-        check_choice("transform.colour", colour, ("intended", "released"))
-        check_range("transform.flip_probability", flip_probability, 0, 1)
-        check_lengths(
-            sizes=sizes,
-            max_size=(max_size,),
-            crop_hw=crop_hw,
-            test_short_edge=(test_short_edge,),
         )
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:

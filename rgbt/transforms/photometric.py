@@ -9,13 +9,14 @@ On the batch the same changes are made by `rgbt.transforms.on_batch`, with the s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from annotated_types import Interval, Predicate, doc
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_range
+from rgbt.checks import GreyLevel, Share, rising
 
 Image = NDArray[Any]
 
@@ -24,6 +25,11 @@ LEVELS = np.arange(256, dtype=np.uint8)
 
 WIDEST_VECTOR = 64
 """8-bit values that the widest vector unit takes at a time (AVX-512)."""
+
+
+Factor = Annotated[float, Interval(ge=0, le=100)]
+FactorRange = Annotated[tuple[Factor, Factor], Predicate(rising), doc("the smaller one first")]
+HueDelta = Annotated[int, Interval(ge=0, le=180)]
 
 
 @dataclass(frozen=True)
@@ -45,24 +51,12 @@ class ColourJitter:
         InputError: a value out of range.
     """
 
-    probability: float
-    brightness_delta: float
-    contrast_range: tuple[float, float]
-    saturation_range: tuple[float, float]
-    hue_delta: int
-    thermal_contrast_range: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        check_range("transform.colour_probability", self.probability, 0, 1)
-        check_range("transform.brightness_delta", self.brightness_delta, 0, 255)
-        check_range("transform.hue_delta", self.hue_delta, 0, 180)
-        for key in ("contrast_range", "saturation_range", "thermal_contrast_range"):
-            low, high = getattr(self, key)
-            if not 0 <= low <= high:
-                raise InputError(
-                    f"transform.{key} must be [low, high] with 0 <= low <= high, got "
-                    f"[{low:g}, {high:g}]."
-                )
+    probability: Share
+    brightness_delta: GreyLevel
+    contrast_range: FactorRange
+    saturation_range: FactorRange
+    hue_delta: HueDelta
+    thermal_contrast_range: FactorRange
 
     def draw(self, rng: np.random.Generator) -> Colours:
         """What happens to one example; every draw comes from `rng`."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Annotated
 
-from rgbt.checks import check_range
+import numpy as np
+from annotated_types import Interval
+
+from rgbt.checks import Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
-from rgbt.transforms.joint import Part, View, check_lengths
+from rgbt.transforms.joint import Part, View
 from rgbt.types import Sample
 
 
@@ -33,15 +36,12 @@ class RtfnetTransform:
     def __init__(
         self,
         *,
-        flip_probability: float,
-        cut_share: float,
-        crop_hw: tuple[int, int],
-        test_short_edge: int | None,
+        flip_probability: Share,
+        cut_share: Annotated[float, Interval(ge=0, le=0.5)],
+        crop_hw: Size,
+        test_short_edge: Pixels | None,
         track_position: bool,
     ) -> None:
-        check_range("transform.flip_probability", flip_probability, 0, 1)
-        check_range("transform.cut_share", cut_share, 0, 0.5)
-        check_lengths(crop_hw=crop_hw, test_short_edge=(test_short_edge,))
         self.flip_probability = flip_probability
         self.cut_share = cut_share
         self.crop_hw = crop_hw

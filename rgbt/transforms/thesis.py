@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+from annotated_types import Interval, Predicate, doc
 from numpy.typing import DTypeLike, NDArray
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
-from rgbt.transforms.joint import View, check_lengths
+from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample
+
+OddPixels = Annotated[
+    int,
+    Interval(ge=1, le=255),
+    Predicate(lambda side: side % 2 == 1),
+    doc("an odd number of pixels"),
+]
 
 
 class ThesisTransform:
@@ -46,23 +54,14 @@ class ThesisTransform:
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         *,
-        crop_hw: tuple[int, int],
-        flip_probability: float,
-        blur_probability: float,
-        blur_kernel: int,
+        crop_hw: Size,
+        flip_probability: Share,
+        blur_probability: Share,
+        blur_kernel: OddPixels,
         label_resize: Literal["nearest", "bilinear"],
-        test_short_edge: int | None,
+        test_short_edge: Pixels | None,
         track_position: bool,
     ) -> None:
-        check_range("transform.flip_probability", flip_probability, 0, 1)
-        check_range("transform.blur_probability", blur_probability, 0, 1)
-        check_choice("transform.label_resize", label_resize, ("nearest", "bilinear"))
-        check_lengths(crop_hw=crop_hw, test_short_edge=(test_short_edge,))
-        if blur_kernel < 1 or blur_kernel % 2 == 0:
-            raise InputError(
-                f"transform.blur_kernel must be an odd number of pixels, got {blur_kernel}; the "
-                "thesis has 5."
-            )
         self.crop_hw = crop_hw
         self.flip_probability = flip_probability
         self.blur_probability = blur_probability

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import TEXT, InputError, nearest, one_line, read_bytes
+from rgbt.checks import TEXT, InputError, Names, nearest, one_line, read_bytes
 from rgbt.transforms.virtual_view import VirtualView
 
 HEADER = "yaw,pitch,roll"
@@ -42,9 +42,7 @@ class ViewSets:
         InputError: no such set, a line that is no triple, or a triple that leaves no rectangle.
     """
 
-    def __init__(
-        self, *, view: VirtualView, sets: tuple[str, ...], splits: tuple[Split, ...]
-    ) -> None:
+    def __init__(self, *, view: VirtualView, sets: Names, splits: tuple[Split, ...]) -> None:
         self.view = view
         self.sets = sets
         self.splits = splits

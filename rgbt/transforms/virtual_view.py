@@ -9,21 +9,23 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from itertools import product
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Interval, Predicate, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import InputError, rising
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.homography import Order, homography
 from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
 from rgbt.geometry.warp import Resampling, Warp
 from rgbt.types import IGNORE, Batch
 
-Degrees = tuple[float, float]
-STEEPEST = 60.0
-"""Degrees; a camera of ordinary width that turns further sees nothing of what it saw."""
+Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]
+"""A camera of ordinary width that turns further sees nothing of what it saw."""
+
+Degrees = Annotated[tuple[Angle, Angle], Predicate(rising), doc("the smaller one first")]
 
 LEAST = 0.1
 """Share of the frame that the smallest rectangle of the drawn angles must hold."""
@@ -73,9 +75,6 @@ class VirtualView:
         resampling: Resampling,
         outside: Literal["ignore", "background"],
     ) -> None:
-        check_choice("view.angles", angles, ("uniform", "integer"))
-        check_choice("view.mode", mode, ("both", "rotation", "translation"))
-        check_choice("view.outside", outside, ("ignore", "background"))
         self.camera = camera
         self.order: Order = order
         self.angles = angles
@@ -177,12 +176,12 @@ class VirtualView:
 
     def _check_ranges(self) -> None:
         for name, (low, high) in self.ranges.items():
-            for end in (low, high):
-                check_range(f"view.{name}", end, -STEEPEST, STEEPEST)
             whole = float(low).is_integer() and float(high).is_integer()
-            if low > high or (self.angles == "integer" and not (whole and low < high)):
-                wanted = "whole degrees, low < high" if self.angles == "integer" else "low <= high"
-                raise InputError(f"view.{name} must be (low, high) with {wanted}, got {low, high}.")
+            if self.angles == "integer" and not (whole and low < high):
+                raise InputError(
+                    f"view.{name} must be (low, high) with whole degrees, low < high, got "
+                    f"{low, high}; see view.angles=integer."
+                )
         self._check_turns()
 
     def _check_turns(self) -> None:

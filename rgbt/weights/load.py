@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, not_finite
 from rgbt.weights.layout import FAMILIES, Facts, Rule, family_of
 from rgbt.weights.plan import Plan, adapted, make_plan
 from rgbt.weights.read import Contents, read
@@ -28,13 +28,21 @@ def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()
             "sem_seg_head.predictor.class_embed" for another number of classes.
 
     Raises:
-        InputError: unreadable, asking for code, of another network, incomplete or of another shape.
+        InputError: unreadable, asking for code, of another network, incomplete, of another shape,
+            or with NaN or infinity.
     """
     contents = read(Path(path))
     facts, plan, remarks = plan_for(model, contents, fresh)
     state = model.state_dict()
     if not plan.fits:
         raise InputError(refusal(contents.path, facts, plan, family_of(type(model)), len(state)))
+    broken = not_finite({name: contents.tensors[name] for name in plan.values.values()})
+    if broken:
+        raise InputError(
+            f"{contents.path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
+            f"{len(plan.values)} tensors do): the training that wrote it failed; give a checkpoint "
+            "of an earlier step."
+        )
     with torch.no_grad():
         for entry, name in plan.values.items():
             state[entry].copy_(adapted(contents.tensors[name], state[entry]))

@@ -102,7 +102,7 @@ def test_unreadable_files_can_be_left_out(call: Call, data: Path, tmp_path: Path
         (["metric=ring9"], "'metric' has no effect here;"),
         (["partition=vertical", "aspect=released_3_4"], "aspect=released_3_4 is one of rings"),
         (["split=trian"], "dataset.splits has no split 'trian'; did you mean 'train'?"),
-        (["data.on_error=ignore"], "'data.on_error': input should be 'raise' or 'skip', got"),
+        (["data.on_error=ignore"], "'data.on_error' must be 'raise' or 'skip', got"),
         (["dataset.rot=x"], "'dataset.rot' is not a key of the configuration"),
     ],
 )

@@ -29,12 +29,6 @@ def two(target_is: str, **changes: Any) -> Domains:
     )
 
 
-@pytest.mark.parametrize("threshold", [-0.1, 1.0, 2.0])
-def test_a_threshold_out_of_range_is_refused(threshold: float) -> None:
-    with pytest.raises(InputError, match=r"threshold must lie in \[0, 1\), got"):
-        domain(labels="experiment:x/best.pt", threshold=threshold)
-
-
 @pytest.mark.parametrize("labels", ["given", "none", "/some/folder"])
 @pytest.mark.parametrize("setting", [{"threshold": 0.5}, {"teacher_view": "thermal"}])
 def test_settings_of_a_teacher_without_one_are_refused(labels: str, setting: dict) -> None:

@@ -265,15 +265,6 @@ def test_skip_with_nothing_left(dataset: MFNet) -> None:
         next(batches)
 
 
-def test_settings_are_checked() -> None:
-    with pytest.raises(InputError, match=r"data.batch_size must lie in \[1"):
-        settings(batch_size=0)
-    with pytest.raises(InputError, match="data.num_workers"):
-        settings(num_workers=-1)
-    with pytest.raises(InputError, match="data.on_error: 'skpi'.*did you mean 'skip'"):
-        settings(on_error="skpi")
-
-
 @pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
 def test_words_that_name_no_cache(cache: object) -> None:
     """They would be folders where the command was typed."""

@@ -237,20 +237,6 @@ def test_settings_of_the_reader_are_passed_on(data: Freiburg) -> None:
         small.read(small.names("train")[0])
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"num_test": 1}, "num_test must lie in"),
-        ({"num_train_night": 0}, "num_train_night must lie in"),
-        ({"width": 8}, "width must lie in"),
-    ],
-)
-def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        synth_freiburg(cache_dir=str(tmp_path), **wrong)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     path = Path(__file__).resolve().parents[2] / "conf/dataset/synth_freiburg.yaml"
     node = OmegaConf.to_container(OmegaConf.load(path))

@@ -205,16 +205,6 @@ def test_every_class_that_there_is_is_often_seen(scenes: list[Scene]) -> None:
 # ---- settings -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [({"num_test": 0}, "num_test must lie in"), ({"width": 8}, "width must lie in")],
-)
-def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        synth_kp(cache_dir=str(tmp_path), **wrong)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "dataset/synth_kp.yaml"))
     assert node.pop("_target_") == "rgbt.data.synth.kp.synth_kp"

@@ -132,16 +132,6 @@ def test_the_cache_is_used_again_and_named_by_the_plan(
             assert cached(small, tmp_path) != folder
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [({"num_val": 0}, "num_val must lie in"), ({"width": 8}, "width must lie in")],
-)
-def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        synth_pst900(cache_dir=str(tmp_path), **wrong)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_bag_that_is_not_there_is_named(data: PST900) -> None:
     other = synth_pst900(cache_dir=str(data.root.parent), **SMALL, val_bags=(33,))
     with pytest.raises(InputError, match=r"dataset.val_bags: .* has no bag 33"):

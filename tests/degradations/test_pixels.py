@@ -229,7 +229,6 @@ def noise(*severities: float) -> Noise:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: occluded(block=0), r"degradation.block must lie in \[1, 480\], got 0"),
         (lambda: Occluded(image="rgb", block=8, severities=(0.5, 2.0)), r"in \[0, 1\], got 2"),
         (lambda: Occluded(image="rgb", block=8, severities=()), r"rise from above 0 .*got \[\]"),
         (lambda: noise(8.0, 8.0), r"must rise from above 0"),

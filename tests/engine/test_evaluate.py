@@ -9,6 +9,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from rgbt.checks import RunError
 from rgbt.engine.evaluate import class_maps, class_scores, predictions
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, Output, View
@@ -100,3 +101,20 @@ def test_the_names_of_a_batch_choose_its_heads(model: Heads) -> None:
     expected = class_maps(model, images.to("cpu"), fabric, "rgb", heads)
     assert torch.equal(found[0].classes, expected)
     assert torch.equal(found[1].classes, expected)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_scores_that_are_not_finite_are_refused_with_the_image(model: Heads, value: float) -> None:
+    fabric = Fabric(accelerator="cpu", devices=1)
+    data = batch(3)
+    data.rgb[1, 0, 2, 3] = value
+    with pytest.raises(RunError, match="^image '1': the network's class scores are NaN or inf"):
+        list(predictions(model, [data], fabric))
+
+
+def test_large_finite_scores_are_counted(model: Heads) -> None:
+    """Their sum is not finite, they are."""
+    with torch.no_grad():
+        model.heads["day"].bias.fill_(1e38)
+    found = class_maps(model, batch(2), Fabric(accelerator="cpu", devices=1))
+    assert found.shape == (2, 12, 16)

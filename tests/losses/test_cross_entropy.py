@@ -55,9 +55,6 @@ def test_raises(make_batch: Any) -> None:
         plain(Output(torch.zeros(1, 3, 4, 4), {}), batch, NOTHING)
     with pytest.raises(InputError, match="2 numbers"):
         CrossEntropy(class_weights=(1.0, 2.0))(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
-    for wrong in [(), (1.0, -1.0)]:
-        with pytest.raises(InputError, match="at least 0"):
-            CrossEntropy(class_weights=wrong)
 
 
 def test_uniform_scores_of_fourteen_classes(make_batch: Any) -> None:

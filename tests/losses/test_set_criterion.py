@@ -229,14 +229,6 @@ def test_raises(make_problem: Any, make_criterion: Any) -> None:
         criterion(Output(None, bad), batch, seeded())
 
 
-@pytest.mark.parametrize(
-    "setting", [{"num_points": 0}, {"oversample_ratio": 0.5}, {"importance_ratio": 1.5}]
-)
-def test_settings_out_of_range(make_criterion: Any, setting: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=next(iter(setting))):
-        make_criterion(**setting)
-
-
 @pytest.mark.parametrize("name", ["set_criterion", "set_criterion_spatial", "cross_entropy"])
 def test_configuration_files_name_every_setting(name: str) -> None:
     node = OmegaConf.load(ROOT / "conf" / "loss" / f"{name}.yaml")

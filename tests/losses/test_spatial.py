@@ -104,10 +104,6 @@ def test_weights_at_points(make_batch: Any, make_positions: Any) -> None:
 
 
 def test_raises(make_batch: Any) -> None:
-    with pytest.raises(InputError, match="at least 0"):
-        replace(PLAIN, alpha=-1.0)
-    with pytest.raises(InputError, match="at least 0"):
-        replace(PLAIN, alpha=float("nan"))
     batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long))
     with pytest.raises(InputError, match="track_position"):
         weight_map(batch, (3, 3), EDGE)

@@ -165,9 +165,6 @@ def test_passes_are_summed(frames: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"alpha": -0.5}, r"^loss\.alpha must be finite and at least 0, got -0\.5\.$"),
-        ({"alpha": float("nan")}, r"^loss\.alpha .* got nan\.$"),
-        ({"beta": float("inf")}, r"^loss\.beta .* got inf\.$"),
         ({"second": "none"}, r"^loss\.beta=1 .* loss\.second=none; set loss\.beta=0"),
         ({"beta": 0.0}, r"^loss\.beta=0 .* loss\.second=con; set loss\.second=none"),
     ],

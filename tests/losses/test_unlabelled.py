@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.losses.unlabelled import Entropy, MaxSquares
 
 
@@ -133,26 +132,6 @@ def test_a_probability_of_zero_has_a_finite_gradient() -> None:
     entropy(p).backward()
     assert p.grad is not None
     assert p.grad.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"weight": -1.0}, "max_squares.weight"),
-        ({"weight": math.nan}, "max_squares.weight"),
-        ({"image_wise_ratio": 1.5}, "max_squares.image_wise_ratio"),
-        ({"normalisation": "pixel"}, "max_squares.normalisation.*did you mean 'pixels'"),
-    ],
-)
-def test_values_out_of_range_are_refused(changes: dict[str, Any], key: str) -> None:
-    good: dict[str, Any] = {"weight": 1.0, "normalisation": "pixels", "image_wise_ratio": None}
-    with pytest.raises(InputError, match=key):
-        MaxSquares(**{**good, **changes})
-
-
-def test_a_negative_weight_of_entropy_is_refused() -> None:
-    with pytest.raises(InputError, match=r"entropy.weight must lie in"):
-        Entropy(weight=-0.1)
 
 
 def test_of_one_class_there_is_nothing_to_be_unsure_of() -> None:

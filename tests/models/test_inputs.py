@@ -111,7 +111,6 @@ def test_cells_that_do_not_fit_are_refused(grid: tuple[int, int], unit: int) -> 
     [
         ({"thermal_mean": (0.0, 0.0)}, "one value, or three"),
         ({"thermal_std": (1.0, 1.0, 1.0)}, "one value, or three"),
-        ({"rgb_std": (1.0, 0.0, 1.0)}, "must be positive"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(change: dict[str, Any], words: str) -> None:

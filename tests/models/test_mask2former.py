@@ -231,12 +231,8 @@ def test_cells_that_do_not_divide_are_named(grid: tuple[int, int]) -> None:
 @pytest.mark.parametrize(
     ("change", "key"),
     [
-        ({"share_start": 5}, "share_start"),
-        ({"fusion": "mean"}, "fusion"),
         ({"hidden_dim": 48}, "hidden_dim"),
         ({"num_heads": (3, 1, 1, 1)}, "num_heads"),
-        ({"drop_path_rate": 1.0}, "drop_path_rate"),
-        ({"depths": (1, 1, 0, 1)}, "depths"),
     ],
 )
 def test_sizes_that_do_not_fit_name_the_key(change: dict[str, Any], key: str) -> None:

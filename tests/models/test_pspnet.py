@@ -83,21 +83,6 @@ def test_sizes_of_the_release() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"modalities": "late"}, "model.modalities.*late_fusion"),
-        ({"depths": (1, 0, 1, 1)}, "model.depths"),
-        ({"base_width": 0}, "model.base_width"),
-        ({"decoder_width": 0}, "model.decoder_width"),
-        ({"dropout": (0.3, 1.0)}, "model.dropout"),
-    ],
-)
-def test_settings_that_are_refused(changes: dict[str, Any], key: str) -> None:
-    with pytest.raises(InputError, match=key):
-        nano(**changes)
-
-
 def test_one_view() -> None:
     assert [nano(modalities=name).views for name in ALL] == [
         ("rgbt",),

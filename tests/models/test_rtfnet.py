@@ -245,20 +245,6 @@ def test_start_of_encoders_and_decoder() -> None:
             assert module.bias.eq(0).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"depth": 20}, "depth"),
-        ({"base_width": 0}, "base_width"),
-        ({"base_width": 5}, "base_width"),
-        ({"thermal_stem": "mean"}, "thermal_stem"),
-    ],
-)
-def test_settings_that_do_not_fit_name_the_key(change: dict[str, Any], key: str) -> None:
-    with pytest.raises(InputError, match=key):
-        nano(**change)
-
-
 @pytest.mark.parametrize("views", [("rgb",), ("rgbt", "thermal")])
 def test_other_views_are_refused(views: Any) -> None:
     with pytest.raises(InputError, match="RTFNet predicts from rgbt"):

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError
-from rgbt.models.upsampling import UpBlock, check_rates, enlarge
+from rgbt.models.upsampling import UpBlock, enlarge
 from tests.models.plain import generator
 
 
@@ -59,12 +58,6 @@ def test_no_rate_needs_no_generator() -> None:
     assert torch.equal(enlarge(x, (Note(),), (0.0, 0.0), None), x)
     with pytest.raises(ValueError, match="generator"):
         enlarge(x, (Note(),), (0.0, 0.1), None)
-
-
-@pytest.mark.parametrize("rates", [(-0.1, 0.0), (0.0, 1.0)])
-def test_rates_out_of_range_are_refused(rates: tuple[float, float]) -> None:
-    with pytest.raises(InputError, match="model.dropout"):
-        check_rates(rates)
 
 
 def test_gradient() -> None:

@@ -416,7 +416,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "one domain": ({"domains": replace(domains(False), target=None)}, "but there is one"),
     "masker": ({"masker": Something()}, "shows whole images"),
     "verdict loss": ({"verdict_loss": "least_square"}, "did you mean 'least_squares'"),
-    "negative weight": ({"weight": -0.1}, "scheme.weight must lie in"),
+    "no probability": (
+        {"verdict_loss": "cross_entropy", "target_value": -1.0},
+        "must lie in [0, 1] with scheme.verdict_loss=cross_entropy, got 0 and -1",
+    ),
     "equal values": ({"target_value": 0.0}, "are both 0, so that the critic has nothing"),
     "labels not read": (
         {"domains": domains(False)},

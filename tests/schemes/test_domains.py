@@ -336,12 +336,6 @@ def test_one_domain_is_refused_where_there_must_be_two_and_two_where_one() -> No
         )
 
 
-@pytest.mark.parametrize(("key", "value"), [("guidance_weight", -1.0), ("guidance_threshold", 1.5)])
-def test_guidance_out_of_range_is_refused(key: str, value: float) -> None:
-    with pytest.raises(InputError, match=f"scheme.{key} must lie in"):
-        unlabelled(network(False, auxiliary=True), **{key: value})
-
-
 def test_guidance_without_an_auxiliary_head_is_refused() -> None:
     with pytest.raises(InputError, match="trains an auxiliary head, which this network does not"):
         unlabelled(network(False), guidance_weight=0.1)

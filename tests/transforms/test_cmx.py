@@ -11,7 +11,6 @@ import pytest
 import torch
 import yaml
 
-from rgbt.checks import InputError
 from rgbt.config import build
 from rgbt.transforms.cmx import CmxTransform, draw_span, padded
 from rgbt.transforms.example import Example, viewed
@@ -211,25 +210,6 @@ def test_tracking_can_be_left_out() -> None:
     example = cmx(track_position=False, factors=(0.5,)).train(sample(), np.random.default_rng(10))
     assert example.position is None
     assert image_part(example)[example.centre_yx]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"flip_probability": -1.0}, "transform.flip_probability must lie in"),
-        ({"factors": ()}, r"transform.factors must be positive numbers, got \[\]"),
-        ({"factors": (1.0, 0.0)}, "transform.factors"),
-        ({"crop_hw": (48, 0)}, "transform.crop_hw must hold lengths of at least 1 pixel"),
-        ({"test_short_edge": 0}, "transform.test_short_edge"),
-        ({"padding_rgb": (0.0, 0.0, 256.0)}, r"transform.padding_rgb must lie in \[0, 255\]"),
-        ({"padding_thermal": (-1.0,)}, "transform.padding_thermal must lie in"),
-        ({"padding_thermal": ()}, "transform.padding_thermal must hold the mean of a channel"),
-        ({"padding_order": "grb"}, "transform.padding_order: 'grb' is not a choice"),
-    ],
-)
-def test_refuses_wrong_settings(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        cmx(**changes)
 
 
 def test_configuration_names_every_setting_and_the_released_numbers() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from rgbt.checks import InputError
 from rgbt.config import build, conf_dir
 from rgbt.transforms.joint import View
 from rgbt.transforms.thesis import ThesisTransform, area, mixed
@@ -185,23 +184,6 @@ def test_same_generator_same_example() -> None:
     one, other = (transform.train(sample(), np.random.default_rng(10)) for _ in range(2))
     np.testing.assert_array_equal(one.rgb, other.rgb)
     np.testing.assert_array_equal(one.confidence, other.confidence)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"flip_probability": 1.5}, "transform.flip_probability must lie in"),
-        ({"blur_probability": -0.1}, "transform.blur_probability must lie in"),
-        ({"blur_kernel": 4}, "transform.blur_kernel must be an odd number of pixels, got 4"),
-        ({"blur_kernel": -1}, "transform.blur_kernel"),
-        ({"label_resize": "linear"}, "transform.label_resize: 'linear'.*bilinear"),
-        ({"crop_hw": (0, 4)}, "transform.crop_hw must hold lengths of at least 1 pixel"),
-        ({"test_short_edge": 0}, "transform.test_short_edge"),
-    ],
-)
-def test_refuses_wrong_settings(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        thesis(**changes)
 
 
 def test_configurations_name_every_setting_and_differ_where_they_say() -> None:

@@ -305,3 +305,15 @@ def test_checkpoints_of_runs(tmp_path: Path) -> None:
     path = saved(tmp_path, {"model": network("cmx_tiny").state_dict(), "step": 240})
     said = refused(network("mfnet_tiny"), path)
     assert "is no file for MFNet: checkpoint of a run, CMX" in said
+
+
+def test_a_file_with_nan_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    model = nn.Linear(3, 2)
+    before = model.bias.detach().clone()
+    broken = OrderedDict(model.state_dict(), weight=torch.full((2, 3), float("nan")))
+    broken["bias"] = before + 1
+    path = tmp_path / "broken.pt"
+    torch.save({"model": broken}, path)
+    with pytest.raises(InputError, match=r"'weight' holds NaN or infinity \(1 of 2 tensors do\)"):
+        load_weights(model, path)
+    assert torch.equal(model.bias, before)

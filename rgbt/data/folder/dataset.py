@@ -12,19 +12,30 @@ from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, check_range, nearest
+from rgbt.checks import (
+    Colour,
+    InputError,
+    Names,
+    NumClasses,
+    Seed,
+    Share,
+    Text,
+    check_choice,
+    nearest,
+)
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_packed, read_rgb, within
 from rgbt.data.folder.frames import Frame, find_frames, patterns_of
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, Rule
 from rgbt.data.folder.values import (
-    Colour,
+    LabelValue,
     Range,
     check_limits,
     each_colour,
@@ -35,7 +46,7 @@ from rgbt.data.folder.values import (
 )
 from rgbt.data.integrity import is_there
 from rgbt.data.named_files import hash_of_files
-from rgbt.types import IGNORE, Sample
+from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
 
@@ -79,27 +90,27 @@ class Folder:
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
-        root: str,
+        root: Text,
         *,
-        num_classes: int,
-        classes: tuple[str, ...],
-        rgb: str,
-        thermal: str,
-        label: str | None,
-        name: str = "folder",
+        num_classes: NumClasses,
+        classes: Names,
+        rgb: Text,
+        thermal: Text,
+        label: Text | None,
+        name: Text = "folder",
         palette: tuple[Colour, ...] | None = None,
-        unscored: tuple[str, ...] = (),
-        folders: dict[str, str] | None = None,
-        lists: dict[str, str] | None = None,
-        shares: dict[str, float] | None = None,
-        shares_seed: int = 0,
-        block: int | None = None,
-        unlabelled: tuple[str, ...] = (),
-        ids: dict[int, str] | None = None,
-        colours: dict[str, Colour | tuple[Colour, ...]] | None = None,
-        ignored: tuple[int | Colour, ...] = (),
+        unscored: Names = (),
+        folders: dict[Text, Text] | None = None,
+        lists: dict[Text, Text] | None = None,
+        shares: dict[Text, Share] | None = None,
+        shares_seed: Seed = 0,
+        block: Annotated[int, Interval(ge=1, le=10**6)] | None = None,
+        unlabelled: Names = (),
+        ids: dict[LabelValue, Text] | None = None,
+        colours: dict[Text, Colour | tuple[Colour, ...]] | None = None,
+        ignored: tuple[LabelValue | Colour, ...] = (),
         thermal_range: Range | None = None,
-        night: str | None = None,
+        night: Text | None = None,
     ) -> None:
         self.root = Path(root).expanduser()
         self.name = name
@@ -109,7 +120,6 @@ class Folder:
         self.unscored = unscored
         self.thermal_range = thermal_range
         self.night = night
-        check_range("dataset.num_classes", num_classes, 1, IGNORE)
         check_lengths(num_classes, classes, self.palette)
         for word in classes:
             if classes.count(word) > 1:

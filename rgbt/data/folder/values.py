@@ -10,19 +10,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import Colour, InputError, nearest
 from rgbt.data.files import decode, one_channel, read_array, read_colours, read_indices
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
-Colour = tuple[int, int, int]
+LabelValue = Annotated[int, Interval(ge=-(2**31), lt=2**31)]
 Colours = Mapping[str, Colour | tuple[Colour, ...]]
-Range = tuple[float, float]
+Level = Annotated[float, Interval(ge=-1e6, le=1e6)]
+Range = tuple[Level, Level]
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, Seed, Text
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
-from rgbt.data.synth.factors import EgoMotion, SceneFactors, with_factors
+from rgbt.data.synth.factors import (
+    EgoMotion,
+    ForwardMetres,
+    NumScenes,
+    SceneFactors,
+    YawDegrees,
+    with_factors,
+)
 from rgbt.data.synth.writer import Plan, write
 
 VERSION = 2
@@ -18,15 +25,15 @@ VERSION = 2
 @with_factors()
 def synth(  # noqa: PLR0913 - each is a key of the configuration
     *,
-    cache_dir: str | None = None,
+    cache_dir: Text | None = None,
     num_classes: Literal[9] = 9,
-    seed: int = 0,
-    num_train: int = 600,
-    num_val: int = 100,
-    num_test: int = 100,
+    seed: Seed = 0,
+    num_train: NumScenes = 600,
+    num_val: NumScenes = 100,
+    num_test: NumScenes = 100,
     factors: SceneFactors,
-    ego_forward_m: float | None = None,
-    ego_yaw_deg: float = 0.0,
+    ego_forward_m: ForwardMetres | None = None,
+    ego_yaw_deg: YawDegrees = 0.0,
 ) -> MFNet:
     """The synthetic data set with these factors, generated if no earlier call has done so.
 

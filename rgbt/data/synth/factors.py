@@ -6,29 +6,20 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
-from rgbt.checks import check_range
+from annotated_types import Interval, doc
+
+from rgbt.checks import Share
 
 Made = TypeVar("Made")
 
-_RANGES: dict[str, tuple[float, float]] = {
-    "height": (32, 2048),
-    "width": (32, 2048),
-    "num_objects": (0, 24),
-    "num_far_objects": (0, 64),
-    "texture_strength": (0, 4),
-    "rgb_noise": (0, 1),
-    "rgb_noise_radius_gain": (0, 20),
-    "rgb_noise_dark_gain": (0, 20),
-    "thermal_noise": (0, 1),
-    "thermal_contrast": (0, 4),
-    "thermal_drift": (0, 1),
-    "night_share": (0, 1),
-    "camera_height_m": (0.9, 4),
-    "camera_pitch_deg": (-10, 20),
-    "field_of_view_deg": (20, 110),
-}
+NumScenes = Annotated[int, Interval(ge=1, le=30_000)]
+"""Of a split; names have five digits."""
+
+Side = Annotated[int, Interval(ge=32, le=2048), doc("pixels")]
+Strength = Annotated[float, Interval(ge=0, le=4)]
+Gain = Annotated[float, Interval(ge=0, le=20)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,26 +47,26 @@ class SceneFactors:
         field_of_view_deg: horizontal field of view in degrees.
     """
 
-    height: int = 120
-    width: int = 160
-    num_objects: int = 7
-    num_far_objects: int = 16
-    texture_strength: float = 1.0
-    rgb_noise: float = 0.012
-    rgb_noise_radius_gain: float = 0.5
-    rgb_noise_dark_gain: float = 1.5
-    thermal_noise: float = 0.012
-    thermal_contrast: float = 1.0
-    thermal_drift: float = 0.02
-    night_share: float = 0.5
-    camera_height_m: float = 1.6
-    camera_pitch_deg: float = 2.0
-    field_of_view_deg: float = 64.0
+    height: Side = 120
+    width: Side = 160
+    num_objects: Annotated[int, Interval(ge=0, le=24)] = 7
+    num_far_objects: Annotated[int, Interval(ge=0, le=64)] = 16
+    texture_strength: Strength = 1.0
+    rgb_noise: Share = 0.012
+    rgb_noise_radius_gain: Gain = 0.5
+    rgb_noise_dark_gain: Gain = 1.5
+    thermal_noise: Share = 0.012
+    thermal_contrast: Strength = 1.0
+    thermal_drift: Share = 0.02
+    night_share: Share = 0.5
+    camera_height_m: Annotated[float, Interval(ge=0.9, le=4)] = 1.6
+    camera_pitch_deg: Annotated[float, Interval(ge=-10, le=20)] = 2.0
+    field_of_view_deg: Annotated[float, Interval(ge=20, le=110)] = 64.0
 
-    def __post_init__(self) -> None:
-        """Raise InputError where a factor lies outside its range."""
-        for name, (low, high) in _RANGES.items():
-            check_range(name, getattr(self, name), low, high)
+
+ForwardMetres = Annotated[float, Interval(ge=-3, le=3)]
+YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
+"""What a camera moves between two frames of a video."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +78,8 @@ class EgoMotion:
         yaw_deg: degrees to the right.
     """
 
-    forward_m: float
-    yaw_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raise InputError where a motion is larger than between two frames of a video."""
-        check_range("ego_forward_m", self.forward_m, -3, 3)
-        check_range("ego_yaw_deg", self.yaw_deg, -15, 15)
+    forward_m: ForwardMetres
+    yaw_deg: YawDegrees = 0.0
 
 
 def with_factors(
@@ -114,12 +100,13 @@ def with_factors(
 
     def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:
         own = inspect.signature(function)
+        types = get_type_hints(SceneFactors, include_extras=True)
         added = [
             inspect.Parameter(
                 factor.name,
                 inspect.Parameter.KEYWORD_ONLY,
                 default=defaults.get(factor.name, factor.default),
-                annotation=factor.type,
+                annotation=types[factor.name],
             )
             for factor in fields(SceneFactors)
             if factor.name not in left_out

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from rgbt.data.freiburg import THERMAL_RANGE, Freiburg
+from annotated_types import Interval
+
+from rgbt.checks import Names, Seed, Text
+from rgbt.data.freiburg import THERMAL_RANGE, Counts, Crop, Freiburg
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
-from rgbt.data.synth.factors import SceneFactors, with_factors
+from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.freiburg_writer import VAL_SEQUENCE, FreiburgPlan, write
 
 VERSION = 1
@@ -18,17 +21,17 @@ VERSION = 1
 @with_factors("night_share", height=98, width=288, field_of_view_deg=96.0)
 def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     *,
-    cache_dir: str | None = None,
+    cache_dir: Text | None = None,
     num_classes: Literal[14] = 14,
-    unscored: tuple[str, ...] = ("background", "ignore"),
-    crop: tuple[int, int, int, int] | None = (1, 97, 48, 240),
-    thermal_range: tuple[int, int] = THERMAL_RANGE,
-    ignored_test: tuple[str, ...] = ("ignore",),
-    seed: int = 0,
-    num_train_day: int = 300,
-    num_train_night: int = 300,
-    num_val: int = 40,
-    num_test: int = 60,
+    unscored: Names = ("background", "ignore"),
+    crop: Crop | None = (1, 97, 48, 240),
+    thermal_range: Counts = THERMAL_RANGE,
+    ignored_test: Names = ("ignore",),
+    seed: Seed = 0,
+    num_train_day: NumScenes = 300,
+    num_train_night: NumScenes = 300,
+    num_val: NumScenes = 40,
+    num_test: Annotated[int, Interval(ge=2, le=30_000)] = 60,
     factors: SceneFactors,
 ) -> Freiburg:
     """The data set with these factors, generated if no earlier call has done so.

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import check_range
 from rgbt.data.freiburg import CLASSES
 from rgbt.data.freiburg_layout import LABEL, RGB, TEST_LABEL, THERMAL
 from rgbt.data.synth.camera import Floats
@@ -66,12 +65,6 @@ class FreiburgPlan:
     num_val: int
     num_test: int
     factors: SceneFactors
-
-    def __post_init__(self) -> None:
-        """Raise InputError where a split is empty or larger than the real one."""
-        for name in ("num_train_day", "num_train_night", "num_val"):
-            check_range(name, getattr(self, name), 1, 30_000)
-        check_range("num_test", self.num_test, 2, 30_000)
 
     def shots(self) -> tuple[Shot, ...]:
         """Every frame, numbered over all splits: no scene is in two of them."""

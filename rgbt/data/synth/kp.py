@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from rgbt.checks import Seed, Text
 from rgbt.data.kp import KP
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
-from rgbt.data.synth.factors import SceneFactors, with_factors
+from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.kp_writer import write
 from rgbt.data.synth.writer import Plan
 
@@ -19,12 +20,12 @@ VERSION = 1
 @with_factors(night_share=0.48)
 def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     *,
-    cache_dir: str | None = None,
+    cache_dir: Text | None = None,
     num_classes: Literal[19] = 19,
-    seed: int = 0,
-    num_train: int = 400,
-    num_val: int = 60,
-    num_test: int = 80,
+    seed: Seed = 0,
+    num_train: NumScenes = 400,
+    num_val: NumScenes = 60,
+    num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> KP:
     """The data set with these factors, generated if no earlier call has done so.

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rgbt.data.pst900 import PST900
+from rgbt.checks import Seed, Text
+from rgbt.data.pst900 import PST900, Bags
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
-from rgbt.data.synth.factors import SceneFactors, with_factors
+from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.pst900_writer import VAL_BAG, write
 from rgbt.data.synth.writer import Plan
 
@@ -19,13 +20,13 @@ VERSION = 1
 @with_factors(width=214, field_of_view_deg=80.0)
 def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     *,
-    cache_dir: str | None = None,
+    cache_dir: Text | None = None,
     num_classes: Literal[5] = 5,
-    val_bags: tuple[int, ...] = (VAL_BAG,),
-    seed: int = 0,
-    num_train: int = 400,
-    num_val: int = 50,
-    num_test: int = 80,
+    val_bags: Bags = (VAL_BAG,),
+    seed: Seed = 0,
+    num_train: NumScenes = 400,
+    num_val: NumScenes = 50,
+    num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> PST900:
     """The data set with these factors, generated if no earlier call has done so.

@@ -9,14 +9,17 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Annotated, Any, get_type_hints
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, Seed, nearest
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import Scene, render_scene
+from rgbt.values import check_value
 
 COLOURS = np.array(
     [
@@ -26,6 +29,14 @@ COLOURS = np.array(
     np.uint8,
 )  # fmt: skip
 """Loud colours, one per class; the published palette is too dark to be seen at this size."""
+
+
+OWN: dict[str, Any] = {
+    "seed": Seed,
+    "first": Annotated[int, Interval(ge=0, le=99_999)],
+    "columns": Annotated[int, Interval(ge=1, le=100)],
+    "zoom": Annotated[int, Interval(ge=1, le=16)],
+}
 
 
 def contact_sheet(
@@ -66,15 +77,18 @@ def _parsed(arguments: list[str]) -> tuple[Path, dict[str, int], SceneFactors]:
     """Where to write, the sheet's own numbers, the factors."""
     own = {"seed": 0, "first": 0, "columns": 5, "zoom": 2}
     factors = asdict(SceneFactors())
+    kinds = OWN | get_type_hints(SceneFactors, include_extras=True)
     out = Path("sheet.png")
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key == "out":
             out = Path(value)
         elif key in own:
-            own[key] = int(_number(argument, value, int))
+            own[key] = check_value(key, _number(argument, value, int), kinds[key])
         elif key in factors:
-            factors[key] = _number(argument, value, type(factors[key]))
+            factors[key] = check_value(
+                key, _number(argument, value, type(factors[key])), kinds[key]
+            )
         else:
             known = nearest(key, ["out", *own, *factors])
             raise InputError(f"'{key}' is not a setting of the sheet; {known}.")

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from rgbt.checks import check_range
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.light import is_night
 from rgbt.data.synth.scene import Scene, render_pair, render_scene
@@ -57,11 +56,6 @@ class Plan:
     num_test: int
     factors: SceneFactors
     motion: EgoMotion | None = None
-
-    def __post_init__(self) -> None:
-        """Raise InputError where a split is empty or names would need more than five digits."""
-        for name in ("num_train", "num_val", "num_test"):
-            check_range(name, getattr(self, name), 1, 30_000)
 
     @property
     def num_scenes(self) -> int:

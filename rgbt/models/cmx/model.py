@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import (
+    Channels,
+    Depths,
+    Epsilon,
+    InputError,
+    MlpRatio,
+    NumClasses,
+    ShareBelowOne,
+    Widths,
+)
 from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.fusion import Fusion, Rectification
 from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
@@ -90,6 +101,9 @@ class Encoder(nn.Module):
         return [torch.split(half, list(self.depths)) for half in drawn.chunk(2)]
 
 
+Reduction = Annotated[int, Interval(ge=1, le=64)]
+
+
 class CMX(nn.Module):
     """CMX with MiT streams for RGB and thermal.
 
@@ -124,24 +138,23 @@ class CMX(nn.Module):
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
         *,
-        num_classes: int,
-        embed_dims: tuple[int, int, int, int],
-        depths: tuple[int, int, int, int],
-        num_heads: tuple[int, int, int, int],
-        sr_ratios: tuple[int, int, int, int],
-        mlp_ratio: float,
-        decoder_dim: int,
-        drop_path_rate: float,
+        num_classes: NumClasses,
+        embed_dims: Widths,
+        depths: Depths,
+        num_heads: Widths,
+        sr_ratios: tuple[Reduction, Reduction, Reduction, Reduction],
+        mlp_ratio: MlpRatio,
+        decoder_dim: Channels,
+        drop_path_rate: ShareBelowOne,
         drop_path_stage2: Stage2,
-        decoder_dropout: float,
-        decoder_norm_eps: float,
-        decoder_norm_eps_eval: float | None,
+        decoder_dropout: ShareBelowOne,
+        decoder_norm_eps: Epsilon,
+        decoder_norm_eps_eval: Epsilon | None,
         inputs: Inputs,
     ) -> None:
         super().__init__()
         shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
-        _check(shape, decoder_dim, drop_path_rate, decoder_dropout)
-        check_choice("model.drop_path_stage2", drop_path_stage2, ("ramp", "released"))
+        _check(shape)
         self.num_classes = num_classes
         # The smallest image whose every map is at least as large as the kernel that shrinks it.
         self.shortest_side = max(
@@ -156,8 +169,6 @@ class CMX(nn.Module):
         )
         if decoder_norm_eps_eval is None:
             decoder_norm_eps_eval = decoder_norm_eps
-        check_range("model.decoder_norm_eps", decoder_norm_eps, 1e-12, 1)
-        check_range("model.decoder_norm_eps_eval", decoder_norm_eps_eval, 1e-12, 1)
         self.decode_head = MlpDecoder(
             embed_dims,
             num_classes,
@@ -213,24 +224,15 @@ class CMX(nn.Module):
         return Output(logits, {})
 
 
-def _check(
-    shape: MitShape, decoder_dim: int, drop_path_rate: float, decoder_dropout: float
-) -> None:
+def _check(shape: MitShape) -> None:
     """Refuse sizes that do not fit each other, naming the key."""
-    check_range("model.drop_path_rate", drop_path_rate, 0, 0.999)
-    check_range("model.decoder_dropout", decoder_dropout, 0, 0.999)
-    if min(*shape.depths, *shape.sr_ratios) < 1:
+    if min(int(dim * shape.mlp_ratio) for dim in shape.embed_dims) < 1:
         raise InputError(
-            "model.depths and model.sr_ratios must be at least 1 in every stage, got "
-            f"{shape.depths} and {shape.sr_ratios}."
-        )
-    if min(decoder_dim, *(int(dim * shape.mlp_ratio) for dim in shape.embed_dims)) < 1:
-        raise InputError(
-            "model.decoder_dim, model.embed_dims and model.mlp_ratio must be positive, got "
-            f"{decoder_dim}, {shape.embed_dims} and {shape.mlp_ratio:g}."
+            f"model.mlp_ratio={shape.mlp_ratio:g} leaves no channel of model.embed_dims="
+            f"{list(shape.embed_dims)}; choose a larger ratio, such as 4."
         )
     for stage, (dim, heads) in enumerate(zip(shape.embed_dims, shape.num_heads, strict=True)):
-        if heads < 1 or dim % heads:
+        if dim % heads:
             raise InputError(
                 f"model.num_heads[{stage}] = {heads} must divide the {dim} channels of "
                 f"model.embed_dims[{stage}]."

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval, Len
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_choice
-from rgbt.models.upsampling import DropRates, UpBlock, check_rates, enlarge
+from rgbt.checks import InputError
+from rgbt.models.upsampling import DropRates, UpBlock, enlarge
 
 Decoder = Literal["basic", "modified_released", "modified_thesis"]
-DECODERS = ("basic", "modified_released", "modified_thesis")
+
+Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64)]
+"""Dilations."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +36,16 @@ class HeadShape:
     in_channels: int
     num_classes: int
     decoder: Decoder
-    rates: tuple[int, ...]
-    summed_rates: tuple[int, ...]
+    rates: Rates
+    summed_rates: Rates
     dropout: DropRates
     align_corners: bool
 
     def __post_init__(self) -> None:
-        check_choice("model.decoder", self.decoder, DECODERS)
-        check_rates(self.dropout)
         summed = set(self.summed_rates)
-        if min(self.rates, default=0) < 1 or len(set(self.rates)) < len(self.rates):
-            raise InputError(f"model.rates needs different dilations >= 1, got {self.rates}.")
-        if not summed or not summed <= set(self.rates) or len(summed) < len(self.summed_rates):
+        if len(set(self.rates)) < len(self.rates):
+            raise InputError(f"model.rates needs different dilations, got {self.rates}.")
+        if not summed <= set(self.rates) or len(summed) < len(self.summed_rates):
             raise InputError(
                 f"model.summed_rates must name some of model.rates {self.rates}, each once, "
                 f"got {self.summed_rates}."

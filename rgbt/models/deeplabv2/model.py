@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
+from annotated_types import Len
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import BaseWidth, Depths, InputError, Names, NumClasses, check_choice
 from rgbt.geometry.padding import padded_hw
 from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
-from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid
+from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid, Rates
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.upsampling import DropRates
 from rgbt.types import MaskPair, Output, Predicts, View
@@ -58,27 +61,25 @@ class DeepLabV2(nn.Module):
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
         *,
-        num_classes: int,
-        depths: tuple[int, int, int, int],
-        base_width: int,
+        num_classes: NumClasses,
+        depths: Depths,
+        base_width: BaseWidth,
         ceil_mode: bool,
         train_norm: TrainNorm,
-        heads: tuple[str, ...],
+        heads: Annotated[Names, Len(1, 100)],
         auxiliary: bool,
         decoder: Decoder,
-        rates: tuple[int, ...],
-        summed_rates: tuple[int, ...],
+        rates: Rates,
+        summed_rates: Rates,
         dropout: DropRates,
         align_corners: bool,
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        check_range("model.base_width", base_width, 1, 4096)
         shape = HeadShape(
             32 * base_width, num_classes, decoder, rates, summed_rates, dropout, align_corners
         )
-        _check(depths, heads, inputs)
-        check_choice("model.train_norm", train_norm, ("all", "statistics"))
+        _check(heads, inputs)
         if ceil_mode and decoder != "basic":
             raise InputError(
                 f"model.decoder={decoder} enlarges 8 times, which comes back to the size of the "
@@ -149,12 +150,10 @@ class DeepLabV2(nn.Module):
         return scores[..., : image_hw[0], : image_hw[1]]
 
 
-def _check(depths: tuple[int, ...], heads: tuple[str, ...], inputs: Inputs) -> None:
+def _check(heads: tuple[str, ...], inputs: Inputs) -> None:
     """Refuse what the parts cannot be built from, naming the key."""
-    if min(depths) < 1:
-        raise InputError(f"model.depths needs at least one block per stage, got {depths}.")
     usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
-    if not heads or len(set(heads)) < len(heads) or not usable:
+    if len(set(heads)) < len(heads) or not usable:
         raise InputError(
             "model.heads needs different names made of letters, such as [main] or "
             f"[source, target], got {list(heads)}."

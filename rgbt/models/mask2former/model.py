@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice, check_range
+from rgbt.checks import (
+    Blocks,
+    Channels,
+    Depths,
+    InputError,
+    MlpRatio,
+    NumClasses,
+    ShareBelowOne,
+    Widths,
+    check_choice,
+)
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
@@ -72,28 +83,28 @@ class Mask2Former(nn.Module):
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
         *,
-        num_classes: int,
-        embed_dim: int,
-        depths: tuple[int, int, int, int],
-        num_heads: tuple[int, int, int, int],
-        window_size: int,
-        mlp_ratio: float,
-        drop_path_rate: float,
-        share_start: int,
+        num_classes: NumClasses,
+        embed_dim: Channels,
+        depths: Depths,
+        num_heads: Widths,
+        window_size: Annotated[int, Interval(ge=1, le=1024)],
+        mlp_ratio: MlpRatio,
+        drop_path_rate: ShareBelowOne,
+        share_start: Annotated[int, Interval(ge=0, le=4)],
         fusion: Literal["max", "add"],
-        hidden_dim: int,
-        num_queries: int,
-        encoder_layers: int,
-        encoder_ffn_dim: int,
-        decoder_layers: int,
-        decoder_ffn_dim: int,
-        attention_heads: int,
+        hidden_dim: Channels,
+        num_queries: Annotated[int, Interval(ge=1, le=10_000)],
+        encoder_layers: Blocks,
+        encoder_ffn_dim: Channels,
+        decoder_layers: Blocks,
+        decoder_ffn_dim: Channels,
+        attention_heads: Channels,
         pixel_decoder_fp32: bool,
         inputs: Inputs,
     ) -> None:
         super().__init__()
         shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
-        _check(shape, share_start, fusion, hidden_dim, attention_heads)
+        _check(shape, hidden_dim, attention_heads)
         self.num_classes = num_classes
         self.drop_path_rate = drop_path_rate
         self.backbone = RgbtBackbone(
@@ -236,13 +247,8 @@ def _check_passes(count: int, passes: int, views: tuple[View, ...]) -> None:
         check_choice("view", view, VIEWS)
 
 
-def _check(shape: SwinShape, share_start: int, fusion: str, hidden: int, heads: int) -> None:
+def _check(shape: SwinShape, hidden: int, heads: int) -> None:
     """Refuse sizes that do not fit each other, naming the key."""
-    check_range("model.share_start", share_start, 0, 4)
-    check_range("model.drop_path_rate", shape.drop_path_rate, 0, 0.999)
-    check_choice("model.fusion", fusion, ("max", "add"))
-    if min(shape.depths) < 1:
-        raise InputError(f"model.depths needs at least one block per stage, got {shape.depths}.")
     if hidden % GROUPS or hidden % heads:
         raise InputError(
             f"model.hidden_dim must be a multiple of {GROUPS} and of model.attention_heads "

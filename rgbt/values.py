@@ -1,0 +1,193 @@
+"""One value of a configuration against its annotation: type and range, refused in one sentence.
+
+The range of a setting is declared once, in the annotations of the constructor that takes it
+(aliases in `rgbt.checks`); sentences are made of these annotations. Part of `rgbt.config`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from functools import cache
+from typing import Any
+
+from annotated_types import DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, MultipleOf
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+
+Place = tuple[int | str, ...]
+"""Where in a value: indices of lists and keys of mappings."""
+
+NAMES: dict[Any, str] = {
+    **{float: "a number", int: "a whole number", str: "a text", bool: "true or false"},
+    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list"},
+    Any: "a finite value",
+}
+
+SHOWN = 80
+"""Characters of a refused value that a sentence quotes."""
+
+
+def check_value(path: str, value: Any, annotation: Any) -> Any:
+    """`value` as the annotated type; as in JSON, a list may be a tuple and an int a float.
+
+    NaN and infinity are refused whatever the annotation is.
+
+    Args:
+        path: key of the value, for messages.
+        value: plain, or a list or mapping of OmegaConf.
+        annotation: a type with `annotated_types` that give its range.
+
+    Raises:
+        InputError: another type, or a value out of its range: key, range and value.
+    """
+    import pydantic  # not at the top: --help does not need it
+
+    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    infinite = _not_finite(plain)
+    if infinite is not None:
+        raise InputError(_refusal(path, plain, annotation, infinite))
+    try:
+        return _adapter(annotation).validate_json(json.dumps(plain), strict=True)
+    except pydantic.errors.PydanticSchemaGenerationError:
+        raise InputError(
+            f"'{path}' takes an object, not {_shown(plain)}: give a mapping with `_target_`, or "
+            "omit it where the run itself provides it."
+        ) from None
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        if first["type"] == "value_error":  # a check of the type's own, which has its sentence
+            raise InputError(f"'{path}': {first['ctx']['error']}") from None
+        raise InputError(_refusal(path, plain, annotation, first["loc"])) from None
+
+
+@cache
+def _adapter(annotation: Any) -> Any:
+    import pydantic
+
+    return pydantic.TypeAdapter(annotation)
+
+
+def _not_finite(value: Any) -> Place | None:
+    """Where NaN or infinity is; None where there is neither."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return ()
+    parts = dict(enumerate(value)) if isinstance(value, list) else value
+    items = parts.items() if isinstance(parts, dict) else ()
+    found = ((key, _not_finite(part)) for key, part in items)
+    return next(((key, *place) for key, place in found if place is not None), None)
+
+
+def _refusal(path: str, value: Any, annotation: Any, place: Place) -> str:
+    """The sentence about the innermost part at `place` whose type is known."""
+    for step in () if "[key]" in place else place:
+        inner = _part_type(annotation, step)
+        if inner is None or not _holds(value, step):
+            break
+        annotation, value = inner, value[step]
+        path += f"[{step}]" if isinstance(step, int) else f".{step}"
+    return f"'{path}' must be {expected(annotation)}, got {_shown(value)}."
+
+
+def _holds(value: Any, step: int | str) -> bool:
+    if isinstance(value, list):
+        return isinstance(step, int) and step < len(value)
+    return isinstance(value, dict) and step in value
+
+
+def _part_type(annotation: Any, step: int | str) -> Any:
+    """Annotation of a part of a value; None where the types do not say."""
+    members = [each for each in _members(_bare(annotation)) if each is not type(None)]
+    if len(members) != 1:
+        return None
+    kind = _bare(members[0])
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple and isinstance(step, int):
+        return args[0] if args[-1] is ... else args[min(step, len(args) - 1)]
+    if origin is dict:
+        return args[1]
+    if dataclasses.is_dataclass(kind):
+        return typing.get_type_hints(kind, include_extras=True).get(str(step))
+    return None
+
+
+def _bare(annotation: Any) -> Any:
+    is_annotated = typing.get_origin(annotation) is typing.Annotated
+    return typing.get_args(annotation)[0] if is_annotated else annotation
+
+
+def _members(annotation: Any) -> tuple[Any, ...]:
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
+
+
+def expected(annotation: Any) -> str:
+    """What an annotation takes, in words: "a number from 0 to 1, or null"."""
+    limits: list[Any] = []
+    if typing.get_origin(annotation) is typing.Annotated:
+        annotation, *limits = typing.get_args(annotation)
+        flat = (each if isinstance(each, GroupedMetadata) else (each,) for each in limits)
+        limits = [limit for group in flat for limit in group]
+    members = _members(annotation)
+    if len(members) > 1:
+        words = [expected(each) for each in members if each is not type(None)]
+        return " or ".join(words) + (", or null" if type(None) in members else "")
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Literal:
+        return _one_of([repr(each) for each in args])
+    if origin is tuple:
+        return _list(args, limits)
+    if origin is dict:
+        return f"a mapping whose values are each {expected(args[1])}"
+    if dataclasses.is_dataclass(annotation):
+        return "a mapping with " + ", ".join(each.name for each in dataclasses.fields(annotation))
+    return f"{NAMES.get(annotation, 'a mapping with `_target_`')}{_range(limits)}{_remarks(limits)}"
+
+
+def _one_of(words: list[str]) -> str:
+    return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
+
+
+def _list(args: tuple[Any, ...], limits: list[Any]) -> str:
+    if args[-1] is ...:
+        return f"a list{_range(limits)}{_remarks(limits)}, each {expected(args[0])}"
+    count = f"a list of {len(args)}{_remarks(limits)}"
+    if len(set(args)) == 1:
+        return f"{count}, each {expected(args[0])}"
+    return f"{count}: {'; '.join(map(expected, args))}"
+
+
+def _range(limits: list[Any]) -> str:
+    """Bounds of a number, or of how much a list or text holds."""
+    bound = {type(each): each for each in limits}
+    least, most = bound.get(MinLen), bound.get(MaxLen)
+    if least and most:
+        return f" of {least.min_length} to {most.max_length}"
+    if Ge in bound and Le in bound:
+        return f" from {_number(bound[Ge].ge)} to {_number(bound[Le].le)}"
+    words = [
+        *(f"at least {_number(each.ge)}" for each in limits if isinstance(each, Ge)),
+        *(f"above {_number(each.gt)}" for each in limits if isinstance(each, Gt)),
+        *(f"at most {_number(each.le)}" for each in limits if isinstance(each, Le)),
+        *(f"below {_number(each.lt)}" for each in limits if isinstance(each, Lt)),
+    ]
+    return f" {' and '.join(words)}" if words else ""
+
+
+def _number(value: Any) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def _remarks(limits: list[Any]) -> str:
+    words = [f"multiples of {each.multiple_of}" for each in limits if isinstance(each, MultipleOf)]
+    words += [each.documentation for each in limits if isinstance(each, DocInfo)]
+    return f" ({', '.join(words)})" if words else ""
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
