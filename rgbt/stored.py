@@ -117,6 +117,8 @@ def open_run(
     for key, value in _plain(defaults.data).items():
         if key not in config.data:
             config.data[key] = value
+    if "absent" not in config.dataset:  # a run from before data sets had a convention
+        config.dataset.absent = config.metric.absent
     trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
@@ -167,7 +169,13 @@ def _plain(node: DictConfig) -> dict[str, Any]:
 
 
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
-    """Apply overrides in place: groups first, then single values."""
+    """Apply overrides in place: groups first, then single values.
+
+    Absent classes count by the convention of the data set that is measured, unless the run or
+    `pairs` set ``metric.absent`` by hand.
+    """
+    by_hand = config.metric.absent != config.dataset.absent
+    absent = config.metric.absent
     search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
     pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]
     for key, _ in pairs:
@@ -190,6 +198,8 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
             open_ones = [each for each in known if _is_changeable(each)]
             raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
         OmegaConf.update(config, key, _parsed(key, value))
+    if "metric.absent" not in [_place(key) for key, _ in pairs]:
+        config.metric.absent = absent if by_hand else config.dataset.get("absent", "exclude")
 
 
 def _is_changeable(place: str) -> bool:

@@ -146,7 +146,7 @@ def _differences(images: Images, asked: Sequence[Asked], *, paired: bool) -> Ite
     swapped_a, swapped_b = images.swapped(asked)
     every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
     for each, rows_a, rows_b, swapped in every:
-        first, second = estimate_of(images, *rows_a), estimate_of(images, *rows_b)
+        first, second = (estimate_of(images, each, *rows) for rows in (rows_a, rows_b))
         value = second.value - first.value
         plain = Difference(
             metric=each.metric, a=first, b=second, value=value, p_images=swap_p(value, swapped)
