@@ -95,7 +95,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     grid = replace(comparison_grid(comparison, labels), notes=notes)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
-    show(escape("\n".join([said, *part_lines(comparison), remark(settings)])))
+    below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
+    show(escape("\n".join(filter(None, below))))
     if out is not None:
         _write(out, grid, said, comparison)
     return 0

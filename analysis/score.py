@@ -278,6 +278,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
 
     found: dict[Cell, tuple[float, float]] = {}
     drawn: dict[str, str] = {}
+    reason = ""
     for absent, part in product(table.conventions(), table.num_images):
         named = interval_cells(table, absent)[part]
         try:
@@ -291,6 +292,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
             if each.images is not None:
                 found[named[metric]] = (each.images.low, each.images.high)
         drawn[part] = f"of {estimates[OF_PARTS[part]].said}"
+        reason = estimates[OF_PARTS[part]].reason if part == "all" else reason
     whole_split = drawn.pop("all")
     if not found:
         return replace(
@@ -300,7 +302,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
         f"(percentile, of Var without its bias; {settings.resamples} resamples "
-        f"{whole_split}{parts})."
+        f"{whole_split}{parts}). {reason}".rstrip()
     )
     return with_intervals(table, found, said)
 

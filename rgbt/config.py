@@ -22,7 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
-from rgbt.metrics.metric import Absent
 
 TOP_LEVEL: dict[str, Any] = {
     **{"seed": int, "name": str, "runs_dir": str, "out": str | None, "pretrained": str | None},
@@ -36,7 +35,7 @@ NODES = (
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
     "model": {"weights": str | None, "fresh": tuple[str, ...]},
-    "dataset": {"absent": Absent},
+    "dataset": {"absent": typing.Literal["released", "exclude"]},
 }
 """Keys of a node that the run reads itself and the constructor does not take, by node."""
 

@@ -73,6 +73,7 @@ class Comparison:
         differences: in the order of the metrics asked for.
         images: number of images.
         said: how they were drawn, e.g. "393 single images".
+        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
         partition: of the regions, e.g. "ring5".
         level: of the intervals.
     """
@@ -82,6 +83,7 @@ class Comparison:
     said: str
     partition: str
     level: float
+    reason: str = ""
 
 
 def compare(
@@ -138,6 +140,7 @@ def compare(
         said=main.blocks.said,
         partition=a[0].partition,
         level=settings.level,
+        reason=main.blocks.reason,
     )
 
 

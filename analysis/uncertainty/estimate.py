@@ -40,6 +40,7 @@ class Estimate:
         both: interval over images and seeds (Student with Satterthwaite's degrees of freedom, not
             narrower than `trainings`); None where one of the two is.
         said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
+        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
     """
 
     value: float
@@ -49,6 +50,7 @@ class Estimate:
     trainings: Interval | None
     both: Interval | None
     said: str
+    reason: str = ""
 
 
 def estimate(
@@ -92,9 +94,8 @@ def estimate_of(
     settings, value = images.settings, float(points.mean())
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
-    is_variance = asked.score == names.VAR
-    bias = float(np.nanmean(resampled)) - value if is_variance and around is not None else 0.0
-    if is_variance and around is not None and settings.method == "auto":
+    if asked.score == names.VAR and around is not None and settings.method == "auto":
+        bias = float(np.nanmean(resampled)) - value
         around = corrected(value, bias, image_spread(images, resampled), level)
     spread = over_seeds(points)
     trainings = both = None
@@ -102,7 +103,7 @@ def estimate_of(
         trainings = corrected(value, 0.0, spread, level)
         if around is not None:
             whole = together(image_spread(images, resampled), spread)
-            both = corrected(value, bias, widest(level, whole, spread), level)
+            both = corrected(value, 0.0, widest(level, whole, spread), level)
     return Estimate(
         value=value,
         sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),
@@ -111,6 +112,7 @@ def estimate_of(
         trainings=trainings,
         both=both,
         said=images.blocks.said,
+        reason=images.blocks.reason,
     )
 
 

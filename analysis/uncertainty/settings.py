@@ -28,8 +28,9 @@ class Resampling:
             (`analysis.uncertainty.intervals.corrected`); docs/analysis.md has the measurements.
         blocks: what is drawn together, because neighbouring frames show nearly the same:
             "none" single images; a number: that many neighbours; "sequence": whole sequences (names
-            that are equal but for one number); "auto": as many neighbours as the scores of
-            the images are correlated over (Politis and White, 2004).
+            that are equal but for one number); "auto": runs of consecutively numbered frames, cut
+            where one is too long for that at the distance over which the scores of the images are
+            correlated (Politis and White, 2004).
         seed: of the draws.
         absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
             say (`rgbt.metrics.counts.Counts.absent`).
