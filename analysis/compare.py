@@ -6,6 +6,7 @@ One table and one sentence: the differences with intervals and p-values, over im
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from analysis.results import Frames, Stored
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
+    from rgbt.metrics.metric import Absent
     from rgbt.tracking.tables import Grid
 
 OWN = {
@@ -30,9 +32,9 @@ OWN = {
     "missing": "refuse",
     "level": "0.95",
     "resamples": "10000",
-    "method": "percentile",
+    "method": "auto",
     "blocks": "auto",
-    "absent": "released",
+    "absent": "as counted",
     "seed": "0",
     "runs_dir": "runs",
     "out": "",
@@ -54,9 +56,11 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               degradation=noise severity=16
     missing   refuse, or leave_out: compare the images that both hold
     level     of the intervals;  resamples: their number;  seed: of the draws
-    method    percentile or bca: how intervals over images are taken from the resamples
+    method    how intervals over images are taken from the resamples: percentile or bca; auto:
+              percentile, for the variance of one method without its bias
     blocks    images drawn together: auto, none, sequence, or a number of neighbouring frames
-    absent    released: a class without a pixel scores 0; exclude: it is left out of means
+    absent    released: a class without a pixel scores 0; exclude: it is left out of means;
+              default: as counted, by the convention of the data set
     split     of runs; default: test
     out       folder for comparison.md and comparison.csv
     """
@@ -87,10 +91,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     comparison = compare(a, b, metrics, settings)
     failing = " ".join(word for word in (degradation, severity) if word)
     labels = [f"{label} ({failing})" if failing else label for label in _labels(opened)]
-    grid = comparison_grid(comparison, labels)
+    notes = absent_classes([*a, *b], settings.absent)
+    grid = replace(comparison_grid(comparison, labels), notes=notes)
     said = sentence(comparison, *labels)
     show(rich_table(grid))
-    show(escape("\n".join([said, *part_lines(comparison), remark(settings)])))
+    below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
+    show(escape("\n".join(filter(None, below))))
     if out is not None:
         _write(out, grid, said, comparison)
     return 0
@@ -105,13 +111,14 @@ def settings_of(arguments: dict[str, str]) -> Resampling:
     from analysis.uncertainty.settings import Method, Resampling
     from rgbt.metrics.metric import Absent
 
+    absent = arguments["absent"]
     return Resampling(
         resamples=whole("resamples", arguments["resamples"], 100, MOST),
         level=decimal("level", arguments["level"], "0.95"),
         method=cast(Method, arguments["method"]),
         blocks=blocks_of(arguments["blocks"]),
         seed=whole("seed", arguments["seed"], 0, 2**31),
-        absent=cast(Absent, arguments["absent"]),
+        absent=None if absent == OWN["absent"] else cast(Absent, absent),
     )
 
 
@@ -182,10 +189,32 @@ def part_lines(comparison: Comparison) -> list[str]:
     return [f"{part}: {said}." for part, said in drawn.items() if part is not None]
 
 
+def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
+    """Footnotes about classes that are absent from the counts of both methods.
+
+    Args:
+        every: counts of both methods, of the same images.
+        absent: convention of the table; None: that of the counts.
+    """
+    import numpy as np
+
+    from rgbt.metrics.absent import absent_notes
+    from rgbt.metrics.counts import convention
+    from rgbt.metrics.pairs import protocol_of
+
+    first = every[0]
+    if protocol_of(first.partition) is not None:
+        return ()  # matrices of pairs of frames have no labels as rows
+    summed = np.sum([counts.by_region() for counts in every], axis=0)
+    used = absent or convention(every)
+    return absent_notes(summed, first.classes, first.scored, first.split, used)
+
+
 def remark(settings: Resampling) -> str:
     """How the numbers of the table were made, in one line."""
+    method = "percentile" if settings.method == "auto" else settings.method
     return (
-        f"Percent points (Var: squared). Intervals: {settings.method}, {settings.resamples} "
+        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
         "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
         "Holm: corrected for the number of lines."
     )

@@ -22,7 +22,7 @@ from analysis.arguments import (
 )
 from analysis.bar import progress
 from rgbt.checks import InputError, check_choice
-from rgbt.command import plain_command
+from rgbt.command import built, plain_command
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
@@ -211,7 +211,8 @@ def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
     from analysis.predictions.scoring import score_folder
 
     refuse_others(overrides, ("dataset",), list(OWN))
-    dataset, options = dataset_of(overrides), _options(arguments)
+    dataset, absent = dataset_of(overrides), built("metric", overrides).absent
+    options = replace(_options(arguments), absent=absent)
     folder, split = Path(arguments["predictions"]), arguments["split"] or "test"
     with progress("counting", len(dataset.names(split))) as advance:
         return score_folder(folder, dataset, split, options, advance)
@@ -277,6 +278,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
 
     found: dict[Cell, tuple[float, float]] = {}
     drawn: dict[str, str] = {}
+    reason = ""
     for absent, part in product(table.conventions(), table.num_images):
         named = interval_cells(table, absent)[part]
         try:
@@ -290,6 +292,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
             if each.images is not None:
                 found[named[metric]] = (each.images.low, each.images.high)
         drawn[part] = f"of {estimates[OF_PARTS[part]].said}"
+        reason = estimates[OF_PARTS[part]].reason if part == "all" else reason
     whole_split = drawn.pop("all")
     if not found:
         return replace(
@@ -298,7 +301,8 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     parts = "".join(f"; {part} {said}" for part, said in drawn.items())
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"({settings.method}, {settings.resamples} resamples {whole_split}{parts})."
+        f"(percentile, of Var without its bias; {settings.resamples} resamples "
+        f"{whole_split}{parts}). {reason}".rstrip()
     )
     return with_intervals(table, found, said)
 

@@ -40,6 +40,7 @@ NODES = (
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
+    "dataset": {"absent": typing.Literal["released", "exclude"]},
 }
 """Keys of a node that the run reads itself and the constructor does not take, by node."""
 

@@ -27,13 +27,14 @@ DOMAINS = ("source", "target")
 
 NOT_IN_KEY = (
     *("name", "runs_dir", "out", "scale", "recipe", "tracking", "consistency"),
-    *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout"),
+    *("dataset.root", "dataset.cache_dir", "dataset.palette", "dataset.layout", "dataset.absent"),
     *("data.num_workers", "data.on_error", "data.eval_batch_size"),
     *("data.prefetch", "data.augment", "data.cache"),
     *("trainer.accelerator", "trainer.log_every", "trainer.checkpoint_every"),
 )
 """What may differ between two runs that are the same run: labels, paths, hardware, tracking, what
-is measured beside, and the sizes of `scale` and `recipe`, which count where others take them up."""
+is measured beside, and what counts where others take it up: the sizes of `scale` and `recipe`, and
+`dataset.absent` in `metric.absent`."""
 
 LATER: dict[str, Any] = {
     "trainer.tested": "best",

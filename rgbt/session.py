@@ -31,6 +31,7 @@ from rgbt.engine.progress import progress
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
 from rgbt.metrics import scores
+from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
@@ -287,6 +288,7 @@ def evaluate(
         dataset=dataset.fingerprint(),
         split=split,
         unscored=dataset.unscored,
+        absent=session.regions.absent,
     )
     return Evaluation(counts, tuple(kept), tuple(batches.skipped))
 
@@ -327,6 +329,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
             subset_mious={part: float(value) for part, value in parts.items()},
             unscored=counts.unscored,
+            notes=absent_notes(by_region, counts.classes, scored, counts.split, absent),
         ),
     )
 

@@ -125,6 +125,8 @@ def open_run(
             config.data[key] = value
     if config.trainer.threads is None:  # of before it had a number: one thread per core
         config.trainer.threads = defaults.trainer.threads
+    if "absent" not in config.dataset:  # a run from before data sets had a convention
+        config.dataset.absent = config.metric.absent
     trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
@@ -174,7 +176,13 @@ def _plain(node: DictConfig) -> dict[str, Any]:
 
 
 def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
-    """Apply overrides in place: groups first, then single values."""
+    """Apply overrides in place: groups first, then single values.
+
+    Absent classes count by the convention of the data set that is measured, unless the run or
+    `pairs` set ``metric.absent`` by hand.
+    """
+    by_hand = config.metric.absent != config.dataset.absent
+    absent = config.metric.absent
     search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
     pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]
     for key, _ in pairs:
@@ -197,6 +205,8 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
             open_ones = [each for each in known if _is_changeable(each)]
             raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
         OmegaConf.update(config, key, parse_yaml(value, key))
+    if "metric.absent" not in [_place(key) for key, _ in pairs]:
+        config.metric.absent = absent if by_hand else config.dataset.get("absent", "exclude")
 
 
 def _is_changeable(place: str) -> bool:

@@ -296,6 +296,7 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
         dataset=dataset.fingerprint(),
         split=split,
         unscored=dataset.unscored,
+        absent=session.regions.absent,
     )
 
 

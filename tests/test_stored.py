@@ -7,10 +7,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt import stored
 from rgbt.checks import InputError
+from rgbt.config import conf_dir
 from rgbt.session import names_key
+from tests.composed import composed
 
 
 def session(**splits: tuple[str, ...]) -> SimpleNamespace:
@@ -51,3 +54,45 @@ def test_without_a_note_nothing_is_told(tmp_path: Path, said: list[str]) -> None
     (tmp_path / "dataset.json").write_text("{")
     stored._tell_other_splits(tmp_path, "rig", session(train=("a",), test=("b",)))
     assert said == []
+
+
+def resolved(*overrides: str) -> DictConfig:
+    """A configuration as a run stores it."""
+    config = OmegaConf.create(OmegaConf.to_container(composed(overrides), resolve=True))
+    assert isinstance(config, DictConfig)
+    return config
+
+
+OTHER = (("dataset", "synth_kp"), ("dataset.absent", "exclude"))
+
+
+@pytest.mark.parametrize(
+    ("trained", "pairs", "expected"),
+    [
+        ((), (), "released"),
+        # Another data set brings its convention; another partition changes none.
+        ((), OTHER, "exclude"),
+        (("dataset.absent=exclude",), (("dataset", "synth_kp"),), "released"),
+        (("dataset.absent=exclude",), (("metric", "ring9"),), "exclude"),
+        # By hand, of the run or of the command that measures it.
+        (("metric.absent=exclude",), (("dataset", "synth_kp"),), "exclude"),
+        ((), (("metric", "ring9"), ("metric.absent", "exclude")), "exclude"),
+    ],
+)
+def test_absent_classes_of_a_stored_run_count_as_the_measured_data_set_says(
+    trained: tuple[str, ...], pairs: tuple[tuple[str, str], ...], expected: str
+) -> None:
+    config = resolved(*trained)
+    stored._override(config, list(pairs))
+    assert config.metric.absent == expected
+
+
+def test_a_data_set_of_its_own_class_leaves_absent_classes_out() -> None:
+    config = composed(())
+    assert config.metric.absent == "released"
+    del config.dataset.absent
+    assert config.metric.absent == "exclude"
+    for path in sorted((conf_dir() / "dataset").glob("*.yaml")):
+        text = path.read_text()
+        expected = "exclude" if path.stem == "folder" else "released"
+        assert f"\nabsent: {expected} #" in text or "_target_" not in text, path

@@ -42,7 +42,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     layout       rows or columns: one row, or one column, per image
     format       of predictions: auto, index or colour; suffix: NAME<suffix>.png
     regions      number of regions of each partition of spatialseg/fig2 (5)
-    absent       how a class without pixels counts: released (0) or exclude
+    absent       how a class without pixels counts: released (0) or exclude; default: as counted
     estimator    of the noise: immerkaer, wavelet_mad or std; average: pooled or images
     patches      sizes of the patches of crm/fig5 (8,16,32,64); seed: of the masks (0)
     band         interval over: widest, images, seeds or both; with resamples (10000), level (0.95)

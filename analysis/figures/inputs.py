@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from analysis.arguments import MOST, decimal, whole
 from analysis.bar import progress
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from analysis.statistics.data import SpatialStatistics
     from rgbt.data.dataset import LabelledDataset
     from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Regions
+    from rgbt.metrics.metric import Absent, Regions
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,18 @@ class Given:
         value = self.get(key, known[0])
         check_choice(key, value, known)
         return value
+
+    def absent(self, every: Iterable[Counts]) -> Absent:
+        """The convention for absent classes of ``absent=``; without it that of the counts.
+
+        Raises:
+            InputError: no such convention, or counts made with both.
+        """
+        from rgbt.metrics.counts import convention
+
+        if "absent" not in self.values:
+            return convention(every)
+        return cast("Absent", self.choice("absent", ("released", "exclude")))
 
     def number(self, key: str, default: int) -> int:
         """A whole number of at least 1 (a seed: at least 0)."""

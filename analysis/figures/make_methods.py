@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from analysis.figures.robustness import Panel
     from analysis.predictions.images import Reader
 
-ABSENT = ("released", "exclude")
 LEAST, MOST_PIXELS = 16, 4096
 """Pixels of a side of ``size=``."""
 
@@ -91,8 +90,9 @@ def region_heat(given: Given) -> Figure:
     from analysis.figures import profiles, regions
 
     image_hw = _image_hw(given.get("size", "480x640"))
-    absent: Any = given.choice("absent", ABSENT)
-    methods = [profiles.means_only(label, seeds, absent) for label, seeds in given.runs().items()]
+    runs = given.runs()
+    absent = given.absent(counts for seeds in runs.values() for counts in seeds)
+    methods = [profiles.means_only(label, seeds, absent) for label, seeds in runs.items()]
     return regions.draw_heat(regions.region_heat(methods, image_hw))
 
 
@@ -136,14 +136,14 @@ def _failing(given: Given) -> tuple[Panel, ...]:
     from analysis.robustness import Training, trainings
 
     runs_dir, split = given.get("runs_dir", "runs"), given.get("split", "")
-    absent: Any = given.choice("absent", ABSENT)
     found: dict[str, list[Training]] = {}
     for word in split_words(given.need("runs", "runs or groups; label:run names one")):
         label, colon, place = word.partition(":")
         for each in trainings(place if colon else label, Path(runs_dir).expanduser(), split):
             found.setdefault(label if colon else each.label, []).append(each)
     rows = [word.strip() for word in given.get("degradations", "").split(",") if word.strip()]
-    return panels(found, absent, rows)
+    levels = (level for each in found.values() for training in each for level in training.levels)
+    return panels(found, given.absent(level.counts for level in levels), rows)
 
 
 def region_profile(given: Given) -> Figure:
@@ -158,14 +158,13 @@ def _profiles(given: Given) -> list[Profile]:
     from analysis.uncertainty import Resampling
 
     band: Any = given.choice("band", BANDS)
-    absent: Any = given.choice("absent", ABSENT)
+    methods = given.runs()
     settings = Resampling(
         resamples=given.number("resamples", 10_000),
         level=given.fraction("level", 0.95),
         blocks=blocks_of(given.get("blocks", "auto")),
-        absent=absent,
+        absent=given.absent(counts for seeds in methods.values() for counts in seeds),
     )
-    methods = given.runs()
     made = []
     with progress("resampling", len(methods)) as advance:
         for label, seeds in methods.items():

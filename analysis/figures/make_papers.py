@@ -13,7 +13,6 @@ from rgbt.checks import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ABSENT = ("released", "exclude")
 PARTS = ("all", "day", "night")
 STRIPS_AND_RINGS = ("vertical", "horizontal", "ring")
 
@@ -51,8 +50,9 @@ def spatialseg_fig2(given: Given) -> Figure:
     from analysis.figures.maps import occupancy_over
     from rgbt.metrics.metric import Regions
 
-    regions, absent = given.number("regions", 5), given.choice("absent", ABSENT)
+    regions = given.number("regions", 5)
     counts = {each: given.counts("methods", f"{each}{regions}") for each in STRIPS_AND_RINGS}
+    absent = given.absent(each for methods in counts.values() for each in methods.values())
     statistics = given.statistics()
     hw = statistics.region_map.shape
     of_methods = next(iter(counts["ring"].values()))
@@ -81,7 +81,7 @@ def spatialseg_fig3(given: Given) -> Figure:
             raise InputError(f"methods: {given.figure} shows one method, got {len(methods)}.")
         method = next(iter(methods.items()))
         check_one_dataset(statistics, method[1])
-    absent: Any = given.choice("absent", ABSENT)
+    absent = given.absent([method[1]]) if method else "released"
     made = classes.class_regions(statistics, given.choice("part", PARTS), method, absent)
     return classes.draw(made, splits=(statistics.split, method[1].split if method else ""))
 
@@ -143,8 +143,9 @@ def temporal_fig5(given: Given) -> Figure:
     from analysis.figures import consistency
 
     frames: Any = given.choice("frames", ("aligned", "released", "next"))
-    absent: Any = given.choice("absent", ABSENT)
-    return consistency.draw(consistency.class_consistency(given.runs(frames), absent))
+    runs = given.runs(frames)
+    absent = given.absent(counts for seeds in runs.values() for counts in seeds)
+    return consistency.draw(consistency.class_consistency(runs, absent))
 
 
 def multihead_fig3(given: Given) -> Figure:

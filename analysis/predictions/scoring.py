@@ -21,7 +21,7 @@ from rgbt.checks import InputError, check_choice
 from rgbt.data.dataset import LabelledDataset
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.metric import Regions
+from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.regions import Partition
 
 Resize = Literal["refuse", "nearest"]
@@ -45,6 +45,7 @@ class Options:
         suffix: files are called NAME + suffix + ".png".
         name: of the method; "": the folder's name.
         threads: that read and count; 0: one per core.
+        absent: convention for absent classes of the data set, stored with the counts.
     """
 
     partitions: tuple[Partition, ...] = PARTITIONS
@@ -55,11 +56,13 @@ class Options:
     suffix: str = ""
     name: str = ""
     threads: int = 0
+    absent: Absent = "released"
 
     def __post_init__(self) -> None:
         for partition in self.partitions:
             check_choice("partition", partition, PARTITIONS)
         check_choice("format", self.form, get_args(Format))
+        check_choice("absent", self.absent, get_args(Absent))
         check_choice("missing", self.missing, get_args(Missing))
         check_choice("resize", self.resize, get_args(Resize))
 
@@ -132,6 +135,7 @@ def score_folder(
                 dataset=fingerprint,
                 split=split,
                 unscored=dataset.unscored,
+                absent=options.absent,
             )
             for by_image, counter in zip(counts, counting.counters, strict=True)
         ),

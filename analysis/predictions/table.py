@@ -94,9 +94,10 @@ class ScoreTable:
     scores: Mapping[Cell, Score]
     intervals: str = ""
     unscored: tuple[str, ...] = ()
+    absent: Absent = "released"
 
     def conventions(self, metric: Metric | None = None) -> tuple[Absent, ...]:
-        """Both where a mean differs between them, else "released" alone.
+        """Both where a mean differs between them, that of the data set first; else that one alone.
 
         Args:
             metric: look at this one over all images; None: at all of them, day and night too.
@@ -107,7 +108,8 @@ class ScoreTable:
             if cell.class_name is None
             and (metric is None or (cell.metric, cell.images) == (metric, ALL))
         )
-        return CONVENTIONS[:1] if same else CONVENTIONS
+        both = (self.absent, *(each for each in CONVENTIONS if each != self.absent))
+        return both[:1] if same else both
 
     def absent_classes(self) -> tuple[str, ...]:
         """Scored classes without a pixel to count in a region, by day or by night."""
@@ -148,6 +150,7 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
         num_images={images: len(subset.names) for images, subset in parts.items()},
         scores=scores,
         unscored=counts.unscored,
+        absent=counts.absent,
     )
 
 

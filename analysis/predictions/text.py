@@ -85,7 +85,8 @@ def convention_line(table: ScoreTable) -> str:
         f"{table.partition}: {absent}: no pixel to count in some region or part ({ABSENT} in the "
         "tables of classes); "
         + (
-            "released counts that as 0, exclude leaves the class out of the mean."
+            "released counts that as 0, exclude leaves the class out of the mean; "
+            f"{table.absent} is the convention of the data set."
             if differ
             else "released counts that as 0, exclude leaves it out; the means are the same."
         )

@@ -35,6 +35,7 @@ class RunEntry:
         partition: e.g. "ring5".
         classes: K names.
         unscored: those that are left out of means.
+        notes: footnotes of the table by class, about absent classes.
         scores: metric name -> percent (`rgbt.metrics.names`).
         region_ious: R percents, region 1 first.
         class_region_ious: K rows of R percents.
@@ -63,6 +64,7 @@ class RunEntry:
     partition: str
     classes: tuple[str, ...]
     unscored: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     scores: Mapping[str, float]
     region_ious: tuple[float, ...]
     class_region_ious: tuple[tuple[float, ...], ...]

@@ -23,6 +23,7 @@ from analysis.report.runs_provenance import (
 from analysis.report.store import Files, StoredRun
 from rgbt.checks import InputError, check_choice
 from rgbt.metrics import names
+from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import iou, miou, summary
@@ -81,8 +82,9 @@ def open_run(stored: StoredRun, remarks: list[str]) -> Run:
     """
     key = stored.tags.get("rgbt.key", stored.run_id)
     config = _config(stored, remarks)
-    absent = cast("Absent", config.get("metric.absent", "released"))
     counts = _counts(stored, key, remarks)
+    counted = "released" if counts is None else counts.absent
+    absent = cast("Absent", config.get("metric.absent", counted))
     scores = {} if counts is None else percent_scores(counts, absent)
     remarks += _disagreements(key, stored.metrics, scores)
     processes = read_provenance(stored.files, key, remarks)
@@ -103,6 +105,7 @@ def open_run(stored: StoredRun, remarks: list[str]) -> Run:
         partition="" if counts is None else counts.partition,
         classes=() if counts is None else counts.classes,
         unscored=() if counts is None else counts.unscored,
+        notes=() if counts is None else _notes(counts, absent),
         scores=scores,
         region_ious=() if counts is None else _by_region(counts, absent),
         class_region_ious=() if counts is None else _by_class(counts, absent),
@@ -212,6 +215,11 @@ def _by_region(counts: Counts, absent: Absent) -> tuple[float, ...]:
 def _by_class(counts: Counts, absent: Absent) -> tuple[tuple[float, ...], ...]:
     """K rows of R percents."""
     return tuple(_percents(row) for row in iou(counts.by_region(), absent).T)
+
+
+def _notes(counts: Counts, absent: Absent) -> tuple[str, ...]:
+    matrices, classes = counts.by_region(), counts.classes
+    return absent_notes(matrices, classes, counts.scored, counts.split, absent)
 
 
 def _percents(fractions: Any) -> tuple[float, ...]:

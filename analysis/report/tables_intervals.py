@@ -28,12 +28,12 @@ class Source:
         keys: of the runs, one per seed.
         paths: of the evaluation in each run, `OWN` for the run's own; two: the first less the
             second.
-        absent: how a class without pixels scores.
+        absent: how a class without pixels scores; None: as the counts say.
     """
 
     keys: tuple[str, ...]
     paths: tuple[str, ...]
-    absent: Absent
+    absent: Absent | None
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,8 @@ def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | N
     evaluation = evaluation_of(column, table)
     path = OWN if evaluation is None else evaluation.path
     try:
-        return value(metric_of(column, row), counts_of(run, path), table.absent)
+        counts = counts_of(run, path)
+        return value(metric_of(column, row), counts, table.absent or counts.absent)
     except InputError:  # the reason stands in the cell
         return None
 

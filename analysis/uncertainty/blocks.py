@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,13 @@ from rgbt.checks import InputError
 
 FEWEST = 10
 """Blocks below which an interval would rest on almost nothing."""
+
+GAP = 3.0
+"""Typical steps between frames of a sequence above which the next frame begins another run. In the
+lists of MFNet neighbours are 1 or 3 numbers apart (a frame left out) or at least 12; in those of KP
+1 or 2 steps of a recording (43 to 203 numbers), or at least 7."""
+
+ALONE = "each image is drawn alone, as if it were independent evidence"
 
 BAND = 1.96
 """Standard errors ``1 / sqrt(n)`` above which an autocorrelation counts as one."""
@@ -28,11 +36,20 @@ class Blocks:
         index: (N,) int64, block 0..count-1 of every image.
         count: number of blocks.
         said: what they are, e.g. "40 blocks of up to 10 neighbouring frames".
+        reason: of "auto", the sentence that says why these; "" for blocks that were set by hand.
     """
 
     index: NDArray[np.int64]
     count: int
     said: str
+    reason: str = ""
+
+
+class Frames(NamedTuple):
+    """Images of one sequence in the order of their frames: numbers, and places in the split."""
+
+    frames: NDArray[np.float64]
+    places: NDArray[np.int64]
 
 
 def make_blocks(
@@ -50,26 +67,20 @@ def make_blocks(
         InputError: fewer than `FEWEST` blocks, or names without a number where frames are asked
             for.
     """
-    sequences = _sequences(names)
     if choice == "none":
         return _singles(len(names))
-    if choice == "auto" and sequences is None:
-        return _singles(len(names), " (their names tell no neighbours)")
+    sequences = _sequences(names)
     if sequences is None:
-        raise InputError(
-            f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
-            "but for one number); use blocks=none."
-        )
+        return _without_frames(names, choice)
+    if choice == "auto":
+        return _automatic(sequences, series)
+    places = [each.places for each in sequences]
     if choice == "sequence":
-        blocks = _joined(len(names), sequences, f"{len(sequences)} sequences")
+        blocks = _joined(len(names), places, f"{len(places)} sequences")
+    elif choice == 1:
+        return _singles(len(names))
     else:
-        length = choice if isinstance(choice, int) else _automatic(series, sequences)
-        if length <= 1:
-            return _singles(len(names))
-        pieces = [piece for each in sequences for piece in _cut(each, length)]
-        largest = max(map(len, pieces))
-        said = f"{len(pieces)} blocks of up to {largest} neighbouring frames"
-        blocks = _joined(len(names), pieces, said)
+        blocks = _pieces(places, choice)
     if blocks.count < FEWEST:
         raise InputError(
             f"blocks={choice}: {len(names)} images make {blocks.said}, and fewer than {FEWEST} say "
@@ -135,16 +146,58 @@ def _autocovariance(
     return float(sum(products)) / len(centred)
 
 
-def _automatic(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]]) -> int:
+def _automatic(sequences: Sequence[Frames], series: NDArray[np.float64]) -> Blocks:
+    """Runs of consecutive frames, or pieces of them where one run is too long for that."""
+    runs = [run for each in sequences for run in _runs(each)]
+    sizes = [len(run) for run in runs]
+    count, longest = sum(sizes), max(sizes)
+    said = f"{len(runs)} run{'s' * (len(runs) > 1)} of consecutive numbers ({_range(sizes)} images)"
+    if longest * FEWEST <= count:
+        shown = f"{len(runs)} blocks of {_range(sizes)} neighbouring frames"
+        return _joined(count, runs, shown, f"The names form {said}; each is one block.")
+    reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
+    length = _measured_length(series, runs)
+    if length <= 1:
+        reason += f"; scores of neighbours are not shown to be correlated, {ALONE}."
+        return _singles(count, reason=reason)
+    reason += f"; they are cut at {length}, the distance over which scores are correlated."
+    return replace(_pieces(runs, length), reason=reason)
+
+
+def _measured_length(series: NDArray[np.float64], runs: Sequence[NDArray[np.int64]]) -> int:
     """The longest length of the scores, as far as it leaves `FEWEST` blocks."""
-    wanted = max(block_length(each, sequences) for each in series)
-    while wanted > 1 and sum(math.ceil(len(each) / wanted) for each in sequences) < FEWEST:
+    wanted = max(block_length(each, runs) for each in series)
+    while wanted > 1 and sum(math.ceil(len(run) / wanted) for run in runs) < FEWEST:
         wanted -= 1
     return wanted
 
 
-def _sequences(names: Sequence[str]) -> list[NDArray[np.int64]] | None:
-    """Places of the images of every sequence, by frame; None where names tell no neighbours.
+def _runs(sequence: Frames) -> list[NDArray[np.int64]]:
+    """Places of the frames that follow one another without a gap (`GAP`)."""
+    steps = np.diff(sequence.frames)
+    if not len(steps):
+        return [sequence.places]
+    return np.split(sequence.places, np.flatnonzero(steps > GAP * np.median(steps)) + 1)
+
+
+def _range(sizes: Sequence[int]) -> str:
+    """For example "2 to 20", or "10" where all are equal."""
+    least, most = min(sizes), max(sizes)
+    return str(most) if least == most else f"{least} to {most}"
+
+
+def _without_frames(names: Sequence[str], choice: NamedBlocks | int) -> Blocks:
+    if choice == "auto":
+        reason = f"Names such as '{names[0]}' hold no frame number that others continue; {ALONE}."
+        return _singles(len(names), " (their names tell no neighbours)", reason)
+    raise InputError(
+        f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
+        "but for one number); use blocks=none."
+    )
+
+
+def _sequences(names: Sequence[str]) -> list[Frames] | None:
+    """The frames of every sequence; None where names tell no neighbours.
 
     The frame is the last number in the names that is not the same in all of them; names that are
     equal but for it are one sequence.
@@ -165,20 +218,31 @@ def _sequences(names: Sequence[str]) -> list[NDArray[np.int64]] | None:
             found.setdefault(rest, []).append((int(words[place][frame]), place))
     if all(len(frames) == 1 for frames in found.values()):
         return None
-    return [np.array([place for _, place in sorted(frames)]) for frames in found.values()]
+    ordered = [sorted(frames) for frames in found.values()]
+    return [
+        Frames(
+            frames=np.array([frame for frame, _ in each], np.float64),
+            places=np.array([place for _, place in each], np.int64),
+        )
+        for each in ordered
+    ]
 
 
-def _cut(places: NDArray[np.int64], length: int) -> list[NDArray[np.int64]]:
-    """Pieces of nearly equal size, at most `length` each."""
-    return np.array_split(places, math.ceil(len(places) / length))
+def _pieces(sequences: Sequence[NDArray[np.int64]], length: int) -> Blocks:
+    """Sequences cut into pieces of nearly equal size, at most `length` each."""
+    pieces = [
+        piece for each in sequences for piece in np.array_split(each, math.ceil(len(each) / length))
+    ]
+    said = f"{len(pieces)} blocks of up to {max(map(len, pieces))} neighbouring frames"
+    return _joined(sum(map(len, sequences)), pieces, said)
 
 
-def _joined(count: int, pieces: Sequence[NDArray[np.int64]], said: str) -> Blocks:
+def _joined(count: int, pieces: Sequence[NDArray[np.int64]], said: str, reason: str = "") -> Blocks:
     index = np.empty(count, np.int64)
     for number, piece in enumerate(pieces):
         index[piece] = number
-    return Blocks(index, len(pieces), said)
+    return Blocks(index, len(pieces), said, reason)
 
 
-def _singles(count: int, remark: str = "") -> Blocks:
-    return Blocks(np.arange(count), count, f"{count} single images{remark}")
+def _singles(count: int, remark: str = "", reason: str = "") -> Blocks:
+    return Blocks(np.arange(count), count, f"{count} single images{remark}", reason)

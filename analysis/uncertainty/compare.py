@@ -73,6 +73,7 @@ class Comparison:
         differences: in the order of the metrics asked for.
         images: number of images.
         said: how they were drawn, e.g. "393 single images".
+        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
         partition: of the regions, e.g. "ring5".
         level: of the intervals.
     """
@@ -82,6 +83,7 @@ class Comparison:
     said: str
     partition: str
     level: float
+    reason: str = ""
 
 
 def compare(
@@ -138,6 +140,7 @@ def compare(
         said=main.blocks.said,
         partition=a[0].partition,
         level=settings.level,
+        reason=main.blocks.reason,
     )
 
 
@@ -146,7 +149,7 @@ def _differences(images: Images, asked: Sequence[Asked], *, paired: bool) -> Ite
     swapped_a, swapped_b = images.swapped(asked)
     every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
     for each, rows_a, rows_b, swapped in every:
-        first, second = estimate_of(images, *rows_a), estimate_of(images, *rows_b)
+        first, second = (estimate_of(images, each, *rows) for rows in (rows_a, rows_b))
         value = second.value - first.value
         plain = Difference(
             metric=each.metric, a=first, b=second, value=value, p_images=swap_p(value, swapped)

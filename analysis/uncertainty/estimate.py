@@ -14,13 +14,14 @@ from analysis.uncertainty.intervals import (
     Interval,
     Spread,
     Values,
+    corrected,
     over_images,
     over_seeds,
-    student,
     together,
     widest,
 )
 from analysis.uncertainty.settings import Resampling
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import Asked, parse
 
@@ -39,6 +40,7 @@ class Estimate:
         both: interval over images and seeds (Student with Satterthwaite's degrees of freedom, not
             narrower than `trainings`); None where one of the two is.
         said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
+        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
     """
 
     value: float
@@ -48,6 +50,7 @@ class Estimate:
     trainings: Interval | None
     both: Interval | None
     said: str
+    reason: str = ""
 
 
 def estimate(
@@ -72,7 +75,7 @@ def estimate(
         images = prepare([seeds], group[0], settings)
         (drawn,) = images.drawn(group)
         found |= {
-            asked.metric: estimate_of(images, *rows)
+            asked.metric: estimate_of(images, asked, *rows)
             for asked, rows in zip(group, drawn.rows(), strict=True)
         }
     return {metric: found[metric] for metric in metrics}
@@ -84,18 +87,23 @@ def by_part(metrics: Sequence[str]) -> list[list[Asked]]:
     return [list(group) for _, group in groupby(every, key=lambda asked: asked.part)]
 
 
-def estimate_of(images: Images, points: Values, resampled: Values, without: Values) -> Estimate:
+def estimate_of(
+    images: Images, asked: Asked, points: Values, resampled: Values, without: Values
+) -> Estimate:
     """The estimate that one row of `Drawn` makes."""
     settings, value = images.settings, float(points.mean())
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
+    if asked.score == names.VAR and around is not None and settings.method == "auto":
+        bias = float(np.nanmean(resampled)) - value
+        around = corrected(value, bias, image_spread(images, resampled), level)
     spread = over_seeds(points)
     trainings = both = None
     if spread is not None:
-        trainings = _of_score(student(value, spread, level))
+        trainings = corrected(value, 0.0, spread, level)
         if around is not None:
             whole = together(image_spread(images, resampled), spread)
-            both = _of_score(student(value, widest(level, whole, spread), level))
+            both = corrected(value, 0.0, widest(level, whole, spread), level)
     return Estimate(
         value=value,
         sd=float(points.std(ddof=1)) if len(points) > 1 else float("nan"),
@@ -104,12 +112,8 @@ def estimate_of(images: Images, points: Values, resampled: Values, without: Valu
         trainings=trainings,
         both=both,
         said=images.blocks.said,
+        reason=images.blocks.reason,
     )
-
-
-def _of_score(interval: Interval) -> Interval:
-    """Without what lies below 0: no score is negative, and neither is a variance."""
-    return Interval(max(0.0, interval.low), interval.high)
 
 
 def image_spread(images: Images, resampled: Values) -> Spread:

@@ -13,7 +13,8 @@ from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.counts import Counts, check_same_means, convention
+from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import Asked, images_of, parse, values
 from rgbt.metrics.pairs import protocol_of
 from rgbt.randomness import numpy_generator
@@ -55,6 +56,7 @@ class Images:
         images: N.
         blocks: how the images are drawn.
         settings: of the resampling.
+        absent: how a class without pixels scores.
     """
 
     methods: tuple[NDArray[np.float64], ...]
@@ -63,6 +65,7 @@ class Images:
     images: int
     blocks: Blocks
     settings: Resampling
+    absent: Absent
 
     def drawn(self, asked: Sequence[Asked]) -> list[Drawn]:
         """The scores of every method, as they are and with images drawn anew or left out."""
@@ -120,7 +123,7 @@ class Images:
     def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
         """(metrics, ...) percent of summed counts (..., R K K)."""
         by_region = summed.reshape(*summed.shape[:-1], *self.shape)
-        given = (by_region, self.like, self.settings.absent)
+        given = (by_region, self.like, self.absent)
         return np.stack([values(each, *given) for each in asked])
 
 
@@ -151,6 +154,7 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         images=len(first.names),
         blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
+        absent=settings.absent or convention(counts for seeds in alike for counts in seeds),
     )
     try:
         blocks = make_blocks(first.names, settings.blocks, _influence(single))

@@ -54,7 +54,7 @@ def over_images(
         value: the score itself.
         resampled: (resamples,) scores; NaN (nothing to score) is left out.
         without_each: (B,) scores without one block each; read by "bca" alone.
-        method: see `Resampling.method`.
+        method: see `Resampling.method`; "auto" is "percentile".
         level: of the interval.
 
     Returns:
@@ -69,6 +69,32 @@ def over_images(
     low, high = np.quantile(known, np.sort(tails))
     # Resampling raises a variance over regions; where that is all there is, quantiles miss it.
     return Interval(min(float(low), value), max(float(high), value))
+
+
+def corrected(value: float, bias: float, spread: Spread, level: float) -> Interval:
+    """Student's interval of a score that is never negative, without the bias of its estimate.
+
+        value - bias -+ t error,  cut at 0
+
+    For the variance over regions: regions that are equally good in truth differ in a sample, so
+    that the estimate is too high by the mean error variance of their scores, and each resample is
+    too high by as much again. Quantiles of the resamples lie above the truth, even above the
+    estimate.
+
+    Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), Sec. 5.2.1, with
+    Student's quantile.
+
+    Args:
+        value: the estimate, >= 0.
+        bias: mean of the resamples less `value`; 0 for other scores.
+        spread: standard error of the estimate.
+        level: of the interval.
+
+    Returns:
+        at least 0; holds `value`, at its upper end where the bias is all that there is.
+    """
+    around = student(value - bias, spread, level)
+    return Interval(min(max(0.0, around.low), value), max(around.high, value))
 
 
 def _bias(value: float, known: Values) -> float:

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from rgbt.checks import InputError, check_choice, check_range
 from rgbt.metrics.metric import Absent
 
-Method = Literal["bca", "percentile"]
+Method = Literal["auto", "percentile", "bca"]
 NamedBlocks = Literal["auto", "none", "sequence"]
 
 MOST = 1_000_000
@@ -23,13 +23,17 @@ class Resampling:
         resamples: number of resamples, 100..`MOST`.
         level: share of intervals that shall hold the true value, 0.5..0.999.
         method: of intervals over images. "percentile": quantiles of the resampled scores; "bca":
-            bias-corrected and accelerated (Efron, 1987).
+            bias-corrected and accelerated (Efron, 1987); "auto": percentile, except for the
+            variance over regions, whose bias is removed
+            (`analysis.uncertainty.intervals.corrected`); docs/analysis.md has the measurements.
         blocks: what is drawn together, because neighbouring frames show nearly the same:
             "none" single images; a number: that many neighbours; "sequence": whole sequences (names
-            that are equal but for one number); "auto": as many neighbours as the scores of
-            the images are correlated over (Politis and White, 2004).
+            that are equal but for one number); "auto": runs of consecutively numbered frames, cut
+            where one is too long for that at the distance over which the scores of the images are
+            correlated (Politis and White, 2004).
         seed: of the draws.
-        absent: how a class without pixels scores, see `rgbt.metrics.scores`.
+        absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
+            say (`rgbt.metrics.counts.Counts.absent`).
 
     Raises:
         InputError: a value out of range.
@@ -37,16 +41,17 @@ class Resampling:
 
     resamples: int = 10_000
     level: float = 0.95
-    method: Method = "percentile"
+    method: Method = "auto"
     blocks: NamedBlocks | int = "auto"
     seed: int = 0
-    absent: Absent = "released"
+    absent: Absent | None = None
 
     def __post_init__(self) -> None:
         check_range("resamples", self.resamples, 100, MOST)
         check_range("level", self.level, 0.5, 0.999)
         check_choice("method", self.method, get_args(Method))
-        check_choice("absent", self.absent, get_args(Absent))
+        if self.absent is not None:
+            check_choice("absent", self.absent, get_args(Absent))
         if isinstance(self.blocks, int):
             check_range("blocks", self.blocks, 1, MOST)
         elif self.blocks not in get_args(NamedBlocks):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.archive import Archive
+from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import DAY, NIGHT
 
 ARCHIVE = Archive(
@@ -20,8 +22,9 @@ ARCHIVE = Archive(
     {
         **{"counts": "iu N R K K", "names": "U N", "night": "b M", "classes": "U K"},
         **{"partition": "U", "dataset": "U", "split": "U", "unscored": "U L"},
+        "absent": "U",
     },
-    optional=("unscored",),
+    optional=("unscored", "absent"),
 )
 
 
@@ -42,9 +45,12 @@ class Counts:
         unscored: names of the classes that are left out of every mean over classes. Their pixels
             count as all others do: what is labelled so and predicted as another class is a false
             positive of that class, and the other way round a miss.
+        absent: convention for absent classes (`rgbt.metrics.scores`) of the evaluation that counted
+            them; scores that are derived later follow it unless another one is requested.
 
     Raises:
-        ValueError: the lengths do not agree, or `unscored` names no class or all of them.
+        ValueError: the lengths do not agree, `unscored` names no class or all of them, or there is
+            no such convention.
     """
 
     counts: NDArray[np.integer]
@@ -55,6 +61,7 @@ class Counts:
     dataset: str
     split: str
     unscored: tuple[str, ...] = ()
+    absent: Absent = "released"
 
     def __post_init__(self) -> None:
         shape = self.counts.shape
@@ -69,6 +76,8 @@ class Counts:
                 f"night: expected {len(self.names)} values, one per image, got {len(self.night)}."
             )
         scored_classes(self.classes, self.unscored)
+        if self.absent not in get_args(Absent):
+            raise ValueError(f"absent: expected released or exclude, got '{self.absent}'.")
 
     @property
     def scored(self) -> NDArray[np.bool_]:
@@ -119,7 +128,10 @@ class Counts:
 
     @classmethod
     def load(cls, path: Path) -> Counts:
-        """Read what `save` wrote; files from before `unscored` was stored score every class.
+        """Read what `save` wrote.
+
+        Files from before `unscored` was stored score every class; files from before `absent` was
+        stored score absent classes as "released", as every data set did then.
 
         Raises:
             InputError: no such file, or not a file of counts.
@@ -135,6 +147,7 @@ class Counts:
                 dataset=str(values["dataset"]),
                 split=str(values["split"]),
                 unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
+                absent=cast(Absent, str(values.get("absent", "released"))),
             )
 
     def _take(self, indices: list[int]) -> Counts:
@@ -179,3 +192,18 @@ def check_same_means(first: Counts, other: Counts) -> None:
         f"counts that leave {left_out[0]} out of means cannot be compared with counts that leave "
         f"out {left_out[1]}; count both with the same dataset.unscored."
     )
+
+
+def convention(every: Iterable[Counts]) -> Absent:
+    """The convention for absent classes that all counts were made with.
+
+    Raises:
+        InputError: they were made with both.
+    """
+    found = {counts.absent for counts in every}
+    if len(found) > 1:
+        raise InputError(
+            "the counts were made with both conventions for absent classes (released: they score "
+            "0; exclude: they are left out of means); choose absent=released or absent=exclude."
+        )
+    return found.pop()

@@ -3,12 +3,17 @@
 Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (regions, images) are
 kept. Scores are fractions 0..1; variances are in squared percent points, as the papers print them.
 
-A class without a pixel to count (0 / 0) scores, by `absent`:
+A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
                 and in the averages that the RTFNet and Temporal releases report. (These two keep
                 NaN for the class; the scalars that Temporal sends to TensorBoard are plain means,
                 NaN where a class is.)
     "exclude":  NaN and is left out of means, as in the CMX release.
+The denominator decides, by score and by region. IoU and F1 lack one where the class is neither
+labelled nor predicted: one false pixel of a class that no label holds makes its IoU 0 with either
+convention, so that "exclude" still lowers the mean. Recall lacks one where the class is not
+labelled, precision where it is not predicted; means of different scores may therefore be over
+different classes. The data set says which convention its published tables use (`dataset.absent`).
 Means are over the scored classes alone (`rgbt.metrics.counts.Counts.scored`): a class that is left
 out counts in none of them, whether it has pixels or not and whatever `absent` says.
 """

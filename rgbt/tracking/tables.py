@@ -42,6 +42,7 @@ class ClassTable:
         region_ious: K rows of R fractions, IoU of the class inside each region.
         subset_mious: mean IoU of subsets of the images, e.g. {"day": 0.41, "night": 0.38}.
         unscored: names of the classes that are left out of every mean.
+        notes: footnotes about absent classes (`rgbt.metrics.absent`).
     """
 
     names: tuple[str, ...]
@@ -50,6 +51,7 @@ class ClassTable:
     region_ious: tuple[tuple[float, ...], ...]
     subset_mious: Mapping[str, float]
     unscored: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,7 @@ class ResultTables:
                 region_ious=tuple(_numbers(row) for row in classes["region_ious"]),
                 subset_mious={k: _number(v) for k, v in classes["subset_mious"].items()},
                 unscored=tuple(classes.get("unscored", ())),
+                notes=tuple(classes.get("notes", ())),
             ),
             consistency=None if consistency is None else ConsistencyTable.from_json(consistency),
         )
@@ -138,17 +141,19 @@ class ResultTables:
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of text: first column labels, the others numbers."""
+    """A table of text: first column labels, the others numbers; footnotes."""
 
     title: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
 
     def to_markdown(self) -> str:
-        """The table in Markdown, with the title in bold above it."""
+        """The table in Markdown, with the title in bold above it and its footnotes below."""
         rule = ["---", *["---:"] * (len(self.header) - 1)]
         lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
-        return "\n".join([f"**{self.title}**", "", *lines]) + "\n"
+        notes = ["", *(f"- {note}" for note in self.notes)] if self.notes else []
+        return "\n".join([f"**{self.title}**", "", *lines, *notes]) + "\n"
 
 
 def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> Grid:
@@ -191,7 +196,7 @@ def class_grid(tables: ResultTables) -> Grid:
     ]
     regions = tables.regions
     mean = ("mean", percent(regions.miou), "", *map(percent, regions.region_ious))
-    return Grid("IoU and accuracy by class", header, (*rows, mean))
+    return Grid("IoU and accuracy by class", header, (*rows, mean), classes.notes)
 
 
 def subset_grid(tables: ResultTables) -> Grid:

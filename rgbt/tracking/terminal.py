@@ -28,6 +28,8 @@ def rich_table(grid: Grid) -> Table:
     table = Table(
         title=escape(grid.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
     )
+    if grid.notes:
+        table.caption, table.caption_justify = escape("\n".join(grid.notes)), "left"
     for index, name in enumerate(grid.header):
         table.add_column(escape(name), justify="right" if index else "left", no_wrap=True)
     for row in grid.rows:

@@ -164,7 +164,7 @@ def _value(metric: str, counts: Counts | str, table: Table) -> Value:
     if isinstance(counts, str):
         return counts
     try:
-        found = value(metric, counts, table.absent)
+        found = value(metric, counts, table.absent or counts.absent)
     except InputError as error:
         return str(error)
     return f"'{metric}' has nothing to score" if math.isnan(found) else found

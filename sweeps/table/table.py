@@ -142,7 +142,8 @@ class Table:
         unit: of the values, e.g. "percent".
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
-        absent: how a class without a pixel scores, see `rgbt.metrics.scores`.
+        absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
+            convention of the data set (`rgbt.metrics.counts.Counts.absent`).
         needs: the part that must exist before any row can be run.
         columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
@@ -159,7 +160,7 @@ class Table:
     unit: str = "percent"
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: str = "as trained"
-    absent: Literal["released", "exclude"] = "released"
+    absent: Literal["released", "exclude"] | None = None
     needs: str | None = None
     columns: tuple[Column, ...]
     factor: Factor | None = None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.compare import OWN
+from analysis.compare import OWN, absent_classes
 from analysis.compare import main as compare_command
 from analysis.figures import classes, consistency, inputs, maps, panels, profiles, trends
 from analysis.predictions.maps import PixelMaps, iou_map
@@ -19,6 +19,7 @@ from analysis.report.runs import open_run
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
 from tests.analysis.figures.drawn import statistics, strips, texts
 from tests.analysis.report.stores import counts_of as stored_counts
 from tests.analysis.report.stores import files_of, write_run
@@ -249,3 +250,21 @@ def test_report_shows_means_of_the_scored_classes(tmp_path: Path) -> None:
     assert entry.scores["mIoU"] == entry.scores["class/road"] == pytest.approx(expected)
     assert entry.region_ious == entry.class_region_ious[0]
     assert (entry.classes, entry.unscored) == (("road", "car"), ("car",))
+
+
+def test_report_and_comparison_say_which_classes_are_absent(tmp_path: Path) -> None:
+    """By the convention of the counts: the stored configuration of this run has none."""
+    run = write_run(tmp_path, "aa0", "grbm", 0)
+    array = stored_counts(0).counts.copy()
+    array[:, :, 1] = array[..., 1] = 0
+    counts = replace(stored_counts(0), counts=array, absent="exclude")
+    counts.save(run.counts_path("test"))
+    entry = open_run(stored(files_of(run.path)), []).entry
+    assert entry.notes[0].startswith("absent from the test split: car (")
+    assert absent_classes([counts, counts], None) == (
+        "absent from the test split: car (left out of the mean)",
+    )
+    assert "counted as 0" in absent_classes([counts], "released")[0]
+    found = estimate([counts], ["mIoU"], Resampling(resamples=100, blocks="none"))["mIoU"]
+    assert found.value == pytest.approx(value("mIoU", counts, "exclude"))
+    assert found.value == pytest.approx(2 * value("mIoU", counts, "released"))

@@ -52,6 +52,18 @@ def test_json_round_trip_keeps_nan(tables: ResultTables) -> None:
     assert ResultTables.from_json(json.loads(json.dumps(tables.to_json()))) == tables
 
 
+def test_notes_are_below_the_table_of_classes_in_markdown_and_in_the_terminal(
+    tables: ResultTables,
+) -> None:
+    note = "absent from the test split: car (left out of the mean)"
+    noted = replace(tables, classes=replace(tables.classes, notes=(note,)))
+    assert ResultTables.from_json(json.loads(json.dumps(noted.to_json()))) == noted
+    grid = class_grid(noted)
+    assert grid.to_markdown().endswith(f"|\n\n- {note}\n")
+    assert terminal.rich_table(grid).caption == note
+    assert class_grid(tables).to_markdown().endswith("|\n")
+
+
 def test_region_grid_has_the_papers_columns_and_two_decimals() -> None:
     ours = RegionTable("ours", (0.55283, 0.6279), 0.6124, 10.899)
     paper = RegionTable("paper", (0.5, math.nan), 0.6, 1.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from analysis.uncertainty.blocks import FEWEST, Blocks, block_length, make_block
 from rgbt.checks import InputError
 
 NOTHING = np.empty((0, 0))
+ROOT = Path(__file__).resolve().parents[3]
+LISTS = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"
 
 
 def members(blocks: Blocks, names: list[str]) -> set[frozenset[str]]:
@@ -226,3 +230,69 @@ def test_too_few_blocks():
     with pytest.raises(InputError, match="blocks=sequence: 200 images make 2 sequences"):
         make_blocks(names, "sequence", NOTHING)
     assert make_blocks(mfnet(100), 10, NOTHING).count == FEWEST
+
+
+def numbered(*runs: tuple[int, int]) -> list[str]:
+    """Names of runs of consecutive numbers, each from its first to before its last."""
+    return [f"{number:05d}D" for first, last in runs for number in range(first, last)]
+
+
+def test_auto_takes_runs_of_consecutive_numbers():
+    """A frame that is missing ends no run: in MFNet 00044 is followed by 00047."""
+    names = [*numbered((1, 6), (8, 11)), *numbered(*((100 * k, 100 * k + 8) for k in range(1, 12)))]
+    shuffled = list(np.random.default_rng(0).permutation(names))
+    blocks = make_blocks(shuffled, "auto", NOTHING)
+    expected = {frozenset(numbered((1, 6), (8, 11)))}
+    expected |= {frozenset(numbered((100 * k, 100 * k + 8))) for k in range(1, 12)}
+    assert members(blocks, shuffled) == expected
+    assert blocks.said == "12 blocks of 8 neighbouring frames"
+    assert blocks.reason == (
+        "The names form 12 runs of consecutive numbers (8 images); each is one block."
+    )
+
+
+def test_auto_takes_the_step_of_each_sequence():
+    """KP: every 80th frame of one recording, every 43rd of another; 1040 numbers are a gap."""
+    names = [f"set10_V000_I{50 + 80 * k:05d}" for k in range(9)]
+    names += [f"set10_V000_I{1730 + 80 * k:05d}" for k in range(9)]
+    names += [f"set11_V{v:03d}_I{50 + 43 * k:05d}" for v in range(10) for k in range(8)]
+    blocks = make_blocks(names, "auto", NOTHING)
+    assert blocks.said == "12 blocks of 8 to 9 neighbouring frames"
+    assert {len(block) for block in members(blocks, names)} == {8, 9}
+
+
+def test_auto_cuts_runs_of_which_one_is_too_long():
+    """The test part of MFNet: one run by day and one at night."""
+    names = [*mfnet(205), *mfnet(188, "N")]
+    rng = np.random.default_rng(0)
+    series = np.concatenate([autoregressive(rng, count, 0.8) for count in (205, 188)])[None]
+    blocks = make_blocks(names, "auto", series)
+    assert 20 < blocks.count < 150
+    assert blocks.reason.startswith(
+        "The names form 2 runs of consecutive numbers (188 to 205 images), one of them more than "
+        "1/10 of all images; they are cut at "
+    )
+    alone = make_blocks(names, "auto", rng.normal(size=(1, 393)))
+    assert alone.said == "393 single images"
+    assert "not shown to be correlated, each image is drawn alone" in alone.reason
+
+
+def test_auto_says_what_single_images_mean():
+    for names in (["b", "a", "c"], [f"{video}_7" for video in "abcdefghijkl"], mfnet(12)):
+        blocks = make_blocks(names, "auto", np.zeros((1, len(names))))
+        assert blocks.count == len(names)
+        assert "each image is drawn alone, as if it were independent evidence" in blocks.reason
+    assert make_blocks(mfnet(12), "none", NOTHING).reason == ""
+
+
+@pytest.mark.skipif(not LISTS.is_dir(), reason="the lists of names are not there")
+def test_auto_on_the_lists_of_mfnet_and_kp():
+    """Measured: gaps inside runs of at most 3 numbers or 2 steps, between runs of 12 or 7."""
+    found = {}
+    for name in ("mfnet_names/train", "mfnet_names/test", "kp_names/train_day", "kp_names/test"):
+        names = (LISTS / f"{name}.txt").read_text().split()
+        found[name] = make_blocks(names, "auto", np.zeros((1, len(names))))
+    assert "6 runs of consecutive numbers (2 to 384 images)" in found["mfnet_names/train"].reason
+    assert "2 runs of consecutive numbers (188 to 205 images)" in found["mfnet_names/test"].reason
+    assert "9 runs of consecutive numbers (20 to 52 images)" in found["kp_names/test"].reason
+    assert "20 runs of consecutive numbers (4 to 28 images)" in found["kp_names/train_day"].reason

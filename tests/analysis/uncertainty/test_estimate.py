@@ -45,6 +45,24 @@ def test_percentile_interval_is_the_quantiles_of_the_resamples():
     np.testing.assert_allclose([found.low, found.high], np.percentile(resampled[0], [5, 95]))
 
 
+def test_variance_interval_is_students_without_the_bias():
+    """By hand from the resamples; the estimate is inside, and nothing below 0 is."""
+    seeds, settings = drawn(), replace(SETTINGS, level=0.9)
+    found = estimate(seeds, ["Var"], settings)["Var"]
+    (resampled,) = prepare([seeds], parse("Var"), settings).resampled([parse("Var")])
+    centre = 2 * found.value - resampled[0].mean()
+    half = stats.t.ppf(0.95, 39) * resampled[0].std() * math.sqrt(40 / 39)
+    assert found.images is not None
+    assert found.images.low == pytest.approx(max(0.0, centre - half))
+    assert found.images.high == pytest.approx(max(found.value, centre + half))
+    assert found.value in found.images
+    for seed in range(5):
+        alike = estimate(drawn(tilt=0.0, seed=seed), ["Var"], SETTINGS)["Var"]
+        assert alike.images is not None
+        assert 0.0 in alike.images
+        assert alike.value in alike.images
+
+
 def test_bca_interval_is_near_scipys():
     """Pixel accuracy of paired (right, all) pixels by image; both draw their own resamples."""
     counts = drawn(60)[0]

@@ -15,6 +15,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from tests.analysis.uncertainty.simulated import Population, counts_of
+from tests.analysis.uncertainty.simulated_regions import Tilted
 
 METRICS = ("mIoU", "Var", "region/1", "class/cone")
 RUNS = 300
@@ -89,6 +90,60 @@ def test_intervals_over_correlated_neighbours(blocks):
         assert mean < 0.65
     else:
         assert mean > {"auto": 0.83, 10: 0.88}[blocks]
+
+
+def test_runs_of_consecutive_numbers_are_scenes():
+    """Forty scenes of eight frames with other frames between them: "auto" takes the scenes."""
+    population, rates = Population(block=8), {}
+    true, rng = true_values(population), np.random.default_rng(11)
+    for gap in (0, 100):
+        held = dict.fromkeys(METRICS, 0)
+        for number in range(RUNS):
+            (array,) = population.draw(rng, 320, 1)
+            names = tuple(f"{place + gap * (place // 8):06d}D" for place in range(320))
+            counts = replace(counts_of(array), names=names)
+            settings = replace(SETTINGS, blocks="auto", seed=number)
+            found = estimate([counts], METRICS, settings)
+            for metric in METRICS:
+                held[metric] += true[metric] in found[metric].images
+        rates[gap] = float(np.mean(list(held.values()))) / RUNS
+    print(rates)
+    assert rates[100] > 0.91
+    assert rates[100] > rates[0] > 0.83
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("images", [100, 300])
+def test_intervals_of_a_variance_of_few_regions(tilt: float, images: int):
+    """True variances of 0 to 15, as in the papers' tables; quantiles never hold a true 0."""
+    method, rng = Tilted(tilt), np.random.default_rng(4)
+    held = {"auto": 0, "percentile": 0}
+    for number in range(RUNS):
+        seeds = method.draw(rng, images)
+        for form in held:
+            settings = replace(SETTINGS, method=form, seed=number)
+            found = estimate(seeds, ["Var"], settings)["Var"]
+            assert found.value in found.images
+            assert found.images.low >= 0
+            held[form] += method.true_variance in found.images
+    rates = {form: count / RUNS for form, count in held.items()}
+    print(images, method.true_variance, rates)
+    assert rates["auto"] >= 0.89
+    if tilt == 0:
+        assert rates["percentile"] < 0.05
+        assert rates["auto"] >= 0.97
+
+
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (0.2, 0.2), (0.1, 0.3)])
+def test_intervals_of_a_difference_of_variances(tilts: tuple[float, float]):
+    a, b = (Tilted(tilt) for tilt in tilts)
+    true, rng, held = b.true_variance - a.true_variance, np.random.default_rng(5), 0
+    for number in range(RUNS):
+        first, second = a.draw(rng, 200, b)
+        settings = replace(SETTINGS, resamples=400, seed=number)
+        held += true in compare([first], [second], ["Var"], settings).differences[0].images
+    print(tilts, held / RUNS)
+    assert held / RUNS >= 0.9
 
 
 @pytest.mark.parametrize("training_sd", [0.05, 0.15, 0.5])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -270,3 +271,7 @@ def test_a_class_that_occurs_nowhere_counts_as_the_table_says() -> None:
     for absent, wanted in (("released", 50.0), ("exclude", 100.0)):
         asked = table((Row(label="a", experiment="crm"),), (column,), absent=absent)
         assert score("t", asked, runs, scale="demo").cells["a", "mIoU"].mean == wanted
+        # Without a convention of its own the table takes that of the counts.
+        counted = {("a", 0): outcome("k", replace(right(100), absent=absent))}
+        plain = table((Row(label="a", experiment="crm"),), (column,))
+        assert score("t", plain, counted, scale="demo").cells["a", "mIoU"].mean == wanted

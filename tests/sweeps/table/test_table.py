@@ -62,7 +62,7 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
     write(tmp_path)
     table = load_table("my/ablation", tmp_path)
     assert [row.label for row in table.rows] == ["small", "large"]
-    assert (table.unit, table.regions, table.absent) == ("percent", "as trained", "released")
+    assert (table.unit, table.regions, table.absent) == ("percent", "as trained", None)
     assert table.columns[1].best == "highest"
     assert table.rows[0].values == {}
     assert table.rows[0].overrides == ("masker.sigma_div=1",)

@@ -105,7 +105,9 @@ function classTable(runs) {
   const rows = classes.map((name, k) => el("tr", {}, el("th", { scope: "row" }, unscored.includes(name) ? `${name} (not in means)` : name),
     el("td", { class: "number" }, fixed(score(runs, `class/${name}`))), cells[k].map((value) => heatCell(value, range))));
   const head = el("tr", {}, el("th", { scope: "col" }, "class"), el("th", { scope: "col", class: "number" }, "image"), heads);
-  return scrollBox("IoU by class and region", el("table", { class: "plain heat" }, el("thead", {}, head), el("tbody", {}, rows)));
+  const table = scrollBox("IoU by class and region", el("table", { class: "plain heat" }, el("thead", {}, head), el("tbody", {}, rows)));
+  const notes = [...new Set(runs.flatMap((run) => run.notes))];
+  return el("div", {}, table, notes.map((note) => el("p", { class: "muted" }, note)));
 }
 
 function heatCell(value, range) {

@@ -1,0 +1,61 @@
+"""Footnotes of a table by class: which classes are absent, and how they count in its means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.metrics.metric import Absent
+
+COUNTED: dict[Absent, str] = {"released": "counted as 0", "exclude": "left out of the mean"}
+
+
+def absent_notes(
+    by_region: NDArray[np.integer],
+    classes: Sequence[str],
+    scored: NDArray[np.bool_],
+    split: str,
+    absent: Absent,
+) -> tuple[str, ...]:
+    """Why means over classes are over fewer classes, or hold a 0 that no prediction earned.
+
+    A class is absent where it is neither labelled nor predicted. One that is predicted although no
+    label holds it has an IoU of 0 with either convention (see `rgbt.metrics.scores`).
+
+    Args:
+        by_region: (R, K, K) counts of all images, rows = label, columns = prediction.
+        classes: K names.
+        scored: (K,), which classes means are over; the others are not mentioned.
+        split: name of the split.
+        absent: the convention of the table.
+
+    Returns:
+        at most three sentences without a full stop: absent classes, classes that are predicted
+        only, and classes that some regions lack.
+    """
+    labelled, predicted = by_region.sum(-1) > 0, by_region.sum(-2) > 0
+    there = labelled | predicted
+    gone = scored & ~there.any(0)
+    unlabelled = scored & there.any(0) & ~labelled.any(0)
+    partly = np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist()
+    notes = []
+    if gone.any():
+        notes.append(f"absent from the {split} split: {_names(classes, gone)} ({COUNTED[absent]})")
+    if unlabelled.any():
+        named = _names(classes, unlabelled)
+        notes.append(f"predicted, but not labelled in the {split} split: {named} (IoU 0)")
+    if partly:
+        lacks = [f"{classes[each]} ({_regions(~there[:, each])})" for each in partly]
+        notes.append(f"absent from some regions: {', '.join(lacks)}; {COUNTED[absent]} there")
+    return tuple(notes)
+
+
+def _names(classes: Sequence[str], chosen: NDArray[np.bool_]) -> str:
+    return ", ".join(name for name, is_chosen in zip(classes, chosen, strict=True) if is_chosen)
+
+
+def _regions(missing: NDArray[np.bool_]) -> str:
+    numbers = [str(number) for number, is_missing in enumerate(missing, start=1) if is_missing]
+    return f"region{'s' * (len(numbers) > 1)} {', '.join(numbers)}"
