@@ -112,6 +112,7 @@ class Scale:
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
         pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
+        few_scenes: whether embedded data sets have a handful of scenes, for ``${scenes:...}``.
     """
 
     name: str
@@ -133,3 +134,4 @@ class Scale:
     warmup_steps: int
     precision: str
     pretrained: bool
+    few_scenes: bool = False
