@@ -86,7 +86,7 @@ def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMa
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     session, split = stored.session, arguments["input"]
-    if split not in session.dataset.splits:
+    if split not in session.dataset.splits or arguments["rgb"] or arguments["thermal"]:
         raise InputError(
             f"input={split}: pseudo-labels are written of a split of {session.dataset.name}; "
             f"name one of {', '.join(session.dataset.splits)}."
@@ -141,10 +141,10 @@ def _pictures(arguments: dict[str, str], session: Session, label_map: LabelMap |
 def _tell_what_was_left_out(images: ToPredict) -> None:
     from rgbt.tracking.terminal import tell
 
-    for name, reason in list(images.skipped.items())[:1]:
-        tell(f"{len(images.skipped)} images were left out; '{name}': {reason}")
+    for reason in list(images.skipped.values())[:1]:
+        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
     for path in images.others[:1]:
-        tell(f"{len(images.others)} images of input belong to no pair and were not read: {path}")
+        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
 
 
 def _chosen(arguments: dict[str, str], session: Session) -> ToPredict:

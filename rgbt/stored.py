@@ -186,9 +186,14 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     for key, value in pairs:
         if _place(key).split(".")[0] in groups:
             continue
-        if key not in known:
+        # A mapping such as dataset.shares is one value, and may be replaced as one.
+        if key not in known and not any(each.startswith(f"{key}.") for each in known):
+            node = key.partition(".")[0]
             open_ones = [each for each in known if _is_changeable(each)]
-            raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
+            near = [each for each in open_ones if each.startswith(f"{node}.")]
+            raise InputError(
+                f"'{key}' is not a key of this run; {nearest(key, near or open_ones)}."
+            )
         OmegaConf.update(config, key, _parsed(key, value))
 
 

@@ -113,7 +113,7 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
         )
     pairs = {pair.name: pair for pair in found.pairs}
     folders = {path, *(file.parent for pair in found.pairs for file in pair[1:])}
-    skipped = {str(rgb): f"there is no {thermal}" for rgb, thermal in found.alone.items()}
+    skipped = {str(rgb): f"{rgb} has no {thermal}." for rgb, thermal in found.alone.items()}
     return ToPredict(
         tuple(pairs),
         lambda name: images.read(*pairs[name]),

@@ -181,8 +181,8 @@ def test_sizes_that_differ(root: Path) -> None:
     write_tiff(root / "train" / "ir" / "2_ir.tif", np.zeros((3, 4), np.uint16))
     dataset = folder(root)
     assert refused(lambda: dataset.read("train_1")) == (
-        "'train_1': RGB is 6x8 pixels but its label is 3x4; both must show the same pixels, align them "
-        f"first: {root / 'train/mask/1.png'}."
+        "'train_1': RGB is 6x8 pixels but its label is 3x4; both must show the same pixels, align "
+        f"them first: {root / 'train/mask/1.png'}."
     )
     assert "RGB is 6x8 pixels but thermal is 3x4" in refused(lambda: dataset.read("train_2"))
 

@@ -131,8 +131,10 @@ class Folder:
         self.unlabelled = unlabelled
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
-        self._check_labels()
-        self._check_night()
+        # New images may be of the day alone, and have no labels.
+        if set(self.splits) - set(unlabelled):
+            self._check_labels()
+            self._check_night()
 
     @property
     def splits(self) -> dict[str, str]:
@@ -249,7 +251,7 @@ class Folder:
         return frozenset(name for split in present for name in self.names(split))
 
     def _check_labels(self) -> None:
-        if self.patterns.label is not None and set(self.splits) - set(self.unlabelled):
+        if self.patterns.label is not None:
             labelled = (
                 frame for name, frame in self.frames.items() if name not in self._without_labels
             )
