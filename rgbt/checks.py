@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,29 @@ def nearest(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
     return f"{hint}known: {', '.join(names)}"
+
+
+def split_list(text: str, what: str) -> list[str]:
+    """The entries of a list as people type it: "a,b", "[a, b]", also one entry alone.
+
+    Example:
+        >>> split_list("[crm, grbm sizes=[240,480]]", "runs")
+        ['crm', 'grbm sizes=[240,480]']
+
+    Args:
+        text: entries with commas between them, in brackets or not; commas within further brackets
+            belong to an entry.
+        what: the entries are, for the message.
+
+    Raises:
+        InputError: an entry is empty.
+    """
+    whole = re.fullmatch(r"\s*\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\s*", text)
+    inner = whole[1] if whole else text
+    words = [word.strip() for word in re.split(r",(?![^\[]*\])", inner)]
+    if not all(words):
+        raise InputError(f"'{text}': expected {what}, with commas between them.")
+    return words
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:

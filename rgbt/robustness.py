@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
     words, overrides = own_words(overrides)
     chosen = chosen_of(arguments["degradations"], words)
-    runs = [word.strip() for word in arguments["run"].split(",")]
+    runs = split_list(arguments["run"], "runs") if arguments["run"] else [""]
     _check_comparable(arguments, overrides, runs)
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
@@ -88,7 +88,7 @@ def chosen_of(text: str, words: Sequence[str]) -> list[Chosen]:
     """
     from rgbt.degraded import NODE, SEED, choose, known_degradations
 
-    names = [name.strip() for name in text.split(",")]
+    names = split_list(text, "degradations")
     names = known_degradations() if names == ["all"] else names
     for word in words:
         key = word.partition("=")[0]

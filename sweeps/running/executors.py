@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 
 import rgbt
+from rgbt.checks import InputError
 
 PRELOADED = (
     *("sweeps.running.executors", "torch", "hydra"),
@@ -26,6 +27,8 @@ PRELOADED = (
 )
 COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
 """Run as programs, and a few lines each: not imported before."""
+
+GPUS = "CUDA_VISIBLE_DEVICES"
 
 GRACE_S = 20.0
 """What a process that is asked to stop may take before it is killed."""
@@ -73,6 +76,32 @@ class LocalExecutor:
         # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
         process.start()
         return LocalJob(process)
+
+
+def check_gpus(gpus: tuple[int, ...] | None) -> None:
+    """Refuse numbers of GPUs that this machine does not have, or does not show to us.
+
+    Raises:
+        InputError: naming the first.
+    """
+    if gpus is None:
+        return
+    shown = os.environ.get(GPUS)
+    if shown is None:
+        import torch  # takes seconds: only where GPUs are named
+
+        known = [str(number) for number in range(torch.cuda.device_count())]
+    else:
+        known = [word.strip() for word in shown.split(",") if word.strip()]
+    for number in gpus:
+        if str(number) not in known:
+            here = f"{GPUS}={shown} shows" if shown is not None else "this machine has"
+            advice = "take some of them" if known else "leave gpus out"
+            raise InputError(
+                f"gpus={list(gpus)}: {here} "
+                f"{'the GPUs ' + ', '.join(known) if known else 'no GPU'}, but not {number}; "
+                f"{advice}."
+            )
 
 
 def own_modules() -> list[str]:
