@@ -50,6 +50,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.stored import open_trained
     from rgbt.tracking.terminal import result_view, show
 
+    if Path(arguments["out"] or "x").is_dir():
+        raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
     words, overrides = own_words(overrides)
     failure = _failure(arguments, words)
     if arguments["regions"] != OWN["regions"]:

@@ -54,12 +54,15 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.degraded import own_words
     from rgbt.failing_images import measure
     from rgbt.stored import open_trained
+    from rgbt.tracking.folder import find_run
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     words, overrides = own_words(overrides)
     chosen = chosen_of(arguments["degradations"], words)
     runs = split_list(arguments["run"], "runs") if arguments["run"] else [""]
     _check_comparable(arguments, overrides, runs)
+    for run in filter(None, runs):  # before the first of them is measured
+        find_run(run, Path(arguments["runs_dir"]))
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     for run in runs:

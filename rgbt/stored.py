@@ -123,6 +123,12 @@ def open_run(
     check(config)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     weights = folder / f"{checkpoint}.pt"
+    if not weights.is_file():
+        raise InputError(
+            f"{folder} has no {weights.name}: the run has not come to its first evaluation; rerun "
+            "its command to resume it"
+            + (", or take checkpoint=last." if (folder / "last.pt").is_file() else ".")
+        )
     payload = load_checkpoint(weights)
     session = open_session(config, label_map)
     for path in sorted(folder.glob("counts_*.npz"))[:1]:
@@ -180,7 +186,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
         own = [f"{key}={value}" for key, value in pairs if _place(key).split(".")[0] == group]
         composed = compose([*own, *search])[group]
         for name in OmegaConf.missing_keys(composed):
-            raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
+            raise InputError(f"'{name}' has no value; give one with {name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)
     known = flatten(config)
     for key, value in pairs:

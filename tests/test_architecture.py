@@ -28,7 +28,8 @@ ALLOWED = {
     "randomness.py": set(),
     "config.py": {"rgbt.checks"},
     "identity.py": {"rgbt.checks", "rgbt.config"},
-    "command.py": {"rgbt.checks", "rgbt.config"},
+    "overrides.py": {"rgbt.checks", "rgbt.config"},
+    "command.py": {"rgbt.checks", "rgbt.config", "rgbt.overrides"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""

@@ -95,12 +95,11 @@ def check_gpus(gpus: tuple[int, ...] | None) -> None:
         known = [word.strip() for word in shown.split(",") if word.strip()]
     for number in gpus:
         if str(number) not in known:
-            here = f"{GPUS}={shown} shows" if shown is not None else "this machine has"
-            advice = "take some of them" if known else "leave gpus out"
+            here = "this machine" if shown is None else f"{GPUS}={shown}"
+            found = f"the GPUs {', '.join(known)} alone; take" if known else "no GPU; omit"
             raise InputError(
-                f"gpus={list(gpus)}: {here} "
-                f"{'the GPUs ' + ', '.join(known) if known else 'no GPU'}, but not {number}; "
-                f"{advice}."
+                f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
+                f"{'some of these' if known else 'gpus'}."
             )
 
 

@@ -96,7 +96,9 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"rgbt: {error}\n")
         return 2
     sheet = contact_sheet(own["seed"], own["first"], factors, own["columns"], own["zoom"])
-    cv2.imwrite(str(out), sheet[..., ::-1])
+    if not out.parent.is_dir() or not cv2.imwrite(str(out), sheet[..., ::-1]):
+        sys.stderr.write(f"rgbt: out={out} cannot be written; name a PNG in an existing folder.\n")
+        return 2
     sys.stdout.write(f"{out}\n")
     return 0
 
