@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the command line answers --help without waiting for torch
     from torch import Tensor
+
+
+EXTENDING = "docs/extending.md has an example"
 
 
 class InputError(ValueError):
@@ -92,3 +96,52 @@ def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[s
         wanted = " x ".join(f"{n}={sizes[n]}" if n in sizes else n for n in names)
         raise ValueError(f"{name}: expected shape {wanted}, got {tuple(tensor.shape)}.")
     return found
+
+
+def check_members(
+    key: str, part: object, attributes: Iterable[str], calls: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse a part of somebody's own that lacks what the lab uses of it.
+
+    Args:
+        key: node of the configuration that names it, for the message.
+        part: any object.
+        attributes: names that it must have.
+        calls: method -> its arguments in order; those that end in "=" are passed by keyword.
+
+    Raises:
+        InputError: naming the class, the member and how it is used.
+    """
+    name = type(part).__name__
+    for attribute in attributes:
+        if not hasattr(part, attribute):
+            raise InputError(f"{key}: {name} has no attribute `{attribute}`; {EXTENDING}.")
+    for method, arguments in calls.items():
+        function = getattr(part, method, None)
+        used = f"{method}({', '.join(arguments).replace('=', '=...')})"
+        if not callable(function):
+            raise InputError(f"{key}: {name} has no method {used}; {EXTENDING}.")
+        by_keyword = {each[:-1]: None for each in arguments if each.endswith("=")}
+        try:
+            inspect.signature(function).bind(
+                *arguments[: len(arguments) - len(by_keyword)], **by_keyword
+            )
+        except TypeError as error:
+            raise InputError(
+                f"{key}: {name}.{method} is called as {used}, which it does not accept ({error}); "
+                f"{EXTENDING}."
+            ) from None
+
+
+def described(value: object) -> str:
+    """What a value is, for a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "None"."""
+    if value is None:
+        return "None"
+    kind = type(value).__name__
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{kind} {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, Mapping):
+        return f"{kind} with {', '.join(map(str, value)) or 'nothing'}"
+    if isinstance(value, str | int | float | bool):
+        return f"{kind} {value!r}"
+    return kind

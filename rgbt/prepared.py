@@ -11,7 +11,16 @@ from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, conf_dir
+from rgbt.contracts import (
+    CheckedLoss,
+    CheckedScheme,
+    check_first_sample,
+    check_regions,
+    check_transform,
+    is_own,
+)
 from rgbt.data.batches import Dataset
+from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
@@ -22,6 +31,7 @@ from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
+from rgbt.maskers.contract import check_masker
 from rgbt.randomness import derive, numpy_generator, torch_generator
 from rgbt.session import Session, decode_ahead, open_session
 from rgbt.tracking.terminal import tell
@@ -143,20 +153,25 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
     _where_to_augment(session)
+    _check_own_parts(session)
     masker: Masker = build(config.masker)
-    if session.transform.crop_hw is not None and not masker.hides_nothing:
+    crop_hw = getattr(session.transform, "crop_hw", None)
+    if crop_hw is None and is_own(masker):
+        crop_hw = _example_hw(session)
+    if crop_hw is not None and not getattr(masker, "hides_nothing", False):
         # One draw for nothing: cells that do not fit the crop are told before the run is begun.
-        centre = torch.zeros(1, 2, dtype=torch.int64)
-        masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
+        check_masker(masker, crop_hw, torch_generator(config.seed, "probe"))
     if not rehearsal:
         _tell_what_is_not_as_published(session)
     loss = build(config.loss)
+    loss = CheckedLoss(loss) if is_own(loss) else loss
     _check_loss(loss, session)
     model = session.fabric.setup_module(session.model)
     scheme = _scheme(session, model=model, loss=loss, masker=masker)
     _check_domains(scheme, session)
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
+    scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     if not rehearsal:
         decode_ahead(
             session,
@@ -164,6 +179,33 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
             *(session.trainer.selection_split, "test"),
         )
     return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
+
+
+def _example_hw(session: Session) -> tuple[int, int]:
+    """Size of the first training example."""
+    sample = _first_readable(session, session.domains.source.split)
+    example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
+    height, width = example.thermal.shape
+    return height, width
+
+
+def _check_own_parts(session: Session) -> None:
+    """Refuse a data set, transform or partition of one's own that does not do what it must.
+
+    Raises:
+        InputError: in the words of `rgbt.contracts`.
+    """
+    dataset, transform = session.dataset, session.transform
+    dataset = dataset.source if isinstance(dataset, Decoded) else dataset
+    splits = [domain.split for domain in session.domains.named.values()]
+    if is_own(dataset):
+        for split in dict.fromkeys((*splits, session.trainer.selection_split, "test")):
+            check_first_sample(dataset, split)
+    if is_own(transform):
+        sample = _first_readable(session, splits[0])
+        check_transform(transform, sample, numpy_generator(session.config.seed, "probe"))
+    if is_own(session.regions):
+        check_regions(session.regions, _first_readable(session, "test").thermal.shape)
 
 
 def _tell_what_is_not_as_published(session: Session) -> None:
@@ -315,9 +357,7 @@ def _check_views(scheme: object, loss: object, session: Session) -> None:
         )
     if isinstance(views, VirtualView):
         # One example for nothing: a camera of other images is told before the run is begun.
-        sample = _first_readable(session, session.domains.source.split)
-        example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
-        _check_camera("scheme", views, example.rgb.shape[:2])
+        _check_camera("scheme", views, _example_hw(session))
     if session.consistency.sets:
         shown = session.transform.test(_first_readable(session, "test"))
         for image in (shown.rgb, shown.label):

@@ -28,6 +28,7 @@ ALLOWED = {
     "randomness.py": set(),
     "config.py": {"rgbt.checks"},
     "identity.py": {"rgbt.checks", "rgbt.config"},
+    "contracts.py": COMMON,
     "overrides.py": {"rgbt.checks", "rgbt.config"},
     "command.py": {"rgbt.checks", "rgbt.config", "rgbt.overrides"},
 }
