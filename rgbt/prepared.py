@@ -11,16 +11,8 @@ from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, conf_dir
-from rgbt.contracts import (
-    CheckedLoss,
-    CheckedScheme,
-    check_first_sample,
-    check_regions,
-    check_transform,
-    is_own,
-)
+from rgbt.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
-from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
@@ -31,12 +23,12 @@ from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
-from rgbt.maskers.contract import check_masker
-from rgbt.randomness import derive, numpy_generator, torch_generator
+from rgbt.probes import check_cells, check_own_parts, example_hw, first_readable
+from rgbt.randomness import derive
 from rgbt.session import Session, decode_ahead, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import VIEWS, Loadable, Masker, Sample, View
+from rgbt.types import VIEWS, Loadable, Masker, View
 
 FUNCTIONS = {
     "sdc": sdc,
@@ -153,14 +145,9 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
     _where_to_augment(session)
-    _check_own_parts(session)
+    check_own_parts(session)
     masker: Masker = build(config.masker)
-    crop_hw = getattr(session.transform, "crop_hw", None)
-    if crop_hw is None and is_own(masker):
-        crop_hw = _example_hw(session)
-    if crop_hw is not None and not getattr(masker, "hides_nothing", False):
-        # One draw for nothing: cells that do not fit the crop are told before the run is begun.
-        check_masker(masker, crop_hw, torch_generator(config.seed, "probe"))
+    check_cells(session, masker)
     if not rehearsal:
         _tell_what_is_not_as_published(session)
     loss = build(config.loss)
@@ -179,33 +166,6 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
             *(session.trainer.selection_split, "test"),
         )
     return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
-
-
-def _example_hw(session: Session) -> tuple[int, int]:
-    """Size of the first training example."""
-    sample = _first_readable(session, session.domains.source.split)
-    example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
-    height, width = example.thermal.shape
-    return height, width
-
-
-def _check_own_parts(session: Session) -> None:
-    """Refuse a data set, transform or partition of one's own that does not do what it must.
-
-    Raises:
-        InputError: in the words of `rgbt.contracts`.
-    """
-    dataset, transform = session.dataset, session.transform
-    dataset = dataset.source if isinstance(dataset, Decoded) else dataset
-    splits = [domain.split for domain in session.domains.named.values()]
-    if is_own(dataset):
-        for split in dict.fromkeys((*splits, session.trainer.selection_split, "test")):
-            check_first_sample(dataset, split)
-    if is_own(transform):
-        sample = _first_readable(session, splits[0])
-        check_transform(transform, sample, numpy_generator(session.config.seed, "probe"))
-    if is_own(session.regions):
-        check_regions(session.regions, _first_readable(session, "test").thermal.shape)
 
 
 def _tell_what_is_not_as_published(session: Session) -> None:
@@ -287,7 +247,7 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
     """Refuse labels that the data set does not have, and tell of those that it is tested on."""
     if domain.labels != GIVEN:
         return
-    if _first_readable(session, domain.split).label is None:
+    if first_readable(session, domain.split).label is None:
         raise InputError(
             f"domains.{name}.labels=given, but {session.dataset.name} has no labels of "
             f"{domain.split}; name pseudo-labels (experiment:thermal_teacher/best.pt), or set it "
@@ -357,9 +317,9 @@ def _check_views(scheme: object, loss: object, session: Session) -> None:
         )
     if isinstance(views, VirtualView):
         # One example for nothing: a camera of other images is told before the run is begun.
-        _check_camera("scheme", views, _example_hw(session))
+        _check_camera("scheme", views, example_hw(session))
     if session.consistency.sets:
-        shown = session.transform.test(_first_readable(session, "test"))
+        shown = session.transform.test(first_readable(session, "test"))
         for image in (shown.rgb, shown.label):
             _check_camera("consistency", session.consistency.view, image.shape[:2])
 
@@ -369,20 +329,6 @@ def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> No
         view.camera.matrix(image_hw)
     except InputError as error:
         raise InputError(f"{node}.view.{error}") from error
-
-
-def _first_readable(session: Session, split: str) -> Sample:
-    """The first sample of a split; unreadable ones are passed over where the run does so too."""
-    refused: InputError | None = None
-    for name in session.dataset.names(split):
-        try:
-            return session.dataset.read(name)
-        except InputError as error:
-            if session.loading.on_error == "raise":
-                raise
-            refused = refused or error
-    assert refused is not None, "a split holds a name"
-    raise refused
 
 
 def _check_domains(scheme: object, session: Session) -> None:

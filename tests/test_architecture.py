@@ -50,6 +50,7 @@ MEETING_PLACES = {
     "robustness.py",
     "training.py",
     "prepared.py",
+    "probes.py",
     "earlier.py",
     "naming.py",
     "pretrained.py",
