@@ -252,8 +252,7 @@ def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> Non
 
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
-    path = Path(__file__).resolve().parents[2] / "conf/dataset/synth_freiburg.yaml"
-    node = OmegaConf.to_container(OmegaConf.load(path))
+    node = OmegaConf.to_container(compose(["dataset=synth_freiburg"]).dataset, resolve=True)
     assert node.pop("_target_") == "rgbt.data.synth.freiburg.synth_freiburg"
     parameters = inspect.signature(synth_freiburg).parameters
     defaults = {name: parameter.default for name, parameter in parameters.items()}
