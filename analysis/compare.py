@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from analysis.arguments import MOST, blocks_of, decimal, out_folder, refuse_others, whole
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError, check_choice, split_list
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
     from rgbt.metrics.pairs import HEADLINES, protocol_of
 
     if text != "auto":
-        return [word.strip() for word in text.split(",")]
+        return split_list(text, "metrics")
     headlines: tuple[str, ...] = (names.MIOU,)
     by_region = [names.VAR, *map(names.region, range(1, every[0].counts.shape[1] + 1))]
     protocol = protocol_of(every[0].partition)

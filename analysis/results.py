@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
 from rgbt.tracking.folder import RunFolder, find_run, runs_in
@@ -21,6 +20,9 @@ GROUP = "rgbt.group"
 """Tag that the seeds of one method share (`rgbt.naming`)."""
 
 SEED = "rgbt.seed"
+
+RUNS = "runs, files of counts or a group"
+"""What is listed, for messages."""
 
 Frames = Literal["", "aligned", "released", "next"]
 """Counts of single frames, or of pairs of frames by one protocol."""
@@ -66,7 +68,7 @@ def open_counts(
     root = Path(runs_dir)
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
     is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
-    words = [text] if is_whole else split_words(text)
+    words = [text] if is_whole else split_list(text, RUNS)
     found = [stored for word in words for stored in _open(word, root, split, frames)]
     for stored in found:
         _check_asked_for(stored, split, frames)
@@ -121,17 +123,6 @@ def groups_in(runs_dir: Path | str) -> list[str]:
 def label_of(stored: tuple[Stored, ...]) -> str:
     """What a method is called: its group, or all that its counts are called."""
     return " + ".join(dict.fromkeys(each.label for each in stored))
-
-
-def split_words(text: str) -> list[str]:
-    """The entries of a list with commas between them; InputError where one is empty."""
-    # Not at the commas of "grbm train_sizes=[240,480]".
-    words = [word.strip() for word in re.split(r",(?![^\[]*\])", text)]
-    if not all(words):
-        raise InputError(
-            f"'{text}': expected runs, files of counts or a group, with commas between them."
-        )
-    return words
 
 
 def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[Stored]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from analysis.results import Stored, open_counts, split_words
-from rgbt.checks import InputError, nearest, read_json
+from analysis.results import RUNS, Stored, open_counts
+from rgbt.checks import InputError, nearest, read_json, split_list
 from rgbt.metrics.counts import Counts
 
 FOLDER = Path("evaluations") / "robustness"
@@ -74,7 +74,7 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
         InputError: there is no such thing, or it was not measured.
     """
     found = []
-    for word in split_words(text):
+    for word in split_list(text, RUNS):
         place = Path(word).expanduser()
         if (place / f"{CLEAN}.json").is_file():
             found.append(Training(place.name, place, levels_of(place)))

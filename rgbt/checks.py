@@ -7,11 +7,13 @@ A constructor that a configuration names declares the range of each setting in i
 from __future__ import annotations
 
 import difflib
+import inspect
 import json
 import os
+import re
 import stat
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -103,6 +105,9 @@ NumPoints = Annotated[int, Interval(ge=1, le=10**6), doc("points held in memory 
 def rising(ends: tuple[float, ...]) -> bool:
     """Whether no number is smaller than the one before it."""
     return all(a <= b for a, b in zip(ends, ends[1:], strict=False))
+
+
+EXTENDING = "docs/extending.md has an example"
 
 
 class InputError(ValueError):
@@ -306,6 +311,29 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f"{hint}known: {', '.join(names)}"
 
 
+def split_list(text: str, what: str) -> list[str]:
+    """The entries of a list as people type it: "a,b", "[a, b]", also one entry alone.
+
+    Example:
+        >>> split_list("[crm, grbm sizes=[240,480]]", "runs")
+        ['crm', 'grbm sizes=[240,480]']
+
+    Args:
+        text: entries with commas between them, in brackets or not; commas within further brackets
+            belong to an entry.
+        what: the entries are, for the message.
+
+    Raises:
+        InputError: an entry is empty.
+    """
+    whole = re.fullmatch(r"\s*\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\s*", text)
+    inner = whole[1] if whole else text
+    words = [word.strip() for word in re.split(r",(?![^\[]*\])", inner)]
+    if not all(words):
+        raise InputError(f"'{text}': expected {what}, with commas between them.")
+    return words
+
+
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise InputError unless low <= value <= high (NaN never passes)."""
     if not low <= value <= high:
@@ -352,3 +380,52 @@ def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[s
         wanted = " x ".join(f"{n}={sizes[n]}" if n in sizes else n for n in names)
         raise ValueError(f"{name}: expected shape {wanted}, got {tuple(tensor.shape)}.")
     return found
+
+
+def check_members(
+    key: str, part: object, attributes: Iterable[str], calls: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse a part of somebody's own that lacks what the lab uses of it.
+
+    Args:
+        key: node of the configuration that names it, for the message.
+        part: any object.
+        attributes: names that it must have.
+        calls: method -> its arguments in order; those that end in "=" are passed by keyword.
+
+    Raises:
+        InputError: naming the class, the member and how it is used.
+    """
+    name = type(part).__name__
+    for attribute in attributes:
+        if not hasattr(part, attribute):
+            raise InputError(f"{key}: {name} has no attribute `{attribute}`; {EXTENDING}.")
+    for method, arguments in calls.items():
+        function = getattr(part, method, None)
+        used = f"{method}({', '.join(arguments).replace('=', '=...')})"
+        if not callable(function):
+            raise InputError(f"{key}: {name} has no method {used}; {EXTENDING}.")
+        by_keyword = {each[:-1]: None for each in arguments if each.endswith("=")}
+        try:
+            inspect.signature(function).bind(
+                *arguments[: len(arguments) - len(by_keyword)], **by_keyword
+            )
+        except TypeError as error:
+            raise InputError(
+                f"{key}: {name}.{method} is called as {used}, which it does not accept ({error}); "
+                f"{EXTENDING}."
+            ) from None
+
+
+def described(value: object) -> str:
+    """What a value is, for a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "None"."""
+    if value is None:
+        return "None"
+    kind = type(value).__name__
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{kind} {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, Mapping):
+        return f"{kind} with {', '.join(map(str, value)) or 'nothing'}"
+    if isinstance(value, str | int | float | bool):
+        return f"{kind} {value!r}"
+    return kind

@@ -18,12 +18,13 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from hydra.errors import HydraException
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.config import build, check, check_node, compose, conf_dir, register_resolvers
+from rgbt.overrides import check_words, hydra_sentence
 from rgbt.resources import reporting_exhaustion
 from rgbt.stopping import Stopped, answered
 
@@ -61,7 +62,7 @@ def command(
                 codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
 
             with answered():
-                code = max([_report(lambda: _compose(config_name, job)), *codes])
+                code = max([_report(lambda: _compose(config_name, job, words)), *codes])
             sys.exit(code)
 
         return entry
@@ -98,7 +99,8 @@ def _checked(main: Main, config: DictConfig) -> int | None:
     return main(config)
 
 
-def _compose(config_name: str, job: Callable[[DictConfig], None]) -> None:
+def _compose(config_name: str, job: Callable[[DictConfig], None], words: Sequence[str]) -> None:
+    check_words(words)
     # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Hydra's root logger shows the INFO lines of every library.
@@ -123,7 +125,9 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
         return _say(str(error), 1)
     except (HydraException, OmegaConfBaseException) as error:
         words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        return _say(_hydra_sentence(error, words), 2)
+        return _say(hydra_sentence(error, words), 2)
+    except (FileExistsError, NotADirectoryError) as error:
+        return _say(f"{error.filename}: a file is where a folder is needed; name another path.", 2)
     except OSError as error:
         return _say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
     except Stopped as stop:
@@ -151,7 +155,7 @@ def composing(overrides: Sequence[str]) -> Iterator[None]:
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(_hydra_sentence(error, overrides)) from error
+        raise InputError(hydra_sentence(error, overrides)) from error
 
 
 def built(node: str, overrides: Sequence[str]) -> Any:
@@ -168,53 +172,6 @@ def built(node: str, overrides: Sequence[str]) -> Any:
         config = compose(overrides)
         check_node(config[node], node)
         return build(config[node])
-
-
-def _hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
-    """What Hydra or OmegaConf refused, in one sentence with the nearest known name."""
-    if isinstance(error, MissingConfigException) and error.options:
-        group, _, name = (error.missing_cfg_file or "").rpartition("/")
-        return f"there is no {group or 'configuration'} '{name}'; {nearest(name, error.options)}."
-    if isinstance(error, MissingConfigException):
-        known = sorted(path.name for path in conf_dir().iterdir() if path.is_dir())
-        match = re.search(r"'([^']+?)(?:/[^'/]*)?'", str(error))
-        group = match.group(1) if match else "?"
-        return f"there is no group '{group}'; {nearest(group, known)}."
-    if isinstance(error, OverrideParseException):
-        return (
-            f"'{error.override}' is no override; expected key=value, with quotes around a value "
-            "that holds commas, brackets or spaces: 'key=\"a, b\"'."
-        )
-    text = " ".join(str(error.__cause__ or error).split())
-    key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
-    if key:
-        return _unknown_key(key.group(2), overrides)
-    first = str(error).splitlines()[0].rstrip(".")
-    return f"{first}; see `python -m rgbt.run --help`."
-
-
-def _composed_without(full_key: str, overrides: Sequence[str]) -> DictConfig:
-    """The configuration that was asked for, but for the key that it does not know."""
-    others = [word for word in overrides if word.lstrip("+~").partition("=")[0] != full_key]
-    try:
-        return compose(others)
-    except HydraException:  # a second mistake, or the comma lists of a grid
-        return compose([])
-
-
-def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
-    sweeper = conf_dir() / "hydra" / "sweeper" / "study.yaml"
-    if full_key.startswith("hydra.sweeper.") and full_key.count(".") == 2:
-        settings = [str(key) for key in OmegaConf.load(sweeper) if key != "_target_"]
-        last = full_key.rpartition(".")[2]
-        return f"'{full_key}' is not a setting of a sweep; {nearest(last, settings)}."
-    config = _composed_without(full_key, overrides)
-    *parents, last = full_key.split(".")
-    node: object = config
-    for parent in parents:
-        node = node.get(parent) if isinstance(node, DictConfig) else None
-    known = [str(key) for key in node if key != "_target_"] if isinstance(node, DictConfig) else []
-    return f"'{full_key}' is not a key of the configuration; {nearest(last, known)}."
 
 
 def plain_command(

@@ -74,13 +74,22 @@ def _own_hydra() -> Iterator[None]:
 
 
 def register_resolvers() -> None:
-    """``${px:64}``: 64 pixels of the paper's images, scaled to the images of the chosen scale."""
-    if not OmegaConf.has_resolver("px"):
-        OmegaConf.register_new_resolver("px", _scaled_pixels)
+    """What configuration files may say beside values, by the chosen scale.
+
+    ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
+    ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
+    """
+    for name, resolve in (("px", _scaled_pixels), ("scenes", _num_scenes)):
+        if not OmegaConf.has_resolver(name):
+            OmegaConf.register_new_resolver(name, resolve)
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
     return round(pixels * float(_root_.scale.pixel_factor))
+
+
+def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:
+    return few if _root_.scale.get("few_scenes", False) else usually
 
 
 def check(config: DictConfig) -> None:

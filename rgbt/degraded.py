@@ -17,8 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build, check_node, conf_dir
+from rgbt.contracts import check_degradation, check_sample, is_own
 from rgbt.degradations.dataset import Degraded, settings_of
-from rgbt.degradations.degradation import Degradation
+from rgbt.degradations.degradation import Degradation, OfTime
 from rgbt.session import Session
 from rgbt.stored_config import load_config
 from rgbt.yaml_files import parse_yaml
@@ -111,6 +112,10 @@ class Failure:
         """`session` that reads `split` under this failure."""
         kind, seed = self.chosen.degradation, self.chosen.seed
         seen = Degraded(session.dataset, kind, self.severity, split=split, seed=seed)
+        if is_own(kind) and not isinstance(kind, OfTime):
+            first = seen.names(split)[0]
+            returned = f"degradation: {type(kind).__name__}.__call__ returned"
+            check_sample(returned, seen.read(first), first)
         return replace(session, dataset=seen)
 
 
@@ -140,9 +145,12 @@ def choose(name: str, words: Sequence[str] = (), trust: Collection[str] = ()) ->
         if key != SEED:
             OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
     check_node(node, NODE)
+    kind = build(node)
+    if is_own(kind) and not isinstance(kind, OfTime):
+        check_degradation(kind)
     return Chosen(
         name=path.stem,
-        degradation=build(node),
+        degradation=kind,
         changes=tuple(f"{key}={value}" for key, value in pairs if key not in (SEED, "severities")),
         seed=_seed([value for key, value in pairs if key == SEED]),
     )

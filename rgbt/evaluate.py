@@ -54,6 +54,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.stored_config import parse_trust
     from rgbt.tracking.terminal import result_view, show
 
+    if Path(arguments["out"] or "x").is_dir():
+        raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
     words, overrides = own_words(overrides)
     trust = parse_trust(arguments["trust"])
     failure = _failure(arguments, words, trust)

@@ -6,7 +6,7 @@ labels and confidences of a split instead, to train other networks on (`rgbt.pse
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
@@ -19,13 +19,16 @@ if TYPE_CHECKING:
 
     from rgbt.data.domains import TestedHead
     from rgbt.data.label_map import LabelMap
+    from rgbt.data.to_predict import ToPredict
     from rgbt.session import Session
     from rgbt.stored import Stored
     from rgbt.types import Sample, View
 
 OWN = {
     "run": "",
-    "input": None,
+    "input": "",
+    "rgb": "",
+    "thermal": "",
     "out": None,
     "runs_dir": "runs",
     "modality": "default",
@@ -43,7 +46,10 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
     run       run folder, config key or MLflow run id; without one, name a network and its weights:
               model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)
-    input     a 4-channel PNG (R, G, B, thermal), a folder of such, or a split of the data set
+    input     a folder of new images, laid out as the data set of the run, or with folders rgb and
+              thermal of equal names; PNG of four channels (R, G, B, thermal), one or a folder of
+              such; or a split of the data set. Labels are not needed
+    rgb, thermal  instead: the two files of one pair
     out       folder, made where it is missing
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     head      of a network with a head per domain: own, source or target
@@ -85,7 +91,7 @@ def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMa
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     session, split = stored.session, arguments["input"]
-    if split not in session.dataset.splits:
+    if split not in session.dataset.splits or arguments["rgb"] or arguments["thermal"]:
         raise InputError(
             f"input={split}: pseudo-labels are written of a split of {session.dataset.name}; "
             f"name one of {', '.join(session.dataset.splits)}."
@@ -119,26 +125,51 @@ def _pictures(arguments: dict[str, str], session: Session, label_map: LabelMap |
     from rgbt.tracking.pictures import overlay
 
     view, head = view_of(session, arguments["modality"]), _head(arguments["head"])
-    samples, total = _samples(session, arguments["input"])
-    out = Path(arguments["out"])
-    if out.resolve() in (
-        Path(arguments["input"]).resolve(),
-        Path(arguments["input"]).parent.resolve(),
-    ):
-        raise InputError(
-            f"out={out} holds the input images, which would be overwritten; take another."
-        )
+    images, out = _chosen(arguments, session), Path(arguments["out"])
+    images.check_out(out)
     out.mkdir(parents=True, exist_ok=True)
     palette = np.array(session.dataset.palette, np.uint8)
+    written = 0
     with progress() as display:
-        task = display.add_task("predicting", total=total, note="images")
-        for sample, predicted in _classes(session, samples, view, head):
+        task = display.add_task("predicting", total=len(images.names), note="images")
+        for sample, predicted in _classes(session, images, view, head):
             classes = predicted if label_map is None else label_map(predicted)
             painted = overlay(sample.rgb, classes, palette)
             _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
             _write(out / f"{sample.name}.png", classes)
+            written += 1
             display.advance(task)
-    print(f"{total} images in {out.resolve()}")
+    _tell_what_was_left_out(images)
+    print(f"{written} images in {out.resolve()}")
+
+
+def _tell_what_was_left_out(images: ToPredict) -> None:
+    from rgbt.tracking.terminal import tell
+
+    for reason in list(images.skipped.values())[:1]:
+        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
+    for path in images.others[:1]:
+        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
+
+
+def _chosen(arguments: dict[str, str], session: Session) -> ToPredict:
+    """The images that `input`, or `rgb` and `thermal`, name."""
+    from rgbt.data.to_predict import of_files, of_path, of_split
+
+    source, rgb, thermal = (arguments[key] for key in ("input", "rgb", "thermal"))
+    if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
+        raise InputError(
+            "expected either input=FOLDER (or a split, or a file of four channels) or rgb=FILE "
+            "thermal=FILE, got "
+            + (" and ".join(key for key in ("input", "rgb", "thermal") if arguments[key]) or "none")
+            + " of input, rgb and thermal."
+        )
+    dataset = session.dataset
+    if rgb:
+        return of_files(dataset, Path(rgb), Path(thermal))
+    if source in dataset.splits:
+        return of_split(dataset, source)
+    return of_path(dataset, source, session.loading.on_error)
 
 
 def _head(asked: str) -> TestedHead | None:
@@ -161,41 +192,18 @@ def _write(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _classes(
-    session: Session, samples: Iterable[Sample], view: View, head: TestedHead | None
+    session: Session, images: ToPredict, view: View, head: TestedHead | None
 ) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
     from rgbt.data.batches import collate
     from rgbt.engine.evaluate import predictions
     from rgbt.session import heads_of
 
     heads = heads_of(session, view, head)
-    for sample in samples:
+    for sample in images.samples(session.loading.on_error):
         # One image at a time: a folder may hold images of any size.
         batch = collate([session.transform.test(sample)], "")
         for found in predictions(session.model, [batch], session.fabric, view, heads):
             yield sample, found.classes[0].numpy()
-
-
-def _samples(session: Session, source: str) -> tuple[Iterator[Sample], int]:
-    """The images that `source` names, and how many they are."""
-    from rgbt.data.files import read_packed
-    from rgbt.types import Sample
-
-    dataset, path = session.dataset, Path(source)
-    if source in dataset.splits:
-        names = dataset.names(source)
-        return (dataset.read(name) for name in names), len(names)
-    files = sorted(path.glob("*.png")) if path.is_dir() else [path]
-    if not path.exists() or not files:
-        raise InputError(
-            f"input={source}: expected a 4-channel PNG, a folder that holds some, or a split of "
-            f"{dataset.name} ({', '.join(dataset.splits)})."
-        )
-
-    def read(file: Path) -> Sample:
-        rgb, thermal = read_packed(file)
-        return Sample(rgb=rgb, thermal=thermal, label=None, name=file.stem)
-
-    return map(read, files), len(files)
 
 
 if __name__ == "__main__":

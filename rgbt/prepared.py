@@ -11,6 +11,7 @@ from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config import build, conf_dir
+from rgbt.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
@@ -22,11 +23,12 @@ from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
-from rgbt.randomness import derive, numpy_generator, torch_generator
+from rgbt.probes import check_cells, check_own_parts, example_hw, first_readable
+from rgbt.randomness import derive
 from rgbt.session import Session, decode_ahead, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import VIEWS, Loadable, Masker, Sample, View
+from rgbt.types import VIEWS, Loadable, Masker, View
 
 FUNCTIONS = {
     "sdc": sdc,
@@ -143,20 +145,20 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
     _where_to_augment(session)
+    check_own_parts(session)
     masker: Masker = build(config.masker)
-    if session.transform.crop_hw is not None and not masker.hides_nothing:
-        # One draw for nothing: cells that do not fit the crop are told before the run is begun.
-        centre = torch.zeros(1, 2, dtype=torch.int64)
-        masker(session.transform.crop_hw, centre, torch_generator(config.seed, "probe"))
+    check_cells(session, masker)
     if not rehearsal:
         _tell_what_is_not_as_published(session)
     loss = build(config.loss)
+    loss = CheckedLoss(loss) if is_own(loss) else loss
     _check_loss(loss, session)
     model = session.fabric.setup_module(session.model)
     scheme = _scheme(session, model=model, loss=loss, masker=masker)
     _check_domains(scheme, session)
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
+    scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     if not rehearsal:
         decode_ahead(
             session,
@@ -245,7 +247,7 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
     """Refuse labels that the data set does not have, and tell of those that it is tested on."""
     if domain.labels != GIVEN:
         return
-    if _first_readable(session, domain.split).label is None:
+    if first_readable(session, domain.split).label is None:
         raise InputError(
             f"domains.{name}.labels=given, but {session.dataset.name} has no labels of "
             f"{domain.split}; name pseudo-labels (experiment:thermal_teacher/best.pt), or set it "
@@ -315,11 +317,9 @@ def _check_views(scheme: object, loss: object, session: Session) -> None:
         )
     if isinstance(views, VirtualView):
         # One example for nothing: a camera of other images is told before the run is begun.
-        sample = _first_readable(session, session.domains.source.split)
-        example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
-        _check_camera("scheme", views, example.rgb.shape[:2])
+        _check_camera("scheme", views, example_hw(session))
     if session.consistency.sets:
-        shown = session.transform.test(_first_readable(session, "test"))
+        shown = session.transform.test(first_readable(session, "test"))
         for image in (shown.rgb, shown.label):
             _check_camera("consistency", session.consistency.view, image.shape[:2])
 
@@ -329,20 +329,6 @@ def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> No
         view.camera.matrix(image_hw)
     except InputError as error:
         raise InputError(f"{node}.view.{error}") from error
-
-
-def _first_readable(session: Session, split: str) -> Sample:
-    """The first sample of a split; unreadable ones are passed over where the run does so too."""
-    refused: InputError | None = None
-    for name in session.dataset.names(split):
-        try:
-            return session.dataset.read(name)
-        except InputError as error:
-            if session.loading.on_error == "raise":
-                raise
-            refused = refused or error
-    assert refused is not None, "a split holds a name"
-    raise refused
 
 
 def _check_domains(scheme: object, session: Session) -> None:

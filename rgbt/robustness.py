@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 from rgbt.command import plain_command
 
 if TYPE_CHECKING:
@@ -57,13 +57,16 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.failing_images import measure
     from rgbt.stored import open_trained
     from rgbt.stored_config import parse_trust
+    from rgbt.tracking.folder import find_run
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     words, overrides = own_words(overrides)
     trust = parse_trust(arguments["trust"])
     chosen = chosen_of(arguments["degradations"], words, trust)
-    runs = [word.strip() for word in arguments["run"].split(",")]
+    runs = split_list(arguments["run"], "runs") if arguments["run"] else [""]
     _check_comparable(arguments, overrides, runs)
+    for run in filter(None, runs):  # before the first of them is measured
+        find_run(run, Path(arguments["runs_dir"]))
     if arguments["regions"] != OWN["regions"]:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     for run in runs:
@@ -94,7 +97,7 @@ def chosen_of(text: str, words: Sequence[str], trust: Collection[str] = ()) -> l
     """
     from rgbt.degraded import NODE, SEED, choose, known_degradations
 
-    names = [name.strip() for name in text.split(",")]
+    names = split_list(text, "degradations")
     names = known_degradations() if names == ["all"] else names
     for word in words:
         key = word.partition("=")[0]

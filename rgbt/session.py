@@ -20,6 +20,7 @@ from torch import nn
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config import build
+from rgbt.contracts import check_dataset, is_own, watch_model
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.decoded.dataset import Decoded, decoded_dataset
 from rgbt.data.domains import Domains, TestedHead
@@ -99,10 +100,13 @@ def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Sessi
         torch.manual_seed(derive(config.seed, "weights"))
         model: nn.Module = build(config.model)
     loading: LoaderSettings = build(config.data)
-    dataset: LabelledDataset = decoded_dataset(
-        build(config.dataset), loading.cache, num_threads=len(os.sched_getaffinity(0))
-    )
+    files: LabelledDataset = build(config.dataset)
+    if is_own(files):
+        check_dataset(files)
+    dataset = decoded_dataset(files, loading.cache, num_threads=len(os.sched_getaffinity(0)))
     _check_classes(config, dataset, label_map)
+    if is_own(model):
+        watch_model(model, config.model.get("num_classes", dataset.num_classes))
     weights = start(model, config)
     return Session(
         config=config,

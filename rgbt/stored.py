@@ -133,6 +133,12 @@ def open_run(
     check(config)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     weights = folder / f"{checkpoint}.pt"
+    if not weights.is_file():
+        raise InputError(
+            f"{folder} has no {weights.name}: the run has not come to its first evaluation; rerun "
+            "its command to resume it"
+            + (", or take checkpoint=last." if (folder / "last.pt").is_file() else ".")
+        )
     payload = load_checkpoint(weights)
     session = open_session(config, label_map)
     for path in sorted(folder.glob("counts_*.npz"))[:1]:
@@ -195,15 +201,20 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
         own = [f"{key}={value}" for key, value in pairs if _place(key).split(".")[0] == group]
         composed = compose([*own, *search])[group]
         for name in OmegaConf.missing_keys(composed):
-            raise InputError(f"'{group}.{name}' has no value; give one with {group}.{name}=...")
+            raise InputError(f"'{name}' has no value; give one with {name}=...")
         config[group] = OmegaConf.to_container(composed, resolve=True)
     known = flatten(config)
     for key, value in pairs:
         if _place(key).split(".")[0] in groups:
             continue
-        if key not in known:
+        # A mapping such as dataset.shares is one value, and may be replaced as one.
+        if key not in known and not any(each.startswith(f"{key}.") for each in known):
+            node = key.partition(".")[0]
             open_ones = [each for each in known if _is_changeable(each)]
-            raise InputError(f"'{key}' is not a key of this run; {nearest(key, open_ones)}.")
+            near = [each for each in open_ones if each.startswith(f"{node}.")]
+            raise InputError(
+                f"'{key}' is not a key of this run; {nearest(key, near or open_ones)}."
+            )
         OmegaConf.update(config, key, parse_yaml(value, key))
     if "metric.absent" not in [_place(key) for key, _ in pairs]:
         config.metric.absent = absent if by_hand else config.dataset.get("absent", "exclude")

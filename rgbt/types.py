@@ -207,7 +207,12 @@ class Network(Protocol):
 
 
 class Masker(Protocol):
-    """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`)."""
+    """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`).
+
+    A crop is padded at the bottom and right to multiples of 32 pixels before cells are cut
+    (`rgbt.geometry.padding.padded_hw`: 120 x 160 becomes 128 x 160), so that h and w divide the
+    padded height and width.
+    """
 
     hides_nothing: bool
 

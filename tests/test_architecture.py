@@ -30,12 +30,14 @@ ALLOWED = {
     "yaml_files.py": {"rgbt.checks"},
     "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
     "stopping.py": set(),
-    "command.py": {"rgbt.checks", "rgbt.config", "rgbt.resources", "rgbt.stopping"},
     "resources.py": {"rgbt.checks"},
     "identity.py": {"rgbt.checks", "rgbt.config", "rgbt.source_code"},
     "source_code.py": set(),
     "values.py": {"rgbt.checks"},
     "config.py": {"rgbt.checks", "rgbt.values"},
+    "contracts.py": COMMON,
+    "overrides.py": {"rgbt.checks", "rgbt.config"},
+    "command.py": COMMON | {"rgbt.config", "rgbt.overrides", "rgbt.resources", "rgbt.stopping"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config", "rgbt.values"}
 """What a command line (a module with `if __name__ == "__main__"`) may import too."""
@@ -55,6 +57,7 @@ MEETING_PLACES = {
     "robustness.py",
     "training.py",
     "prepared.py",
+    "probes.py",
     "earlier.py",
     "naming.py",
     "pretrained.py",

@@ -3,65 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rgbt.checks import InputError
+from rgbt.config import check, compose
+from rgbt.randomness import numpy_generator
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data
-
-MODULE = '''
-import torch
-from torch import nn
-from rgbt.types import MaskPair, Output
-
-
-class Halves:
-    """Hides the left half of the thermal image."""
-
-    hides_nothing = False
-
-    def __init__(self, *, cell: int) -> None:
-        self.cell = cell
-
-    def __call__(self, image_hw, centre_yx, generator):
-        rgb = torch.zeros(len(centre_yx), 2, 2, dtype=torch.bool)
-        thermal = rgb.clone()
-        thermal[..., 0] = True
-        return MaskPair(rgb, thermal)
-
-
-class Plain(nn.Module):
-    """Two convolutions on four channels; hidden cells are set to zero."""
-
-    def __init__(self, *, num_classes: int, width: int = 8) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Conv2d(4, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, num_classes, 1)
-        )
-
-    def forward(self, rgb, thermal, masks=None, *, views=("rgbt",), generator=None):
-        if masks is not None:
-            size = thermal.shape[-2:]
-            hidden = nn.functional.interpolate(masks.thermal[:, None].float(), size=size)
-            thermal = thermal * (1 - hidden)
-        return Output(self.layers(torch.cat([rgb, thermal], 1)), {})
-'''
-FILES = {
-    "model/plain.yaml": "_target_: my_lab.Plain\nnum_classes: ${dataset.num_classes}\nwidth: 4\n",
-    "masker/halves.yaml": "_target_: my_lab.Halves\ncell: 4\n",
-    "experiment/mine.yaml": """# @package _global_
-defaults:
-  - override /model: plain
-  - override /masker: halves
-  - override /loss: cross_entropy
-  - override /scheme: supervised
-name: mine
-""",
-}
-
 
 VIEW = '''
 from dataclasses import replace
@@ -129,37 +83,100 @@ def test_a_second_frame_of_ones_own_is_trained_on(
     assert_one_sentence(err, "did you mean 'columns'?")
 
 
-def test_own_parts_run_from_outside_the_repository(
-    write_mfnet: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+
+
+def written(root: Path) -> Path:
+    """The files of the page, by the name in the first line of each block, and some data."""
+    for text in re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE.read_text(), re.DOTALL):
+        name, _, body = text.removeprefix("# ").partition("\n")
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(body)
+    rng = numpy_generator(0, "arrays")
+    for split in ("train", "val", "test"):
+        (root / "data" / split).mkdir(parents=True)
+        for name in "ab":
+            rgb = rng.integers(0, 256, (40, 64, 3), np.uint8)
+            thermal, label = rng.integers(0, 256, (40, 64), np.uint8), np.zeros((40, 64), np.uint8)
+            label[:20] = 2
+            np.savez(root / "data" / split / name, rgb=rgb, thermal=thermal, label=label)
+    return root
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with what the page says, on Python's path."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield written(tmp_path)
+    sys.modules.pop("my_lab", None)
+
+
+def words_of(lab: Path) -> list[str]:
+    return [
+        *("+experiment=mine", "+debug=smoke", f"dataset.root={lab / 'data'}"),
+        *(f"hydra.searchpath=[file://{lab / 'conf'}]", f"runs_dir={lab / 'runs'}"),
+        *("tracking=none", "trainer.accelerator=cpu", "trainer.threads=1"),
+    ]
+
+
+def test_the_page_runs(lab: Path, call: Call) -> None:
+    from rgbt import evaluate, predict
+    from rgbt.command import plain_command
+    from rgbt.maskers import sketch
+    from rgbt.run import main
+
+    code, _, err = call(main, *words_of(lab))
+    assert code == 0, err
+    run = only_run(lab / "runs")
+    assert json.loads((run / "result.json").read_text())["name"].startswith("mine ")
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert {"loss/clean_focal", "loss/masked_focal"} <= lines[0]["values"].keys()
+    code, _, err = call(sketch.main, *words_of(lab), f"out={lab / 'masks.png'}")
+    assert code == 0, err
+    assert (lab / "masks.png").is_file()
+    words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5")
+    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
+    assert code == 0, err
+    words = (f"run={run}", "input=test", f"out={lab / 'out'}")
+    code, _, err = call(plain_command(predict.OWN, predict.main), *words)
+    assert code == 0, err
+    code, _, err = call(plain_command(predict.OWN, predict.main), *words, f"input={lab}")
+    assert code == 2
+    assert_one_sentence(err, "Arrays does not say how new images are read; name one of its splits")
+
+
+FOCAL = '{"focal": ((1 - (-each).exp()) ** self.gamma * each).mean()[None]}'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "height // self.cell",
+            "height // 7",
+            "masker: Halves.__call__ returned MaskPair: rgb is Tensor (1, 9, 2) bool; expected "
+            "MaskPair(rgb, thermal), each bool (1, h, w), True = hidden, h and w dividing 64 and "
+            "64: a crop of 40x64 pixels is padded to 64x64 before cells are cut.",
+        ),
+        (FOCAL, "each.mean()", "loss: Focal.__call__ returned Tensor () float32; expected a dict"),
+    ],
+)
+def test_a_wrong_part_is_one_sentence_of_the_command(
+    lab: Path, call: Call, old: str, new: str, sentence: str
 ) -> None:
     from rgbt.run import main
 
-    (tmp_path / "my_lab.py").write_text(MODULE)
-    for name, text in FILES.items():
-        path = tmp_path / "conf" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    names = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
-    data = write_mfnet(names, hw=(24, 32))
-    monkeypatch.syspath_prepend(str(tmp_path))
-    arguments = [
-        *("+experiment=mine", "dataset=mfnet", f"dataset.root={data}", "tracking=none"),
-        *(f"hydra.searchpath=[file://{tmp_path / 'conf'}]", f"runs_dir={tmp_path / 'runs'}"),
-        *("scale.crop_hw=[24,32]", "scale.train_sizes=[24]", "scale.test_short_edge=24"),
-        *("scale.batch_size=2", "scale.max_steps=2", "trainer.accelerator=cpu"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["rgbt", *arguments])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 0, capfd.readouterr().err
-    (result,) = (tmp_path / "runs").glob("*/result.json")
-    assert json.loads(result.read_text())["name"].startswith("mine ")
+    text = (lab / "my_lab.py").read_text()
+    assert old in text
+    (lab / "my_lab.py").write_text(text.replace(old, new))
+    code, _, err = call(main, *words_of(lab))
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
 
-    monkeypatch.setattr(sys, "argv", ["rgbt", *arguments, "model.widht=3"])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 2
-    assert "did you mean 'width'?" in capfd.readouterr().err
+
+def test_a_misspelt_key_of_ones_own_is_named(lab: Path) -> None:
+    config = compose([*words_of(lab), "masker.cell=4", "+masker.cel=4"])
+    with pytest.raises(InputError, match=r"'masker.cel' is not a setting of my_lab.Halves; did"):
+        check(config)

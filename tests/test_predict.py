@@ -107,6 +107,51 @@ def test_a_network_of_other_classes_needs_a_label_map(
         assert np.array_equal(label, image(tmp_path / "plain" / f"{name}.png"))
 
 
+def test_new_images_in_two_folders_or_two_files(
+    call: Call, trained: Trained, data: Path, tmp_path: Path
+) -> None:
+    """What a run that was trained on packed files predicts of separate ones is the same."""
+    run, new = f"run={trained(*ONE)}", tmp_path / "new"
+    packed = image(data / "images" / "00201D.png")
+    for folder, part in (("rgb", packed[..., :3]), ("thermal", packed[..., 3])):
+        (new / folder).mkdir(parents=True)
+        cv2.imwrite(str(new / folder / "00201D.png"), part)
+    found = []
+    for number, words in enumerate(
+        (
+            ("input=test",),
+            (f"input={data / 'images' / '00201D.png'}",),
+            (f"input={new}",),
+            (f"rgb={new / 'rgb/00201D.png'}", f"thermal={new / 'thermal/00201D.png'}"),
+        )
+    ):
+        out = tmp_path / f"out{number}"
+        code, said, err = call(PREDICT, run, f"out={out}", *words)
+        assert code == 0, err
+        assert said.endswith(f"{3 if number == 0 else 1} images in {out}\n")
+        found.append(image(out / "00201D.png"))
+    assert all(np.array_equal(each, found[0]) for each in found)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ((), "got none of input, rgb and thermal"),
+        (("rgb=a.png",), "got rgb of input, rgb and thermal"),
+        (("rgb=a.png", "thermal=b.png"), "a.png is missing"),
+        (("rgb=a.png", "thermal=b.png", "input=val"), "expected either input=FOLDER"),
+        (("input=vall",), "no such split of mfnet; splits: did you mean 'val'?"),
+        (("input=val", "dataset.rot=x"), "did you mean 'dataset.root'? known: dataset._target_"),
+    ],
+)
+def test_what_names_no_images_is_refused(
+    call: Call, trained: Trained, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    code, _, err = call(PREDICT, f"run={trained(*ONE)}", f"out={tmp_path / 'out'}", *words)
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
+
+
 @pytest.mark.parametrize(
     ("asked", "sentence"),
     [

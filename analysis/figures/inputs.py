@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from analysis.arguments import MOST, decimal, whole
 from analysis.bar import progress
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError, check_choice, nearest, split_list
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -84,7 +84,7 @@ class Given:
     def numbers(self, key: str, default: Sequence[int]) -> tuple[int, ...]:
         """Whole numbers of at least 1, with commas between them."""
         text = self.get(key, ",".join(map(str, default)))
-        return tuple(whole(key, each, 1, MOST) for each in text.split(","))
+        return tuple(whole(key, each, 1, MOST) for each in split_list(text, "numbers"))
 
     def named(self, key: str, what: str) -> dict[str, str]:
         """Label -> place, of ``label:place,label:place``; without a label the place's last name.
@@ -92,10 +92,8 @@ class Given:
         Raises:
             InputError: not given, an empty entry, or a label twice.
         """
-        from analysis.results import split_words
-
         found: dict[str, str] = {}
-        for entry in split_words(self.need(key, what)):
+        for entry in split_list(self.need(key, what), what):
             label, colon, place = entry.partition(":")
             place = place if colon else label
             label = label if colon else Path(place).name
@@ -161,7 +159,7 @@ class Given:
             if len(listed) < number:
                 raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
             return listed[:number]
-        chosen = tuple(name.strip() for name in self.values["names"].split(","))
+        chosen = tuple(split_list(self.values["names"], "names of images"))
         for name in chosen:
             if name not in listed:
                 near = nearest(name, listed[:20])
@@ -254,12 +252,12 @@ class Given:
         Raises:
             InputError: not given, no such counts, or methods on different images.
         """
-        from analysis.results import open_counts, split_words
+        from analysis.results import open_counts
 
         what = "runs, groups or files of counts, with commas; label:run names one"
         runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
         found: dict[str, list[Counts]] = {}
-        for word in split_words(self.need("runs", what)):
+        for word in split_list(self.need("runs", what), what):
             label, colon, place = word.partition(":")
             for stored in open_counts(place if colon else label, runs_dir, split, frames):
                 found.setdefault(label if colon else stored.label, []).append(stored.counts)

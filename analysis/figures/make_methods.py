@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from analysis.arguments import blocks_of
 from analysis.bar import progress
 from analysis.figures.inputs import Given
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -132,16 +132,17 @@ def robustness_numbers(given: Given) -> dict[str, str]:
 
 def _failing(given: Given) -> tuple[Panel, ...]:
     from analysis.figures.robustness import panels
-    from analysis.results import split_words
     from analysis.robustness import Training, trainings
 
     runs_dir, split = given.get("runs_dir", "runs"), given.get("split", "")
     found: dict[str, list[Training]] = {}
-    for word in split_words(given.need("runs", "runs or groups; label:run names one")):
+    what = "runs or groups; label:run names one"
+    for word in split_list(given.need("runs", what), what):
         label, colon, place = word.partition(":")
         for each in trainings(place if colon else label, Path(runs_dir).expanduser(), split):
             found.setdefault(label if colon else each.label, []).append(each)
-    rows = [word.strip() for word in given.get("degradations", "").split(",") if word.strip()]
+    named = given.get("degradations", "")
+    rows = split_list(named, "degradations") if named else []
     levels = (level for each in found.values() for training in each for level in training.levels)
     return panels(found, given.absent(level.counts for level in levels), rows)
 

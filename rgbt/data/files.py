@@ -25,9 +25,7 @@ Array = NDArray[np.uint8]
 Counts = NDArray[np.uint16]
 
 
-def read_packed(
-    path: Path, advice: str = "dataset.layout=folders for separate images"
-) -> tuple[Array, Array]:
+def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
     """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal.
 
     `advice` says what to do with a file of other channels.
@@ -42,18 +40,6 @@ def read_packed(
             f"use the original file, or {advice}."
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8), image[..., 3].copy()
-
-
-def read_channels(rgb_path: Path, thermal_path: Path) -> tuple[Array, Array]:
-    """RGB (H, W, 3) and thermal (H, W), both uint8, of two files.
-
-    Thermal may have one channel or three equal ones.
-
-    Raises:
-        InputError: missing, not decodable, not 8 bit, or other channels.
-    """
-    advice = "dataset.layout=packed reads images with thermal as fourth channel"
-    return read_rgb(rgb_path, advice), read_thermal(thermal_path)
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:

@@ -7,9 +7,10 @@ size of the frame, each as the configuration says, and refuses what it cannot re
 from __future__ import annotations
 
 import hashlib
-from functools import cached_property, lru_cache
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from rgbt.checks import Colour, InputError, Names, NumClasses, Text, check_choice, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_counts, read_label, read_label_array, read_rgb, within
+from rgbt.data.files import read_counts, read_label, read_label_array, within
+from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
 from rgbt.data.integrity import is_there
 from rgbt.types import IGNORE, Sample
@@ -52,7 +54,6 @@ MOST_STRETCH = 0.02
 """How far the aspect of a label may be from that of its frame: what rounding a size leaves."""
 
 Array = NDArray[np.uint8]
-Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 
 class Freiburg:
@@ -132,6 +133,7 @@ class Freiburg:
             for word in chosen:
                 check_choice(f"dataset.{key}", word, classes)
         _check_numbers(crop, thermal_range)
+        self.images = FreiburgImages(crop, thermal_range)
 
     def has(self, split: str) -> bool:
         """Whether there are frames of `split`; InputError where the split is unknown."""
@@ -163,21 +165,17 @@ class Freiburg:
                 smaller than the crop.
         """
         frame = self.frame(name)
-        rgb, thermal = read_rgb(within(frame.rgb, self.root)), self._thermal(frame)
-        if rgb.shape[:2] != thermal.shape:
-            raise InputError(
-                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but thermal is "
-                f"{thermal.shape[0]}x{thermal.shape[1]}; both must have one size, see "
-                f"{frame.thermal}."
-            )
-        label = None if frame.label is None else self._label(frame, thermal.shape)
-        grey = np.take(_grey_levels(*self.thermal_range), self._cut(thermal, name))
-        return Sample(
-            rgb=np.ascontiguousarray(self._cut(rgb, name)),
-            thermal=grey,
-            label=None if label is None else np.ascontiguousarray(self._cut(label, name)),
-            name=name,
-        )
+        pixels, counts = whole_frame(name, *self._image_paths(frame))
+        # A label is brought to the size of the whole frame, and cut with it.
+        label = None if frame.label is None else self._label(frame, counts.shape)
+        sample = self.images.sample(name, pixels, counts)
+        if label is None:
+            return sample
+        return replace(sample, label=np.ascontiguousarray(self.images.cut(label, name)))
+
+    def pair(self, name: str) -> Sample:
+        """The images of `read` alone, without the label; InputError as there."""
+        return self.images.read(name, *self._image_paths(self.frame(name)))
 
     def label(self, name: str) -> Array | None:
         """The label of `read` alone; the frame is read as well, for its size."""
@@ -185,7 +183,7 @@ class Freiburg:
 
     def counts(self, name: str) -> NDArray[np.uint16]:
         """Counts of the thermal camera, (H, W) uint16, cut as in `read`; InputError as there."""
-        return self._cut(self._thermal(self.frame(name)), name)
+        return self.images.cut(read_counts(self._image_paths(self.frame(name))[1]), name)
 
     def files(self, name: str) -> tuple[Path, ...]:
         """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
@@ -283,13 +281,13 @@ class Freiburg:
             f"{self.root}; {hint}."
         )
 
-    def _thermal(self, frame: Frame) -> NDArray[np.uint16]:
+    def _image_paths(self, frame: Frame) -> tuple[Path, Path]:
         if not is_there(frame.thermal):
             raise InputError(
                 f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
                 "data.on_error=skip to leave the frame out."
             )
-        return read_counts(within(frame.thermal, self.root))
+        return within(frame.rgb, self.root), within(frame.thermal, self.root)
 
     def _label(self, frame: Frame, hw: tuple[int, ...]) -> Array:
         """The label at the size of the frame, at the nearest pixel."""
@@ -317,18 +315,6 @@ class Freiburg:
             ignored = [self.classes.index(word) for word in self.ignored_test]
             label = np.where(np.isin(label, ignored), np.uint8(IGNORE), label)
         return label
-
-    def _cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
-        if self.crop is None:
-            return image
-        top, bottom, left, right = self.crop
-        if bottom > image.shape[0] or right > image.shape[1]:
-            raise InputError(
-                f"'{name}': the frame is {image.shape[0]}x{image.shape[1]} pixels but "
-                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}; give "
-                "a crop inside it, or dataset.crop=null for whole frames."
-            )
-        return image[top:bottom, left:right]
 
 
 def _size(path: Path) -> int:
@@ -363,11 +349,3 @@ def _check_numbers(crop: tuple[int, int, int, int] | None, thermal_range: tuple[
             f"dataset.thermal_range: expected counts 0 <= low < high <= 65535, such as "
             f"{list(THERMAL_RANGE)}, got {[low, high]}."
         )
-
-
-@lru_cache(maxsize=4)
-def _grey_levels(low: int, high: int) -> Array:
-    """(65536,) uint8, the grey level of every count."""
-    above = np.clip(np.arange(np.iinfo(np.uint16).max + 1), low, high) - low
-    span = high - low
-    return ((2 * 255 * above + span) // (2 * span)).astype(np.uint8)

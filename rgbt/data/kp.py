@@ -6,7 +6,7 @@ A reader only: it never resizes, augments or remaps, and it refuses what it cann
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rgbt.checks import Colour, InputError, Names, NumClasses, Text, check_choice, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_label, read_rgb
+from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
+from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
 from rgbt.data.kp_names import FORM, MODALITY, NAME, SPLITS, TIMES, parts_of, set_of
 from rgbt.data.kp_names import is_night as is_night
@@ -25,7 +26,7 @@ from rgbt.data.named_files import (
     hash_of_files,
     names_in,
     root_nearby,
-    sample_of_one_size,
+    with_label,
 )
 from rgbt.types import IGNORE, Sample
 
@@ -89,6 +90,19 @@ class KP:
         InputError: no such root, no known layout, numbers of classes, names and colours differ, or
             `splits` was changed where sets decide.
     """
+
+    images = GreyImages(
+        layouts=(
+            PairPattern(
+                "images/{set}/{video}/visible/{frame}.jpg", "images/{set}/{video}/lwir/{frame}.jpg"
+            ),
+            PairPattern(
+                "pseudo_KP/{time}/{set}_{video}_visible_{frame}.png",
+                "pseudo_KP/{time}/{set}_{video}_lwir_{frame}.png",
+            ),
+        ),
+        thermal=partial(read_grey, advice=ADVICE, most_tint=MOST_TINT),
+    )
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -160,15 +174,13 @@ class KP:
             InputError: not a name, a file is missing, cannot be decoded, has other channels, bits
                 or size than expected, or the label holds a value that is no class, void or 255.
         """
-        files = self.files(name)
-        rgb, thermal = (within(path, self.root) for path in files[:2])
-        return sample_of_one_size(
-            name,
-            read_rgb(rgb),
-            read_grey(thermal, advice=ADVICE, most_tint=MOST_TINT),
-            self.label(name),
-            files,
-        )
+        pair = self.pair(name)
+        return with_label(pair, self.label(name), self.label_path(name))
+
+    def pair(self, name: str) -> Sample:
+        """The images of `read` alone, without the label; InputError as there."""
+        rgb, thermal = (within(path, self.root) for path in self.files(name)[:2])
+        return self.images.read(name, rgb, thermal)
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""

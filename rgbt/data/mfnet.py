@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from rgbt.checks import Colour, InputError, Names, NumClasses, Text, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_channels, read_label, read_packed, within
+from rgbt.data.files import read_label, read_thermal, within
+from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
-from rgbt.data.named_files import hash_of_files, sample_of_one_size
+from rgbt.data.named_files import hash_of_files, with_label
 from rgbt.types import Sample
 
 Layout = Literal["auto", "packed", "folders"]
@@ -66,6 +67,15 @@ class MFNet:
     Raises:
         InputError: no such root, no known layout, numbers of classes, names and colours differ.
     """
+
+    images = GreyImages(
+        layouts=tuple(
+            PairPattern(f"{folders[0]}/{{name}}.png", f"{folders[-2]}/{{name}}.png")
+            for folders in LAYOUTS.values()
+        ),
+        thermal=read_thermal,
+        packed_advice="dataset.layout=folders for separate images",
+    )
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -121,10 +131,12 @@ class MFNet:
                 expected, or the label holds a value that is neither a class nor 255.
         """
         label = self.label(name)
-        rgb, thermal = self._read_images(name)
-        # A packed file stands for both of its images.
-        files = (self.image_paths(name)[0], self.image_paths(name)[-1], self.label_path(name))
-        return sample_of_one_size(name, rgb, thermal, label, files)
+        return with_label(self.pair(name), label, self.label_path(name))
+
+    def pair(self, name: str) -> Sample:
+        """The images of `read` alone, without the label; InputError as there."""
+        paths = tuple(within(path, self.root) for path in self.image_paths(name))
+        return self.images.read(name, paths[0], paths[-1])
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
@@ -201,12 +213,6 @@ class MFNet:
                 f"or name another list with dataset.splits.{split}=..."
             )
         return read_names(path, f"dataset.splits.{split}")
-
-    def _read_images(self, name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        paths = tuple(within(path, self.root) for path in self.image_paths(name))
-        if self.layout == "packed":
-            return read_packed(paths[0])
-        return read_channels(*paths)
 
 
 def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:

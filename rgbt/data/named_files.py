@@ -1,4 +1,4 @@
-"""What readers of named files share: folders, samples of one size, fingerprints, roots nearby.
+"""What readers of named files share: folders, images of one size, fingerprints, roots nearby.
 
 Part of the readers of data sets; nothing here knows the layout of a data set.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +25,37 @@ def names_in(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in folder.glob("*.png") if path.name[0] != "."))
 
 
-def sample_of_one_size(
-    name: str, rgb: Array, thermal: Array, label: Array, files: tuple[Path, ...]
-) -> Sample:
-    """The sample of three arrays.
+def pair_of_one_size(name: str, rgb: Array, thermal: Array, path: Path) -> Sample:
+    """The sample of two arrays, without a label.
 
     Args:
         name: of the sample.
         rgb: (H, W, 3).
         thermal: (H, W).
-        label: (H, W).
-        files: where they come from, in this order; for messages.
+        path: of the thermal image; for the message.
 
     Raises:
         InputError: heights or widths differ.
     """
-    for what, image, path in (("thermal", thermal, files[1]), ("its label", label, files[2])):
-        if image.shape != rgb.shape[:2]:
-            raise InputError(
-                f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
-                f"{image.shape[0]}x{image.shape[1]}; both must have one size, see {path}."
-            )
-    return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+    check_size(rgb, "thermal", thermal, name, path)
+    return Sample(rgb=rgb, thermal=thermal, label=None, name=name)
+
+
+def with_label(pair: Sample, label: Array | None, path: Path | None) -> Sample:
+    """`pair` with its label (H, W), read from `path`; InputError where the sizes differ."""
+    if label is not None:
+        check_size(pair.rgb, "its label", label, pair.name, path)
+    return replace(pair, label=label)
+
+
+def check_size(rgb: Array, what: str, image: NDArray[Any], name: str, path: Path | None) -> None:
+    """Refuse an image (H', W') of `path` that is not of the size of `rgb` (H, W, 3)."""
+    if image.shape != rgb.shape[:2]:
+        raise InputError(
+            f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
+            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels, align them "
+            f"first: {path}."
+        )
 
 
 def hash_of_files(

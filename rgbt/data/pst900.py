@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from rgbt.checks import Colour, InputError, Names, NumClasses, Text, nearest
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_label, read_rgb
+from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
+from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
 from rgbt.data.named_files import (
     hash_of_files,
     names_in,
     root_nearby,
-    sample_of_one_size,
+    with_label,
 )
 from rgbt.types import Sample
 
@@ -86,6 +87,14 @@ class PST900:
         InputError: no such root, neither layout in it, a bag that is no whole number, numbers of
             classes, names and colours differ.
     """
+
+    images = GreyImages(
+        layouts=(
+            PairPattern("{part}/rgb/{name}.png", "{part}/thermal/{name}.png"),
+            PairPattern("rgb/{name}.png", "thermal/{name}.png"),
+        ),
+        thermal=partial(read_grey, advice=ADVICE),
+    )
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -177,13 +186,17 @@ class PST900:
                 has other channels, bits or size than expected, or the label holds a value that is
                 neither a class nor 255.
         """
-        files = self.files(name)
-        rgb = read_rgb(within(files[0], self.root))
-        return sample_of_one_size(name, rgb, self.thermal(name), self.label(name), files)
+        pair = self.pair(name)
+        return with_label(pair, self.label(name), self.files(name)[2])
+
+    def pair(self, name: str) -> Sample:
+        """The images of `read` alone, without the label; InputError as there."""
+        rgb, thermal = (within(path, self.root) for path in self.files(name)[:2])
+        return self.images.read(name, rgb, thermal)
 
     def thermal(self, name: str) -> NDArray[np.uint8]:
         """The thermal image called `name` alone, (H, W) uint8; InputError as in `read`."""
-        return read_grey(within(self.files(name)[1], self.root), advice=ADVICE)
+        return self.images.thermal(within(self.files(name)[1], self.root))
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""

@@ -123,6 +123,7 @@ class Scale:
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
         pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
+        few_scenes: whether embedded data sets have a handful of scenes, for ``${scenes:...}``.
     """
 
     name: Text
@@ -144,3 +145,4 @@ class Scale:
     warmup_steps: NumStepsOrZero
     precision: Precision
     pretrained: bool
+    few_scenes: bool = False

@@ -21,8 +21,9 @@ from rgbt.checks import InputError
 from rgbt.command import command
 from rgbt.config import build
 from rgbt.geometry.padding import padded_hw
-from rgbt.maskers.masker import Masker
+from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.types import Masker
 
 SAMPLES = 5
 DRAWS = 2000
@@ -150,9 +151,14 @@ def main(config: DictConfig) -> int:
         transform.train(dataset.read(name), numpy_generator(config.seed, "sketch", index))
         for index, name in enumerate(names)
     ]
-    title = f"{config.name}: {masker.sampler}, cells of {masker.patch_size} px"
+    shape = examples[0].rgb.shape
+    check_masker(masker, (shape[0], shape[1]), torch_generator(config.seed, "probe"))
+    found = sketch(masker, examples, config.seed)
+    cells, pixels = found.rgb_frequency.shape, found.thermal[0].shape
+    sides = " x ".join(f"{n // k}" for n, k in zip(pixels, cells, strict=True))
+    title = f"{config.name}: {type(masker).__name__}, {cells[0]} x {cells[1]} cells of {sides} px"
     path.parent.mkdir(parents=True, exist_ok=True)
-    draw(sketch(masker, examples, config.seed), title).savefig(path, dpi=120)
+    draw(found, title).savefig(path, dpi=120)
     print(path)
     return 0
 

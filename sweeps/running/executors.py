@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 
 import rgbt
+from rgbt.checks import InputError
 from rgbt.source_code import counted_modules
 
 PRELOADED = (
@@ -27,6 +28,8 @@ PRELOADED = (
 )
 COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
 """Run as programs, and a few lines each: not imported before."""
+
+GPUS = "CUDA_VISIBLE_DEVICES"
 
 GRACE_S = 20.0
 """What a process that is asked to stop may take before it is killed."""
@@ -80,6 +83,31 @@ class LocalExecutor:
         # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
         process.start()
         return LocalJob(process)
+
+
+def check_gpus(gpus: tuple[int, ...] | None) -> None:
+    """Refuse numbers of GPUs that this machine does not have, or does not show to us.
+
+    Raises:
+        InputError: naming the first.
+    """
+    if gpus is None:
+        return
+    shown = os.environ.get(GPUS)
+    if shown is None:
+        import torch  # takes seconds: only where GPUs are named
+
+        known = [str(number) for number in range(torch.cuda.device_count())]
+    else:
+        known = [word.strip() for word in shown.split(",") if word.strip()]
+    for number in gpus:
+        if str(number) not in known:
+            here = "this machine" if shown is None else f"{GPUS}={shown}"
+            found = f"the GPUs {', '.join(known)} alone; take" if known else "no GPU; omit"
+            raise InputError(
+                f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
+                f"{'some of these' if known else 'gpus'}."
+            )
 
 
 def own_modules() -> list[str]:

@@ -12,7 +12,7 @@ from rgbt.checks import InputError
 from sweeps import attributes as names
 from sweeps.points import Point
 from sweeps.running.driver import Driver
-from sweeps.running.executors import Executor, LocalExecutor
+from sweeps.running.executors import Executor, LocalExecutor, check_gpus
 from sweeps.running.follow import known_seconds
 from sweeps.running.found import Found, Runs
 from sweeps.running.ledger import Ledger, by_key, counted
@@ -202,6 +202,7 @@ class _Prepared:
 def make_executor(settings: Settings, runs_dir: Path) -> Executor:
     """What `executor` and its options name."""
     if settings.executor == "local":
+        check_gpus(settings.gpus)
         return LocalExecutor()
     from sweeps.running.submitit_executor import SubmititExecutor
 

@@ -234,7 +234,7 @@ def test_colours(path: Path) -> None:
 def test_packed_and_thermal(path: Path) -> None:
     image = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
     cv2.imwrite(str(path), image)
-    rgb, thermal = read_packed(path)
+    rgb, thermal = read_packed(path, "choose another one")
     np.testing.assert_array_equal(rgb, image[..., 2::-1])
     np.testing.assert_array_equal(thermal, image[..., 3])
     with pytest.raises(InputError, match="three equal ones, got 4 channels that differ"):

@@ -16,7 +16,7 @@ from rgbt.checks import InputError
 from rgbt.config import build, check_node
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import grey, label_codes, painted
-from rgbt.data.freiburg import _grey_levels
+from rgbt.data.freiburg_images import _grey_levels
 from rgbt.data.report.dataset import check_dataset, layout_of
 from tests.conftest import write_png
 from tests.data.folder_files import (
@@ -181,8 +181,8 @@ def test_sizes_that_differ(root: Path) -> None:
     write_tiff(root / "train" / "ir" / "2_ir.tif", np.zeros((3, 4), np.uint16))
     dataset = folder(root)
     assert refused(lambda: dataset.read("train_1")) == (
-        "'train_1': RGB is 6x8 pixels but label is 3x4; both must show the same pixels, align them "
-        f"first: {root / 'train/mask/1.png'}."
+        "'train_1': RGB is 6x8 pixels but its label is 3x4; both must show the same pixels, align "
+        f"them first: {root / 'train/mask/1.png'}."
     )
     assert "RGB is 6x8 pixels but thermal is 3x4" in refused(lambda: dataset.read("train_2"))
 

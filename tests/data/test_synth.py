@@ -433,10 +433,9 @@ def test_a_cache_that_is_a_file_is_named(tmp_path: Path) -> None:
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     import inspect
 
-    from omegaconf import OmegaConf
+    from rgbt.config import compose
 
-    path = Path(__file__).resolve().parents[2] / "conf/dataset/synth.yaml"
-    node = dict(OmegaConf.load(path))
+    node = dict(compose(["dataset=synth"]).dataset)
     assert node.pop("_target_") == "rgbt.data.synth.dataset.synth"
     parameters = inspect.signature(synth).parameters
     assert node == {name: parameter.default for name, parameter in parameters.items()}

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node, conf_dir
+from rgbt.config import build, check_node, compose, conf_dir
 from rgbt.data.kp import CLASSES, KP, set_of
 from rgbt.data.synth import kp, people
 from rgbt.data.synth.classes import ids_in
@@ -206,7 +206,7 @@ def test_every_class_that_there_is_is_often_seen(scenes: list[Scene]) -> None:
 
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
-    node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "dataset/synth_kp.yaml"))
+    node = OmegaConf.to_container(compose(["dataset=synth_kp"]).dataset, resolve=True)
     assert node.pop("_target_") == "rgbt.data.synth.kp.synth_kp"
     parameters = inspect.signature(synth_kp).parameters
     assert node == {name: parameter.default for name, parameter in parameters.items()}

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node, conf_dir
+from rgbt.config import build, check_node, compose, conf_dir
 from rgbt.data.pst900 import CLASSES, PST900, bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors
@@ -139,7 +139,7 @@ def test_a_bag_that_is_not_there_is_named(data: PST900) -> None:
 
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
-    node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "dataset/synth_pst900.yaml"))
+    node = OmegaConf.to_container(compose(["dataset=synth_pst900"]).dataset, resolve=True)
     assert node.pop("_target_") == "rgbt.data.synth.pst900.synth_pst900"
     parameters = inspect.signature(synth_pst900).parameters
     defaults = {name: parameter.default for name, parameter in parameters.items()}

@@ -10,7 +10,6 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.absent import absent_notes
-from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import ARCHIVE, Counts, convention
 from rgbt.metrics.scores import summary
 
@@ -68,9 +67,7 @@ def test_counts_keep_their_convention(tmp_path: Path) -> None:
         assert Counts.load(path).absent == absent
         assert Counts.load(path).select(["a"]).absent == absent
     values = ARCHIVE.load(path)
-    Archive(ARCHIVE.mark, "counts", "").save(
-        path, {key: value for key, value in values.items() if key not in ("absent", "format")}
-    )
+    ARCHIVE.save(path, {key: value for key, value in values.items() if key != "absent"})
     assert Counts.load(path).absent == "released"
     with pytest.raises(ValueError, match="expected released or exclude, got 'zero'"):
         counts_of("zero")

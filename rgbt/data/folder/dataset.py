@@ -30,8 +30,9 @@ from rgbt.checks import (
     nearest,
 )
 from rgbt.data.dataset import check_lengths
-from rgbt.data.files import read_packed, read_rgb, within
-from rgbt.data.folder.frames import Frame, find_frames, patterns_of
+from rgbt.data.files import within
+from rgbt.data.folder.frames import Frame, check_partners, find_frames, patterns_of
+from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, Rule
 from rgbt.data.folder.values import (
@@ -39,13 +40,12 @@ from rgbt.data.folder.values import (
     Range,
     check_limits,
     each_colour,
-    grey,
     label_codes,
     painted,
-    read_values,
 )
+from rgbt.data.images import PairPattern
 from rgbt.data.integrity import is_there
-from rgbt.data.named_files import hash_of_files
+from rgbt.data.named_files import hash_of_files, with_label
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
@@ -134,13 +134,17 @@ class Folder:
                 "begins in."
             )
         self.patterns = patterns_of(rgb, thermal, label)
+        self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
         self.frames: Mapping[str, Frame] = find_frames(self.root, self.patterns)
         self._rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self._names: dict[str, tuple[str, ...]] = {}
         self.unlabelled = unlabelled
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
-        self._check_night()
+        # New images may be of the day alone, and have no labels.
+        if set(self.splits) - set(unlabelled):
+            self._check_labels()
+            self._check_night()
 
     @property
     def splits(self) -> dict[str, str]:
@@ -176,19 +180,13 @@ class Folder:
                 that no key names.
         """
         frame = self.frame(name)
-        rgb, thermal = self._images(frame)
-        label = self.label(name)
-        for what, image, path in (
-            ("thermal", thermal, frame.thermal),
-            ("label", label, frame.label),
-        ):
-            if image is not None and image.shape != rgb.shape[:2]:
-                raise InputError(
-                    f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
-                    f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels, "
-                    f"align them first: {path}."
-                )
-        return Sample(rgb=rgb, thermal=thermal, label=label, name=name)
+        return with_label(self.pair(name), self.label(name), frame.label)
+
+    def pair(self, name: str) -> Sample:
+        """The images of `read` alone, without the label; InputError as there."""
+        frame = self.frame(name)
+        rgb = self._there("RGB image", frame.rgb, name)
+        return self.images.read(name, rgb, self._there("thermal image", frame.thermal, name))
 
     def label(self, name: str) -> Array | None:
         """The label of `read` alone, (H, W) uint8; None where there is none; errors as there."""
@@ -201,7 +199,7 @@ class Folder:
         """Values of the thermal camera before they are grey levels, (H, W); errors as of `read`."""
         frame = self.frame(name)
         path = self._there("thermal image", frame.thermal, name)
-        return read_packed(path)[1] if self.packed else read_values(path)
+        return self.images.values(path, packed=self.packed)
 
     def files(self, name: str) -> tuple[Path, ...]:
         """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
@@ -259,16 +257,15 @@ class Folder:
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
-        return frozenset(name for split in self.unlabelled for name in self.names(split))
+        present = [split for split in self.unlabelled if self.has(split)]
+        return frozenset(name for split in present for name in self.names(split))
 
-    def _images(self, frame: Frame) -> tuple[Array, Array]:
-        path = self._there("RGB image", frame.rgb, frame.name)
-        if self.packed:
-            rgb, values = read_packed(path, "give dataset.thermal its own pattern")
-        else:
-            advice = "dataset.thermal with the same pattern reads a fourth channel as thermal"
-            rgb, values = read_rgb(path, advice), self.values(frame.name)
-        return rgb, grey(values, self.thermal_range, frame.thermal)
+    def _check_labels(self) -> None:
+        if self.patterns.label is not None:
+            labelled = (
+                frame for name, frame in self.frames.items() if name not in self._without_labels
+            )
+            check_partners(self.patterns.label, labelled, self.root)
 
     def _there(self, what: str, path: Path, name: str) -> Path:
         if not is_there(path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,8 +77,8 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
         patterns: of the three images.
 
     Raises:
-        InputError: no RGB image, no partner at all of one kind, two frames of one name, or two
-            that would share a partner.
+        InputError: no RGB image, no thermal image, two frames of one name, or two that would
+            share a partner.
     """
     rgb, thermal, label = patterns
     frames: dict[str, Frame] = {}
@@ -96,8 +97,29 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
     found = {name: frames[name] for name in sorted(frames, key=in_order)}
     for pattern in (thermal, label):
         if pattern is not None:
-            _check_partners(pattern, found, root)
+            _check_shared(pattern, found, root)
+    check_partners(thermal, found.values(), root)
     return found
+
+
+def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> None:
+    """Refuse a pattern that names no file that is there, of any of some frames.
+
+    Args:
+        pattern: of thermal images or labels.
+        frames: none, or those that should have such a file.
+        root: what the pattern is relative to.
+
+    Raises:
+        InputError: naming the first file and what is there in its place.
+    """
+    paths = [pattern.path(root, frame.values) for frame in frames]
+    if paths and not any(map(os.path.lexists, paths)):
+        raise InputError(
+            f"{pattern.key}: '{pattern.text}' names no file that is there: the first would be "
+            f"{paths[0]}, {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct the "
+            "pattern."
+        )
 
 
 def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
@@ -120,7 +142,7 @@ def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
     return [frame for frame in found if frame.rgb not in partners]
 
 
-def _check_partners(pattern: Pattern, frames: dict[str, Frame], root: Path) -> None:
+def _check_shared(pattern: Pattern, frames: dict[str, Frame], root: Path) -> None:
     partners: dict[Path, str] = {}
     for name, frame in frames.items():
         path = pattern.path(root, frame.values)
@@ -130,9 +152,3 @@ def _check_partners(pattern: Pattern, frames: dict[str, Frame], root: Path) -> N
                 "word of dataset.rgb that tells them apart."
             )
         partners[path] = name
-    if not any(os.path.lexists(path) for path in partners):
-        first = next(iter(partners))
-        raise InputError(
-            f"{pattern.key}: '{pattern.text}' names no file that is there: the first would be "
-            f"{first}, {first.parent.name} holds {what_is_in(first.parent)}; correct the pattern."
-        )

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from rgbt.checks import InputError
@@ -18,6 +19,8 @@ NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
 
 Values = Mapping[str, str]
 """Word -> what stands for it in the path of a file."""
+
+NO_VALUES: Values = MappingProxyType({})
 
 
 class Found(NamedTuple):
@@ -70,15 +73,22 @@ class Pattern:
         """The file of `values`, which hold every word."""
         return root / _filled(self.text, values)
 
-    def files(self, root: Path) -> Iterator[Found]:
+    def files(
+        self, root: Path, values: Values = NO_VALUES, *, any_case: bool = False
+    ) -> Iterator[Found]:
         """What matches below `root`: files, and anything else of such a name.
 
         Files whose names begin with a dot are left out: systems write them beside others.
 
+        Args:
+            root: what the pattern is relative to.
+            values: of the words that are known; the others may stand for anything.
+            any_case: whether capitals count for nothing.
+
         Raises:
             InputError: a folder may not be listed.
         """
-        return _walk(Found(root, {}), self.pieces)
+        return _walk(Found(root, values), self.pieces, any_case=any_case)
 
     def why_nothing(self, root: Path) -> str:
         """Where the first piece that matches nothing should be, and what is there instead."""
@@ -110,24 +120,24 @@ def in_order(text: str) -> list[tuple[bool, int, str]]:
     ]
 
 
-def _walk(start: Found, pieces: tuple[str, ...]) -> Iterator[Found]:
+def _walk(start: Found, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[Found]:
     piece, *rest = pieces
-    for found in _matching(start, piece):
+    for found in _matching(start, piece, any_case=any_case):
         if rest:
-            yield from _walk(found, tuple(rest))
+            yield from _walk(found, tuple(rest), any_case=any_case)
         else:
             yield found
 
 
-def _matching(start: Found, piece: str) -> Iterator[Found]:
+def _matching(start: Found, piece: str, *, any_case: bool = False) -> Iterator[Found]:
     folder, values = start
     filled = _filled(piece, values)
-    if "{" not in filled:
+    if "{" not in filled and not any_case:
         # A link that leads nowhere is there: whoever opens it says where it should lead.
         if os.path.lexists(folder / filled):
             yield Found(folder / filled, values)
         return
-    expression = _expression(filled)
+    expression = re.compile(_expression(filled), re.DOTALL | (re.IGNORECASE * any_case))
     for name in _listed(folder):
         match = expression.fullmatch(name)
         if match and (not name.startswith(".") or filled.startswith(".")):
@@ -139,7 +149,7 @@ def _filled(text: str, values: Values) -> str:
     return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
 
 
-def _expression(piece: str) -> re.Pattern[str]:
+def _expression(piece: str) -> str:
     seen: set[str] = set()
     parts = []
     for index, part in enumerate(re.split(r"\{(\w+)\}", piece)):
@@ -148,7 +158,7 @@ def _expression(piece: str) -> re.Pattern[str]:
         else:
             parts.append(f"(?P={part})" if part in seen else f"(?P<{part}>.+)")
             seen.add(part)
-    return re.compile("".join(parts), re.DOTALL)
+    return "".join(parts)
 
 
 def _listed(folder: Path) -> list[str]:

@@ -110,6 +110,9 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"rgbt: {error}\n")
         return 2
     sheet = contact_sheet(own["seed"], own["first"], factors, own["columns"], own["zoom"])
+    if not out.parent.is_dir():
+        sys.stderr.write(f"rgbt: out={out} cannot be written; name a PNG in an existing folder.\n")
+        return 2
     out.write_bytes(cv2.imencode(out.suffix, sheet[..., ::-1])[1].tobytes())
     sys.stdout.write(f"{out}\n")
     return 0

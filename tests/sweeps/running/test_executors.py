@@ -17,9 +17,10 @@ from typing import Any
 
 import pytest
 
+from rgbt.checks import InputError
 from sweeps.points import Evaluation
 from sweeps.running import executors
-from sweeps.running.executors import Job, LocalExecutor
+from sweeps.running.executors import Job, LocalExecutor, check_gpus
 from tests.sweeps.fakes import DEADLINE_S, until
 
 MODULE = """
@@ -310,3 +311,29 @@ def test_every_command_that_is_called_of_a_run_is_loaded_by_its_process_alone() 
     called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
     assert called == set(executors.COMMANDS)
     assert not called & set(executors.own_modules())
+
+
+@pytest.mark.parametrize(
+    ("shown", "gpus", "sentence"),
+    [
+        ("2,3", (3, 5), "gpus=[3, 5]: there is no GPU 5, CUDA_VISIBLE_DEVICES=2,3 shows the GPUs"),
+        ("", (0,), "there is no GPU 0, CUDA_VISIBLE_DEVICES= shows no GPU; omit gpus."),
+        (None, (0, 99), "there is no GPU "),
+    ],
+)
+def test_gpus_that_are_not_there_are_refused(
+    monkeypatch: pytest.MonkeyPatch, shown: str | None, gpus: tuple[int, ...], sentence: str
+) -> None:
+    if shown is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    else:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
+    with pytest.raises(InputError) as told:
+        check_gpus(gpus)
+    assert sentence in str(told.value)
+    check_gpus(None)
+
+
+def test_gpus_that_are_shown_may_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
+    check_gpus((3, 2))

@@ -1,0 +1,197 @@
+"""Which files of a folder of new images belong together, by the layouts of a data set.
+
+Nothing is guessed: a folder is read by the first layout of which it holds a whole pair, and what
+belongs to no pair is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from rgbt.checks import InputError
+from rgbt.data.files import channels, decode
+from rgbt.data.folder.pattern import NO_VALUES, Found, Pattern, Values, in_order, what_is_in
+from rgbt.data.images import PairPattern
+
+KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Endings of image files, in small letters."""
+
+ARRAY = ".npy"
+"""What a thermal image may end in as well."""
+
+PLAIN = (
+    PairPattern("rgb/{name}.png", "thermal/{name}.png"),
+    PairPattern("{name}.png", "{name}.png"),
+)
+"""Layouts that are understood whatever the data set; endings may be any of `KINDS`."""
+
+KEY = "input"
+
+
+class NewPair(NamedTuple):
+    """Two files and what their sample is called; one file twice where thermal is its channel 4."""
+
+    name: str
+    rgb: Path
+    thermal: Path
+
+
+class NewImages(NamedTuple):
+    """What a folder holds.
+
+    Attributes:
+        pairs: in the order of their names, 9 before 10.
+        alone: RGB image without a thermal image -> where that should be.
+        others: images that belong to no pair and are no labels.
+    """
+
+    pairs: tuple[NewPair, ...]
+    alone: dict[Path, Path]
+    others: tuple[Path, ...]
+
+
+def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewImages:
+    """The pairs in `folder`.
+
+    The layouts of the data set are tried from its root, then from the folders inside it (without
+    their first pieces), then `PLAIN`. Capitals do not count. Of each layout, endings other than its
+    own count only where its own give no pair.
+
+    Args:
+        folder: an existing folder.
+        layouts: of the data set.
+        name: of the data set, for messages.
+
+    Raises:
+        InputError: no whole pair, two of one name, or two thermal images for one RGB image.
+    """
+    alone: dict[Path, Path] = {}
+    for layouts_of_tier, any_kind in _tiers(layouts):
+        found = _in_tier(folder, layouts_of_tier, any_kind=any_kind)
+        if found.pairs:
+            _check_names(found.pairs)
+            return found
+        alone = alone or found.alone
+    raise InputError(_why_nothing(folder, layouts, name, alone))
+
+
+def _tiers(layouts: Sequence[PairPattern]) -> Iterator[tuple[list[PairPattern], bool]]:
+    """Layouts that are tried together, and whether images of another kind count."""
+    inner = list(layouts)
+    while inner:
+        yield from ((inner, any_kind) for any_kind in (False, True))
+        inner = [shorter for each in inner if (shorter := _inside(each)) is not None]
+    yield from (([plain], any_kind) for plain in PLAIN for any_kind in (False, True))
+
+
+def _inside(layout: PairPattern) -> PairPattern | None:
+    """The layout as its first folder sees it; None where RGB and thermal are not in one."""
+    first, _, rgb = layout.rgb.partition("/")
+    other, _, thermal = layout.thermal.partition("/")
+    if first != other or "{" not in rgb or "{" not in thermal:
+        return None
+    if not set(Pattern(thermal, KEY).words) <= set(Pattern(rgb, KEY).words):
+        return None
+    of_label, _, label = (layout.label or "").partition("/")
+    return PairPattern(rgb, thermal, label if of_label == first and "{" in label else None)
+
+
+def _in_tier(folder: Path, layouts: Sequence[PairPattern], *, any_kind: bool) -> NewImages:
+    pairs: dict[Path, NewPair] = {}
+    alone: dict[Path, Path] = {}
+    labels: set[Path] = set()
+    for layout in layouts:
+        labels |= {path for path, _ in _files(layout.label, folder, any_kind=True)}
+        rgb = Pattern(layout.rgb, KEY)
+        candidates = dict(_files(layout.rgb, folder, any_kind=any_kind))
+        is_packed = layout.rgb == layout.thermal
+        if is_packed and not all(map(_has_four_channels, list(candidates)[:1])):
+            continue
+        for path in candidates.keys() - pairs.keys():
+            values = candidates[path]
+            thermal = path if is_packed else _partner(layout, folder, values, any_kind=any_kind)
+            if thermal is None:
+                alone[path] = Pattern(layout.thermal, KEY).path(folder, values)
+            else:
+                pairs[path] = NewPair("_".join(values[each] for each in rgb.words), path, thermal)
+    partners = {pair.thermal for pair in pairs.values() if pair.thermal != pair.rgb} | labels
+    found = [pair for path, pair in pairs.items() if path not in partners]
+    used = {*pairs, *partners}
+    return NewImages(
+        tuple(sorted(found, key=lambda pair: in_order(pair.name))),
+        {path: alone[path] for path in sorted(alone) if path not in used},
+        tuple(path for path in _all_images(folder) if path not in {*used, *alone}) if found else (),
+    )
+
+
+def _files(
+    text: str | None, folder: Path, values: Values = NO_VALUES, *, any_kind: bool
+) -> Iterator[Found]:
+    """Images whose paths match `text`, or match it but for their ending."""
+    if text is None:
+        return
+    stem, dot, ending = text.rpartition(".")
+    kinds = (ending, *(kind[1:] for kind in (*KINDS, ARRAY))) if any_kind and dot else (ending,)
+    for kind in dict.fromkeys(kinds):
+        yield from Pattern(f"{stem}{dot}{kind}", KEY).files(folder, values, any_case=True)
+
+
+def _partner(layout: PairPattern, folder: Path, values: Values, *, any_kind: bool) -> Path | None:
+    """The thermal image of an RGB image; the one whose name is exactly so before all others."""
+    exact = Pattern(layout.thermal, KEY).path(folder, values)
+    found = {path: None for path, _ in _files(layout.thermal, folder, values, any_kind=any_kind)}
+    if exact in found or not found:
+        return exact if found else None
+    first, *more = found
+    if more:
+        raise InputError(
+            f"{KEY}={folder}: {first} and {more[0]} may both be the thermal image of one pair; "
+            "remove or rename one of them."
+        )
+    return first
+
+
+def _has_four_channels(path: Path) -> bool:
+    try:
+        return channels(decode(path)) == 4
+    except InputError:  # whoever reads it says why it cannot be read
+        return True
+
+
+def _all_images(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in KINDS and not path.name.startswith(".")
+    )
+
+
+def _check_names(pairs: Sequence[NewPair]) -> None:
+    seen: dict[str, Path] = {}
+    for pair in pairs:
+        if pair.name in seen:
+            raise InputError(
+                f"{KEY}: {seen[pair.name]} and {pair.rgb} would both be called '{pair.name}'; "
+                "rename or move one of them."
+            )
+        seen[pair.name] = pair.rgb
+
+
+def _why_nothing(
+    folder: Path, layouts: Sequence[PairPattern], name: str, alone: dict[Path, Path]
+) -> str:
+    own = "; ".join(map(str, layouts))
+    for rgb, thermal in alone.items():
+        reason = f"the thermal image of {rgb} would be {thermal}, but "
+        reason += f"{thermal.parent} holds {what_is_in(thermal.parent)}"
+        break
+    else:
+        reason = f"{folder} holds {what_is_in(folder)}"
+    return (
+        f"{KEY}={folder} holds no pair of images: {reason}. Expected were the files of {name} "
+        f"({own}; also without the first folders), folders rgb and thermal with equal names, or "
+        "PNG files of four channels (red, green, blue, thermal). One pair is predicted with "
+        "rgb=FILE thermal=FILE in the place of input."
+    )

@@ -1,0 +1,150 @@
+"""The images that a prediction is made of: a split, a folder of new ones, a file or two files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.dataset import LabelledDataset
+from rgbt.data.decoded.dataset import Decoded
+from rgbt.data.images import Images, ReadsPairs
+from rgbt.data.new_images import find_pairs
+from rgbt.types import Sample
+
+ENDINGS = (".png", "_overlay.png")
+"""What follows a name in the two files that are written of an image."""
+
+
+@dataclass(frozen=True)
+class ToPredict:
+    """Images to predict, in order.
+
+    Attributes:
+        names: of the images; the names of what is written begin with them.
+        read: name -> its images, without a label.
+        folders: where the files lie, which must not be overwritten.
+        skipped: name -> why it was left out; filled by `samples` and by whoever chooses.
+        others: images that were found beside and belong to no pair.
+    """
+
+    names: tuple[str, ...]
+    read: Callable[[str], Sample]
+    folders: frozenset[Path]
+    skipped: dict[str, str] = field(default_factory=dict)
+    others: tuple[Path, ...] = ()
+
+    def samples(self, on_error: Literal["raise", "skip"]) -> Iterator[Sample]:
+        """The images one after the other.
+
+        Raises:
+            InputError: one cannot be read and `on_error` is "raise", or none can.
+        """
+        for name in self.names:
+            try:
+                sample = self.read(name)
+            except InputError as error:
+                if on_error == "raise":
+                    raise
+                self.skipped[name] = str(error)
+                continue
+            yield sample
+        if self.names and not set(self.names) - self.skipped.keys():
+            first = self.skipped[self.names[0]]
+            raise InputError(f"none of the {len(self.names)} images can be read: {first}")
+
+    def check_out(self, out: Path) -> None:
+        """Refuse a folder in which images, or what is written of two of them, would be overwritten.
+
+        Raises:
+            InputError: naming the files.
+        """
+        if out.resolve() in {folder.resolve() for folder in self.folders}:
+            raise InputError(
+                f"out={out} holds the input images, which would be overwritten; take another."
+            )
+        written: dict[str, str] = {}
+        for name in self.names:
+            for file in (f"{name}{ending}" for ending in ENDINGS):
+                if file in written:
+                    raise InputError(
+                        f"'{written[file]}' and '{name}' would both be written to {out / file}; "
+                        "rename one of the images."
+                    )
+                written[file] = name
+
+
+def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
+    """The images of a split; labels are not read where the data set can leave them."""
+    names = dataset.names(split)
+    plain = _plain(dataset)
+    read = plain.pair if isinstance(plain, ReadsPairs) else plain.read
+    folders = {path.parent for name in names for path in dataset.files(name)}
+    return ToPredict(names, read, frozenset(folders))
+
+
+def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "skip"]) -> ToPredict:
+    """The image of a packed file, or the pairs of a folder (see `find_pairs`).
+
+    Args:
+        dataset: whose images they are like.
+        text: the path.
+        on_error: "skip" leaves out RGB images without a thermal image.
+
+    Raises:
+        InputError: no such path, no pair in the folder, an RGB image without a thermal one.
+    """
+    path, images = Path(text), images_of(dataset)
+    if path.is_file():
+        return of_files(dataset, path, path)
+    if not path.is_dir():
+        raise InputError(
+            f"input={text}: there is no such file or folder, and no such split of {dataset.name}; "
+            f"splits: {nearest(text, dataset.splits)}."
+        )
+    found = find_pairs(path, images.layouts, dataset.name)
+    for rgb, thermal in list(found.alone.items())[: on_error == "raise"]:
+        raise InputError(
+            f"input={text}: {len(found.alone)} of {len(found.alone) + len(found.pairs)} RGB images "
+            f"have no thermal image, the first is {rgb}: expected {thermal}; restore it, or use "
+            "data.on_error=skip to leave such images out."
+        )
+    pairs = {pair.name: pair for pair in found.pairs}
+    folders = {path, *(file.parent for pair in found.pairs for file in pair[1:])}
+    skipped = {str(rgb): f"{rgb} has no {thermal}." for rgb, thermal in found.alone.items()}
+    return ToPredict(
+        tuple(pairs),
+        lambda name: images.read(*pairs[name]),
+        frozenset(folders),
+        skipped,
+        found.others,
+    )
+
+
+def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
+    """One pair, called as its RGB file; one file twice is a packed one."""
+    images = images_of(dataset)
+    return ToPredict(
+        (rgb.stem,),
+        lambda name: images.read(name, rgb, thermal),
+        frozenset({rgb.parent, thermal.parent}),
+    )
+
+
+def images_of(dataset: LabelledDataset) -> Images:
+    """How a data set reads images that are in no split; InputError where it does not say."""
+    plain = _plain(dataset)
+    if not isinstance(plain, ReadsPairs):
+        raise InputError(
+            f"{type(plain).__name__} does not say how new images are read; name one of its splits "
+            f"({', '.join(plain.splits)}), or give it `images` and `pair` "
+            "(docs/extending.md, data set)."
+        )
+    return plain.images
+
+
+def _plain(dataset: LabelledDataset) -> LabelledDataset:
+    """The data set without the cache before it, which holds splits alone."""
+    return dataset.source if isinstance(dataset, Decoded) else dataset
