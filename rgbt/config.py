@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,6 +33,9 @@ NODES = (
     *("scale", "recipe", "dataset", "domains", "data", "transform", "masker", "model", "loss"),
     *("scheme", "optimizer", "schedule", "trainer", "metric", "consistency", "tracking"),
 )
+
+PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
+"""A reference that `scaled_pixels` resolves."""
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
     "model": {"weights": str | None, "fresh": tuple[str, ...]},
@@ -74,7 +78,12 @@ def register_resolvers() -> None:
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
-    return round(pixels * float(_root_.scale.pixel_factor))
+    return scaled_pixels(pixels, float(_root_.scale.pixel_factor))
+
+
+def scaled_pixels(pixels: int, factor: float) -> int:
+    """Value of ``${px:pixels}`` where images are `factor` times as large as the paper's."""
+    return round(pixels * factor)
 
 
 def check(config: DictConfig) -> None:

@@ -24,7 +24,7 @@ from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.identity import run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.pairs import file_name
-from rgbt.naming import describe
+from rgbt.naming import describe, group_of
 from rgbt.prepared import Prepared, prepare
 from rgbt.session import (
     Session,
@@ -98,7 +98,8 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     assert known is not None, "a finished run has its description"
     tell(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
     # A point of a grid that is the default elsewhere: the name that says more is the one to read.
-    shown = asked if len(asked.name) > len(known.name) else known
+    lengths = [len(group_of(each.tags, each.params)) for each in (asked, known)]
+    shown = asked if lengths[0] > lengths[1] else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish("FINISHED")
 
