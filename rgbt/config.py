@@ -35,7 +35,6 @@ NODES = (
 )
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
-"""A reference that `scaled_pixels` resolves."""
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
     "model": {"weights": str | None, "fresh": tuple[str, ...]},
@@ -84,6 +83,11 @@ def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
 def scaled_pixels(pixels: int, factor: float) -> int:
     """Value of ``${px:pixels}`` where images are `factor` times as large as the paper's."""
     return round(pixels * factor)
+
+
+def with_pixels(text: str, factor: float) -> str:
+    """`text` with the value of every ``${px:...}`` in it."""
+    return PIXELS.sub(lambda found: str(scaled_pixels(int(found[1]), factor)), text)
 
 
 def check(config: DictConfig) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
-from rgbt.config import PIXELS, flatten, scaled_pixels
+from rgbt.config import flatten, with_pixels
 from rgbt.tracking.folder import Description
 
 TAGS = "RGBT_TAGS"
@@ -124,12 +124,12 @@ def _resolved(value: str, key: str, params: Mapping[str, str]) -> str:
     """A value as typed, but for references, which are shown as what they stand for."""
     factor = params.get("scale.pixel_factor")
     if factor is not None:
-        value = PIXELS.sub(lambda found: str(scaled_pixels(int(found[1]), float(factor))), value)
+        value = with_pixels(value, float(factor))
     return params.get(key, value) if "${" in value else value
 
 
 def _name(config: DictConfig, words: Mapping[str, tuple[str, str]], varied: Sequence[str]) -> str:
-    """What varies, a dot, and what does not; all that was changed where nothing says what varies."""
+    """What varies, a dot, and what does not; outside of a sweep everything may vary."""
     shown = {key: _word((label, _short(value))) for key, (label, value) in words.items()}
     first = [word for key, word in shown.items() if key in varied or not varied]
     rest = [word for word in shown.values() if word not in first]

@@ -16,10 +16,10 @@ from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.points import Point
+from sweeps.report.data import short_names
 from sweeps.running.found import Runs, open_runs
 from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey, work_off
 from sweeps.running.live import duration
-from sweeps.running.sources import short
 from sweeps.search import Search, search
 from sweeps.settings import Settings, read_settings
 from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
@@ -104,7 +104,7 @@ def _point_list(
     runs, base = place
     every = tuple(
         Point(
-            label=" ".join(short(f"{key}={value}") for key, value in point.params.items()) or name,
+            label=_label(point) or name,
             overrides=point.overrides,
             params=point.params,
             tags={f"rgbt.study/{name}": "grid"},
@@ -112,6 +112,12 @@ def _point_list(
         for point in points
     )
     return PointList(name, name, kind, every, runs, base, distributions(points))
+
+
+def _label(point: GridPoint) -> str:
+    """What is particular to a point, values as typed: "sigma_div=1 seed=0"."""
+    names = short_names([key.lstrip("+") for key in point.params])
+    return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
 def _grid(wanted: PointList, settings: Settings) -> None:
