@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
+from rgbt.tracking.tables import Grid
+from rgbt.tracking.terminal import rich_table
 from rgbt.weights.layout import Facts
 from rgbt.weights.plan import Plan
 from rgbt.weights.read import Contents
@@ -69,9 +69,6 @@ def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableT
         overrides: which network it is.
         remarks: on the way it would be filled.
     """
-    table = Table(title=f"into {overrides}", title_justify="left", box=box.SIMPLE_HEAD)
-    for name, justify in (("", "left"), ("tensors", "right"), ("why", "left"), ("such as", "left")):
-        table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
     unfit = [f"{entry}: {how}" for entry, how in plan.unfit.items()]
     torn = [f"{first} and {other}" for first, other in plan.torn]
     rows: list[tuple[str, str, Iterable[str]]] = [
@@ -84,13 +81,14 @@ def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableT
         ("DIFFERENT", "of another shape or kind", unfit),
         ("TORN", "one tensor in the network, two in the file", torn),
     ]
-    for what, why, names in rows:
-        listed = list(names)
-        if listed:
-            shown = "" if what == "set" else _first(listed, 1)
-            table.add_row(*(Text(cell) for cell in (what, str(len(listed)), why, shown)))
-    lines = [Text(f"remark  {remark}") for remark in remarks]
-    return Group(table, *lines)
+    listed = ((what, why, list(names)) for what, why, names in rows)
+    cells = tuple(
+        (what, str(len(names)), why, "" if what == "set" else _first(names, 1))
+        for what, why, names in listed
+        if names
+    )
+    grid = Grid(f"into {overrides}", ("", "tensors", "why", "such as"), cells)
+    return Group(rich_table(grid), *(Text(f"remark  {remark}") for remark in remarks))
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, list[str]]]:
