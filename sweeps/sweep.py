@@ -22,6 +22,7 @@ from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey, 
 from sweeps.running.live import duration
 from sweeps.search import Search, search
 from sweeps.settings import Settings, read_settings
+from sweeps.sheet.groups import group_grid, unfinished_grid
 from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
 from sweeps.space.merge import merge_space
 from sweeps.space.space import as_overrides
@@ -135,7 +136,10 @@ def _grid(wanted: PointList, settings: Settings) -> None:
         # Nothing was run yet: a typing mistake is told before hours are spent on the other points.
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
     outcomes = work_off(wanted, settings)
-    show(rich_table(grid_table(wanted, outcomes)))
+    show(rich_table(group_grid(wanted.title, outcomes)))
+    unfinished = unfinished_grid(outcomes)
+    if unfinished.rows:
+        show(rich_table(unfinished))
     tell(f"study {wanted.study}; its figures: python -m sweeps.study name={wanted.study}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
@@ -146,7 +150,7 @@ def _grid(wanted: PointList, settings: Settings) -> None:
 
 
 def grid_table(wanted: PointList, outcomes: Sequence[Outcome]) -> Grid:
-    """One row per point: what it is, its scores on the test split, its state."""
+    """A preview, one row per point: what it is, its scores on the test split, its state."""
     metrics = (names.MIOU, names.VAR)
     rows = []
     for outcome in outcomes:

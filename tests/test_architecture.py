@@ -96,7 +96,7 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
 
 
 ANALYSIS_MAY = {
-    *("checks", "types", "config", "identity", "command"),
+    *("checks", "types", "config", "identity", "command", "naming"),
     *("randomness", "metrics", "tracking", "data"),
 }
 """What of rgbt the analysis may import: data sets and what runs have left, never a network."""

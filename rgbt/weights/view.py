@@ -1,15 +1,13 @@
-"""What a file of weights is and what it would do, as tables for a terminal."""
+"""What a file of weights is and what it would do, for a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.text import Text
 from torch import Tensor
 
-from rgbt.tracking.tables import Grid
-from rgbt.tracking.terminal import rich_table
 from rgbt.weights.layout import Facts
 from rgbt.weights.plan import Plan
 from rgbt.weights.read import Contents
@@ -61,14 +59,11 @@ def facts_view(contents: Contents, facts: Facts) -> RenderableType:
     return Text("\n".join(f"{name:<{width}}  {value}" for name, value in lines), no_wrap=True)
 
 
-def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableType:
-    """What would happen to a network, one row per reason.
+PLAN_HEADER = ("", "tensors", "why", "such as")
 
-    Args:
-        plan: see `rgbt.weights.plan`.
-        overrides: which network it is.
-        remarks: on the way it would be filled.
-    """
+
+def plan_rows(plan: Plan) -> tuple[tuple[str, str, str, str], ...]:
+    """What would happen to a network, one row per reason, columns as in `PLAN_HEADER`."""
     unfit = [f"{entry}: {how}" for entry, how in plan.unfit.items()]
     torn = [f"{first} and {other}" for first, other in plan.torn]
     rows: list[tuple[str, str, Iterable[str]]] = [
@@ -82,13 +77,11 @@ def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableT
         ("TORN", "one tensor in the network, two in the file", torn),
     ]
     listed = ((what, why, list(names)) for what, why, names in rows)
-    cells = tuple(
+    return tuple(
         (what, str(len(names)), why, "" if what == "set" else _first(names, 1))
         for what, why, names in listed
         if names
     )
-    grid = Grid(f"into {overrides}", ("", "tensors", "why", "such as"), cells)
-    return Group(rich_table(grid), *(Text(f"remark  {remark}") for remark in remarks))
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, list[str]]]:
