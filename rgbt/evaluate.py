@@ -46,6 +46,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               degradation: degradation.block=16 degradation.seed=1
     """
     from rgbt.degraded import own_words
+    from rgbt.overview import announce_stored
     from rgbt.session import evaluate, result_tables, view_of
     from rgbt.stored import open_trained
     from rgbt.tracking.terminal import result_view, show
@@ -56,6 +57,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         overrides = [*overrides, f"metric={arguments['regions']}"]
     runs_dir = Path(arguments["runs_dir"])
     stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"])
+    announce_stored(stored)
     session = stored.session
     view = view_of(session, arguments["modality"])
     head = _head(arguments["head"])

@@ -54,6 +54,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     threshold smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
+    from rgbt.overview import announce_stored
     from rgbt.pseudo import label_map_of
     from rgbt.stored import open_trained
 
@@ -67,6 +68,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     label_map = label_map_of(arguments["label_map"])
     runs_dir = Path(arguments["runs_dir"])
     stored = open_trained(arguments["run"], runs_dir, overrides, arguments["checkpoint"], label_map)
+    announce_stored(stored)
     if as_labels:
         _pseudo_labels(arguments, stored, label_map)
     else:

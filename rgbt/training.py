@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,9 +24,11 @@ from rgbt.identity import run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.pairs import file_name
 from rgbt.naming import describe, group_of
+from rgbt.overview import announce_training
 from rgbt.prepared import Prepared, prepare
 from rgbt.session import (
     Session,
+    decode_ahead,
     evaluate,
     legend_of,
     names_key,
@@ -48,9 +49,6 @@ from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which the user is told."""
-
-LABEL_WIDTH = 40
-"""Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
 
 
 def is_finished(config: DictConfig) -> bool:
@@ -82,6 +80,8 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         prepared = prepare(config)
+        announce_training(prepared, asked.name, path)
+        decode_ahead(prepared.session, *prepared.read_splits())
         folder = RunFolder(path)
         with folder.lock():
             Run(prepared, folder, tracking, asked).complete()
@@ -303,8 +303,8 @@ class Run:
         of_target = self._of_target(session, session.model, "test", save=True)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
-        label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
-        tables = result_tables(found.counts, session.regions, label, state.best_step)
+        name = self.description.name
+        tables = result_tables(found.counts, session.regions, name, state.best_step)
         subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)

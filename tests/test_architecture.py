@@ -50,6 +50,7 @@ MEETING_PLACES = {
     "prepared.py",
     "earlier.py",
     "naming.py",
+    "overview.py",
     "pretrained.py",
     "weights/__main__.py",
     "__init__.py",
