@@ -6,24 +6,27 @@ import re
 from collections.abc import Sequence
 
 ELLIPSIS = "…"
-SHORTEST = 10
-"""Characters that a shortened label keeps at least."""
+SHORTEST = 16
+"""Characters that a label keeps at least; columns are folded before it gets shorter."""
 
 SHARES = (0.5, 0.75, 0.25, 1.0, 0.0)
 """Parts of what is kept of a label that stand before its cut, the preferred one first."""
 
-SENTENCE = re.compile(r"[^\W\d]{3,}\W+(?:\w+\W+)*?[^\W\d]{3,}")
-"""Two words of letters: text that may be shortened, unlike a number, a key or an interval."""
+LETTERS = re.compile(r"[^\W\d]{3,}")
+KEYS = re.compile(r"[0-9a-f]{12}( [0-9a-f]{12})*")
+"""Keys of runs, which are copied."""
 
 
 def is_text(cell: str) -> bool:
-    """Whether a cell is words, not a number, an interval or a key.
+    """Whether a cell is words that may be shortened: no number, interval, key or path.
 
     Example:
-        >>> is_text("stopped after 5 minutes"), is_text("+1.20 to +3.40"), is_text("runs/454482")
+        >>> is_text("stopped after a while"), is_text("+1.20 to +3.40"), is_text("runs/454482 x")
         (True, False, False)
     """
-    return "/" not in cell and SENTENCE.search(cell) is not None
+    if not cell[:1].isalpha() or "/" in cell or KEYS.fullmatch(cell):
+        return False
+    return sum(LETTERS.search(word) is not None for word in cell.split()) > 1
 
 
 def shortened(labels: Sequence[str], widths: Sequence[int]) -> tuple[str, ...]:

@@ -79,7 +79,7 @@ def fitted(grid: Grid, width: int) -> list[Grid]:
         fixed = [len(cell) for cell in columns[index][1:] if index and not is_text(cell)]
         limits[index] = max(SHORTEST, *fixed, limits[index] - max(over, 0))
     if _taken(_cut_to(columns, limits)) > room:  # folded in any case: no need to cut all
-        limits = [max(SHORTEST, room // 3)] * len(columns)
+        limits = [max(SHORTEST, room // (2 if index else 3)) for index in range(len(columns))]
     columns = _cut_to(columns, limits)
     folded = blocks([_width(cells) for cells in columns], room, gap=GAP, first=1)
     return [

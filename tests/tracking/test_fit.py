@@ -29,8 +29,11 @@ def test_labels_that_differ_still_do() -> None:
         ("48.75 ± 1.22", False),
         ("-3.30 to +0.11", False),
         ("454482993c6b", False),
+        ("fade02993c6b abcde2993c6b", False),
         ("see runs/.logs/abc.log for the rest", False),
         ("finished", False),
+        ("8, 16, 32 gray values (standard deviation)", False),
+        ("95 % over images", False),
     ],
 )
 def test_words_are_told_from_numbers_keys_and_paths(cell: str, expected: bool) -> None:
