@@ -163,8 +163,8 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
 
     with_seeds = any(difference.both is not None for difference in comparison.differences)
     level = f"{100 * comparison.level:g} %"
-    over = [f"{level} over images", "p"]
-    more = [f"{level} over images and seeds", "p"] if with_seeds else []
+    over = [f"{level} over images", "p (images)"]
+    more = [f"{level} over images and seeds", "p (both)"] if with_seeds else []
     rows = []
     for each in comparison.differences:
         both = [_shown(each.both), _p(each.p_both)] if with_seeds else []

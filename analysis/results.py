@@ -13,11 +13,9 @@ import numpy as np
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
-from rgbt.tracking.folder import RunFolder, find_run, runs_in
+from rgbt.naming import GROUP, group_of
+from rgbt.tracking.folder import Description, RunFolder, find_run, runs_in
 from rgbt.tracking.terminal import tell
-
-GROUP = "rgbt.group"
-"""Tag that the seeds of one method share (`rgbt.naming`)."""
 
 SEED = "rgbt.seed"
 
@@ -117,7 +115,7 @@ def _check_trainings_differ(text: str, found: Sequence[Stored]) -> None:
 def groups_in(runs_dir: Path | str) -> list[str]:
     """Names of all groups with finished runs in a folder."""
     runs = [run for run in _runs(Path(runs_dir)) if run.result() is not None]
-    return sorted({_tag(run, GROUP) for run in runs} - {""})
+    return sorted({_groups(run)[0] for run in runs} - {""})
 
 
 def label_of(stored: tuple[Stored, ...]) -> str:
@@ -177,7 +175,8 @@ def _of_file(path: Path) -> Stored:
 
 
 def _of_group(word: str, runs_dir: Path) -> list[RunFolder]:
-    return [run for run in _runs(runs_dir) if _tag(run, GROUP) == word and run.result() is not None]
+    runs = _runs(runs_dir)
+    return [run for run in runs if word in _groups(run) and run.result() is not None]
 
 
 def _runs(runs_dir: Path) -> list[RunFolder]:
@@ -191,7 +190,7 @@ def _of_run(run: RunFolder, split: str, frames: Frames) -> Stored:
         tell(f"{run.path} is not finished; its counts are of a training that goes on.")
     seed = _tag(run, SEED)
     return Stored(
-        label=_tag(run, GROUP) or run.path.name,
+        label=_groups(run)[0] or run.path.name,
         key=run.path.name,
         seed=int(seed) if seed else None,
         path=path,
@@ -223,9 +222,21 @@ def _pairs_of_frames(run: RunFolder, split: str, protocol: Protocol) -> Path:
     return path
 
 
+def _groups(run: RunFolder) -> tuple[str, str]:
+    """The run's group as it is written now, and as the run wrote it: commands may name either."""
+    description = _description(run)
+    if description is None:
+        return "", ""
+    return group_of(description.tags, description.params), description.tags.get(GROUP, "")
+
+
 def _tag(run: RunFolder, name: str) -> str:
-    try:
-        description = run.description()
-    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
-        return ""
+    description = _description(run)
     return "" if description is None else description.tags.get(name, "")
+
+
+def _description(run: RunFolder) -> Description | None:
+    try:
+        return run.description()
+    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
+        return None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,8 @@ NODES = (
     *("scale", "recipe", "dataset", "domains", "data", "transform", "masker", "model", "loss"),
     *("scheme", "optimizer", "schedule", "trainer", "metric", "consistency", "tracking"),
 )
+
+PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
 OF_THE_RUN: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
@@ -85,7 +88,17 @@ def register_resolvers() -> None:
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
-    return round(pixels * float(_root_.scale.pixel_factor))
+    return scaled_pixels(pixels, float(_root_.scale.pixel_factor))
+
+
+def scaled_pixels(pixels: int, factor: float) -> int:
+    """Value of ``${px:pixels}`` where images are `factor` times as large as the paper's."""
+    return round(pixels * factor)
+
+
+def with_pixels(text: str, factor: float) -> str:
+    """`text` with the value of every ``${px:...}`` in it."""
+    return PIXELS.sub(lambda found: str(scaled_pixels(int(found[1]), factor)), text)
 
 
 def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:

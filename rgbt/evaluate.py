@@ -49,6 +49,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               degradation: degradation.block=16 degradation.seed=1
     """
     from rgbt.degraded import own_words
+    from rgbt.overview import announce_stored
     from rgbt.session import evaluate, result_tables, view_of
     from rgbt.stored import open_trained
     from rgbt.stored_config import parse_trust
@@ -64,6 +65,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     runs_dir = Path(arguments["runs_dir"])
     run, checkpoint = arguments["run"], arguments["checkpoint"]
     stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
+    announce_stored(stored)
     session = stored.session
     view = view_of(session, arguments["modality"])
     head = _head(arguments["head"])

@@ -62,6 +62,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     threshold smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
+    from rgbt.overview import announce_stored
     from rgbt.pseudo import label_map_of
     from rgbt.stored import open_trained
     from rgbt.stored_config import parse_trust
@@ -78,6 +79,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     run, checkpoint = arguments["run"], arguments["checkpoint"]
     trust = parse_trust(arguments["trust"])
     stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
+    announce_stored(stored)
     if as_labels:
         _pseudo_labels(arguments, stored, label_map)
     else:

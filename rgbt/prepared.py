@@ -25,7 +25,7 @@ from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
 from rgbt.probes import check_cells, check_own_parts, example_hw, first_readable
 from rgbt.randomness import derive
-from rgbt.session import Session, decode_ahead, open_session
+from rgbt.session import Session, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import VIEWS, Loadable, Masker, View
@@ -65,6 +65,11 @@ class Prepared:
     def splits(self) -> dict[str, str]:
         """Domain -> split that it is trained on."""
         return {name: domain.split for name, domain in self.session.domains.named.items()}
+
+    def read_splits(self) -> tuple[str, ...]:
+        """Every split that the run reads: of the training, of the selection, of the test."""
+        splits = (*self.splits().values(), self.session.trainer.selection_split, "test")
+        return tuple(dict.fromkeys(splits))
 
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
@@ -159,12 +164,6 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
-    if not rehearsal:
-        decode_ahead(
-            session,
-            *(domain.split for domain in domains.named.values()),
-            *(session.trainer.selection_split, "test"),
-        )
     return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
 
 

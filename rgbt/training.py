@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +24,12 @@ from rgbt.identity import run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
-from rgbt.naming import describe
+from rgbt.naming import describe, group_of
+from rgbt.overview import announce_training
 from rgbt.prepared import Prepared, prepare
 from rgbt.session import (
     Session,
+    decode_ahead,
     evaluate,
     legend_of,
     names_key,
@@ -50,9 +51,6 @@ from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which the user is told."""
-
-LABEL_WIDTH = 40
-"""Characters of a run's name in its tables; the whole name is in MLflow and in run.json."""
 
 
 def is_finished(config: DictConfig) -> bool:
@@ -88,6 +86,8 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         prepared = prepare(config)
+        announce_training(prepared, asked.name, path)
+        decode_ahead(prepared.session, *prepared.read_splits())
         if is_finished(config):
             replace_finished(RunFolder(path), tracking)
         folder = RunFolder(path)
@@ -106,7 +106,8 @@ def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> No
     assert known is not None, "a finished run has its description"
     tell(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
     # A point of a grid that is the default elsewhere: the name that says more is the one to read.
-    shown = asked if len(asked.name) > len(known.name) else known
+    lengths = [len(group_of(each.tags, each.params)) for each in (asked, known)]
+    shown = asked if lengths[0] > lengths[1] else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish("FINISHED")
 
@@ -341,8 +342,8 @@ class Run:
         of_target = self._of_target(session, session.model, "test", self.folder.path)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
-        label = textwrap.shorten(self.description.name, LABEL_WIDTH, placeholder=" ...")
-        tables = result_tables(found.counts, session.regions, label, state.best_step)
+        name = self.description.name
+        tables = result_tables(found.counts, session.regions, name, state.best_step)
         subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)

@@ -33,6 +33,9 @@ SECONDS = "rgbt.seconds"
 RESULTS = "rgbt.results"
 """"val/..." and "test/..." scores of the point, mean over its seeds; percent, Var as it is."""
 
+PIXELS = "rgbt.pixels"
+"""Size of the point's images relative to the paper's, by which ``${px:64}`` is scaled."""
+
 KIND = "rgbt.kind"
 """Of a study: "search", "grid" or "list"."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import colorsys
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -74,6 +76,33 @@ class Evaluation:
     def _failing(self) -> str:
         """The degradation with its severity, as part of a name."""
         return f"{self.degradation}" + ("" if self.severity is None else f"-{self.severity:g}")
+
+
+COLOUR = "mlflow.runColor"
+"""Tag with the colour of a run in MLflow's charts, which else comes from a hash of its id: of
+twenty colours two runs of four share one in every fourth grid."""
+
+
+def colour(study: str, index: int) -> str:
+    """Colour of the point `index` of a study, "#rrggbb"; neighbours differ in hue and lightness."""
+    first = hashlib.sha256(study.encode()).digest()[0] / 256
+    hue = (first + index * GOLDEN) % 1.0
+    channels = colorsys.hls_to_rgb(hue, LIGHTNESSES[index % len(LIGHTNESSES)], SATURATION)
+    return "#" + "".join(f"{round(255 * channel):02x}" for channel in channels)
+
+
+GOLDEN = 0.618034
+"""Golden ratio: its multiples, modulo 1, never come close to each other soon."""
+
+LIGHTNESSES = (0.36, 0.56, 0.46)
+SATURATION = 0.62
+
+
+def varied_keys(points: Sequence[Point]) -> list[str]:
+    """Keys of the overrides that not all points have, in order."""
+    common = set.intersection(*(set(point.overrides) for point in points)) if points else set()
+    words = (word for point in points for word in point.overrides if word not in common)
+    return list(dict.fromkeys(word.lstrip("+").partition("=")[0] for word in words))
 
 
 @dataclass(frozen=True)

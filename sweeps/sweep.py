@@ -16,6 +16,7 @@ from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.points import Point
+from sweeps.report.data import short_names
 from sweeps.running.found import Runs, open_runs
 from sweeps.running.lists import (
     Outcome,
@@ -26,9 +27,9 @@ from sweeps.running.lists import (
     work_off,
 )
 from sweeps.running.live import duration
-from sweeps.running.sources import short
 from sweeps.search import Search, search
 from sweeps.settings import Settings, read_settings
+from sweeps.sheet.groups import group_grid, unfinished_grid
 from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
 from sweeps.space.merge import merge_space
 from sweeps.space.space import as_overrides
@@ -113,7 +114,7 @@ def _point_list(
     runs, base = place
     every = tuple(
         Point(
-            label=" ".join(short(f"{key}={value}") for key, value in point.params.items()) or name,
+            label=_label(point) or name,
             overrides=point.overrides,
             params=point.params,
             tags={f"rgbt.study/{name}": "grid"},
@@ -121,6 +122,12 @@ def _point_list(
         for point in points
     )
     return PointList(name, name, kind, every, runs, base, distributions(points))
+
+
+def _label(point: GridPoint) -> str:
+    """What is particular to a point, values as typed: "sigma_div=1 seed=0"."""
+    names = short_names([key.lstrip("+") for key in point.params])
+    return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
 def _grid(wanted: PointList, settings: Settings) -> None:
@@ -139,7 +146,10 @@ def _grid(wanted: PointList, settings: Settings) -> None:
         # Nothing was run yet: a typing mistake is told before hours are spent on the other points.
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
     outcomes = work_off(wanted, settings)
-    show(rich_table(grid_table(wanted, outcomes)))
+    show(rich_table(group_grid(wanted.title, outcomes)))
+    unfinished = unfinished_grid(outcomes)
+    if unfinished.rows:
+        show(rich_table(unfinished))
     _tell_other_code(outcomes)
     tell(f"study {wanted.study}; its figures: python -m sweeps.study name={wanted.study}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
@@ -157,7 +167,7 @@ def _tell_other_code(outcomes: Sequence[Outcome]) -> None:
 
 
 def grid_table(wanted: PointList, outcomes: Sequence[Outcome]) -> Grid:
-    """One row per point: what it is, its scores on the test split, its state."""
+    """A preview, one row per point: what it is, its scores on the test split, its state."""
     metrics = (names.MIOU, names.VAR)
     rows = []
     for outcome in outcomes:

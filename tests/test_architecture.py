@@ -60,6 +60,7 @@ MEETING_PLACES = {
     "probes.py",
     "earlier.py",
     "naming.py",
+    "overview.py",
     "pretrained.py",
     "weights/__main__.py",
     "__init__.py",
@@ -109,7 +110,7 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
 
 
 ANALYSIS_MAY = {
-    *("checks", "types", "config", "identity", "command", "stored_config", "yaml_files"),
+    *("checks", "types", "config", "identity", "command", "naming", "stored_config", "yaml_files"),
     *("randomness", "metrics", "tracking", "data"),
 }
 """What of rgbt the analysis may import: data sets and what runs have left, never a network."""

@@ -313,7 +313,7 @@ def test_what_is_measured_is_no_part_of_a_name() -> None:
         return found.name, found.tags["rgbt.group"]
 
     plain = named()
-    assert plain == ("temporal_con seed=0", "temporal_con")
+    assert plain == ("seed=0 · temporal_con", "temporal_con")
     for words in (
         ("consistency=none",),
         ("consistency.splits=[val,test]",),

@@ -400,7 +400,7 @@ def test_a_group_of_the_same_run_at_other_seeds(bring: Any, tmp_path: Path) -> N
         bring("sh_adversarial", train, f"seed={seed}", "trainer.max_steps=3")
         config = composed("sh_source", f"seed={seed}", "trainer.max_steps=3")
         found = describe(config, ["+experiment=sh_source", *train.words["sh_source"]])
-        assert found.name == f"sh_source max_steps=3 seed={seed}"
+        assert found.name == f"max_steps=3 seed={seed} · sh_source"
         assert found.tags["rgbt.group"] == "sh_source max_steps=3"
 
 

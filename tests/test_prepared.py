@@ -19,7 +19,7 @@ from rgbt.config import build, check, compose
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.prepared import _where_to_augment, prepare, rehearse
 from rgbt.pseudo import BEGUN, Teacher, write_pseudo_labels
-from rgbt.session import open_session
+from rgbt.session import decode_ahead, open_session
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
 from tests.composed import composed as composed_once
@@ -251,6 +251,7 @@ def test_all_that_is_read_is_decoded_before_the_first_step(
     prepare(cached, rehearsal=True)
     assert not (tmp_path / "cache").exists(), "a rehearsal leaves nothing behind"
     prepared = prepare(cached)
+    decode_ahead(prepared.session, *prepared.read_splits())
     dataset: Any = prepared.session.dataset
 
     def refuses(name: str) -> None:

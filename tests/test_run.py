@@ -401,22 +401,6 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 
-def test_names_say_what_differs_and_groups_leave_the_seed_out() -> None:
-    from omegaconf import OmegaConf
-
-    from rgbt.naming import describe
-
-    config = OmegaConf.create({"name": "grbm", "seed": 1})
-    typed = ["+experiment=grbm", "seed=1", "runs_dir=x", "tracking=none", "masker.sigma_div=2"]
-    shown = describe(config, typed)
-    assert (shown.name, shown.tags["rgbt.group"]) == (
-        "grbm sigma_div=2 seed=1",
-        "grbm sigma_div=2",
-    )
-    twice = describe(config, ["dataset.seed=3", "optimizer.lr=1", "scale.lr=2"])
-    assert twice.name == "grbm dataset.seed=3 optimizer.lr=1 scale.lr=2 seed=1"
-
-
 def test_a_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
     from rgbt.checks import InputError
     from rgbt.tracking.folder import find_run

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from rgbt.training import Run
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.training import Run, _show_again
 
 
 def told(
@@ -46,3 +49,25 @@ def test_little_waiting_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
     earlier = [("train", {"loss": 1.0}), ("val", {"wait_share": 0.9})]
     assert told(capsys, earlier, None) == "", "lines of before it was measured, and of no step"
     assert "31%" in told(capsys, [*earlier, *steps(0.31)], None)
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [("grbm", "grbm sigma_div=2 seed=0"), ("grbm sigma_div=2", "grbm sigma_div=2 seed=0")],
+)
+def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
+    tmp_path: Path, group: str, name: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
+    asked = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
+    _show_again(folder, NoTracking(), asked)
+    kept = folder.description()
+    assert kept is not None
+    assert (kept.name, kept.tags["row"]) == (name, "a")
+
+    more = Description("lr=1 · grbm", {"rgbt.group": "grbm sigma_div=2 lr=1"}, {})
+    _show_again(folder, NoTracking(), more)
+    kept = folder.description()
+    assert kept is not None
+    assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")

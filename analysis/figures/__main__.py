@@ -92,10 +92,7 @@ def _list() -> int:
     from rgbt.tracking.terminal import rich_table, show
 
     rows = tuple((name, entry.shows, entry.needs) for name, entry in FIGURES.items())
-    table = rich_table(Grid("figures", ("figure", "shows", "made from"), rows))
-    for column in table.columns:
-        column.justify = "left"
-    show(table)
+    show(rich_table(Grid("figures", ("figure", "shows", "made from"), rows)))
     return 0
 
 

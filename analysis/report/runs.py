@@ -27,6 +27,7 @@ from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import iou, miou, summary
+from rgbt.naming import group_of
 from rgbt.stored_config import settings_of
 from rgbt.tracking.provenance import without_passwords
 from rgbt.yaml_files import parse_yaml
@@ -90,15 +91,16 @@ def open_run(stored: StoredRun, remarks: list[str]) -> Run:
     processes = read_provenance(stored.files, key, remarks)
     first = processes[0] if processes else {}
     command = without_passwords(str(first.get("command") or stored.tags.get("rgbt.command", "")))
+    group = group_of(stored.tags, stored.params)
     entry = RunEntry(
         key=key,
         name=stored.name,
         run_id=stored.run_id,
         status=stored.status,
         experiment=stored.tags.get("rgbt.experiment", ""),
-        scale=_scale(stored.tags.get("rgbt.group", "")),
+        scale=_scale(group),
         seed=_seed(stored.tags.get("rgbt.seed", "")),
-        group=stored.tags.get("rgbt.group", ""),
+        group=group,
         studies=tuple(_after(stored.tags, STUDY_TAG)),
         table_rows=_after(stored.tags, TAG),
         split=SPLIT if counts is None else counts.split,

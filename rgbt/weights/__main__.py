@@ -37,11 +37,14 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
               one that fits, or the one of the run that the file belongs to
     trust     modules of yours with the network of that run: trust=my_lab; their code is run
     """
-    from rgbt.tracking.terminal import show
+    from rich.text import Text
+
+    from rgbt.tracking.tables import Grid
+    from rgbt.tracking.terminal import rich_table, show
     from rgbt.weights.load import plan_for
     from rgbt.weights.read import read
     from rgbt.weights.recognise import recognise
-    from rgbt.weights.view import facts_view, plan_view
+    from rgbt.weights.view import PLAN_HEADER, facts_view, plan_rows
 
     contents = read(Path(arguments["file"]))
     facts = recognise(contents)
@@ -51,7 +54,8 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
         return 0
     node, name = found
     _, plan, remarks = plan_for(_built(node), contents, tuple(node.get("fresh") or ()))
-    show(plan_view(plan, name, remarks))
+    show(rich_table(Grid(f"into {name}", PLAN_HEADER, plan_rows(plan))))
+    show(Text("".join(f"remark  {remark}\n" for remark in remarks), end=""))
     return 0 if plan.fits else 1
 
 

@@ -1,12 +1,10 @@
-"""What a file of weights is and what it would do, as tables for a terminal."""
+"""What a file of weights is and what it would do, for a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from rich import box
-from rich.console import Group, RenderableType
-from rich.table import Table
+from rich.console import RenderableType
 from rich.text import Text
 from torch import Tensor
 
@@ -61,17 +59,11 @@ def facts_view(contents: Contents, facts: Facts) -> RenderableType:
     return Text("\n".join(f"{name:<{width}}  {value}" for name, value in lines), no_wrap=True)
 
 
-def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableType:
-    """What would happen to a network, one row per reason.
+PLAN_HEADER = ("", "tensors", "why", "such as")
 
-    Args:
-        plan: see `rgbt.weights.plan`.
-        overrides: which network it is.
-        remarks: on the way it would be filled.
-    """
-    table = Table(title=f"into {overrides}", title_justify="left", box=box.SIMPLE_HEAD)
-    for name, justify in (("", "left"), ("tensors", "right"), ("why", "left"), ("such as", "left")):
-        table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
+
+def plan_rows(plan: Plan) -> tuple[tuple[str, str, str, str], ...]:
+    """What would happen to a network, one row per reason, columns as in `PLAN_HEADER`."""
     unfit = [f"{entry}: {how}" for entry, how in plan.unfit.items()]
     torn = [f"{first} and {other}" for first, other in plan.torn]
     rows: list[tuple[str, str, Iterable[str]]] = [
@@ -84,13 +76,12 @@ def plan_view(plan: Plan, overrides: str, remarks: Iterable[str]) -> RenderableT
         ("DIFFERENT", "of another shape or kind", unfit),
         ("TORN", "one tensor in the network, two in the file", torn),
     ]
-    for what, why, names in rows:
-        listed = list(names)
-        if listed:
-            shown = "" if what == "set" else _first(listed, 1)
-            table.add_row(*(Text(cell) for cell in (what, str(len(listed)), why, shown)))
-    lines = [Text(f"remark  {remark}") for remark in remarks]
-    return Group(table, *lines)
+    listed = ((what, why, list(names)) for what, why, names in rows)
+    return tuple(
+        (what, str(len(names)), why, "" if what == "set" else _first(names, 1))
+        for what, why, names in listed
+        if names
+    )
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, list[str]]]:

@@ -98,7 +98,7 @@ def dimension(data: StudyData, name: str) -> Dimension:
         float(choices.index(trial.params[name])) if name in trial.params else math.nan
         for trial in data.complete
     ]
-    return Dimension(name, tuple(places), categories=tuple(map(str, choices)))
+    return Dimension(name, tuple(places), categories=tuple(map(data.shown, choices)))
 
 
 def _is_integer(distribution: BaseDistribution) -> bool:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from rgbt.config import PIXELS, with_pixels
 from sweeps import attributes
 
 if TYPE_CHECKING:
@@ -99,10 +100,15 @@ class StudyData:
         study.add_trials(self.complete)
         return study
 
+    def shown(self, value: object) -> str:
+        """A parameter's value for people."""
+        factors = {trial.user_attrs.get(attributes.PIXELS) for trial in self.trials}
+        return shown(value, factors.pop() if len(factors) == 1 else None)
+
     def label(self, trial: FrozenTrial) -> str:
         """What a person sees of a trial: its label, else its parameters, else its number."""
         short = short_names(self.distributions)
-        pairs = [f"{short[name]}={shown(value)}" for name, value in trial.params.items()]
+        pairs = [f"{short[name]}={self.shown(value)}" for name, value in trial.params.items()]
         return str(trial.user_attrs.get(attributes.LABEL) or " ".join(pairs) or trial.number)
 
 
@@ -134,8 +140,17 @@ def short_names(names: Collection[str]) -> dict[str, str]:
     return {name: end if ends[end := name.rpartition(".")[2]] == 1 else name for name in names}
 
 
-def shown(value: object) -> str:
-    """A parameter's value for people: four significant digits."""
+def shown(value: object, pixel_factor: float | None = None) -> str:
+    """A parameter's value for people: four significant digits; ``${px:64}`` as what it stands for.
+
+    Args:
+        value: of a trial.
+        pixel_factor: by which pixels of the paper's images are scaled; None: unknown.
+    """
+    if isinstance(value, str) and PIXELS.search(value):
+        if pixel_factor is None:
+            return PIXELS.sub(r"\1px", value)
+        return with_pixels(value, pixel_factor)
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rgbt.metrics import names as metric_names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps import attributes
-from sweeps.report.data import Importances, StudyData, pruning, short_names, shown
+from sweeps.report.data import Importances, StudyData, pruning, short_names
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -142,7 +142,9 @@ def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_la
     for trial in trials:
         results = _scores(data, trial)
         what = [data.label(trial), WORDS[trial.state.name]] if with_label else []
-        what += [shown(trial.params[name]) if name in trial.params else ABSENT for name in names]
+        what += [
+            data.shown(trial.params[name]) if name in trial.params else ABSENT for name in names
+        ]
         values = [number(results[name]) if name in results else ABSENT for name in scores]
         rows.append((str(trial.number), *what, *values, _seconds(trial), _runs(trial)))
     return Grid(title, tuple(header), tuple(rows))

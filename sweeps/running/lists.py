@@ -9,8 +9,9 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError
+from rgbt.naming import VARIED
 from sweeps import attributes as names
-from sweeps.points import Point
+from sweeps.points import COLOUR, Point, colour, varied_keys
 from sweeps.running.driver import Driver
 from sweeps.running.executors import Executor, LocalExecutor, check_gpus
 from sweeps.running.follow import known_seconds
@@ -172,17 +173,23 @@ class _Prepared:
         if self.wrong and not self.plans:
             # What no point can be composed with is a mistake of the call and not of a cell.
             raise InputError(next(iter(self.wrong.values())))
-        self._share_tags()
+        self._share_tags(wanted.study)
 
-    def _share_tags(self) -> None:
-        """Points that are the same run in other words (1 and 1.0) get the tags of all of them."""
+    def _share_tags(self, study: str) -> None:
+        """Points that are the same run in other words (1 and 1.0) get the tags of all of them.
+
+        Every run gets a colour of its own, and is told what its name begins with.
+        """
+        varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}
         for plan in self.plans.values():
+            own = tags.setdefault(plan.key, {})
             for name, value in plan.point.tags.items():
-                values = tags.setdefault(plan.key, {}).setdefault(name, [])
+                values = own.setdefault(name, [])
                 values += [] if value in values else [value]
         for index, plan in self.plans.items():
             shared = {name: " | ".join(each) for name, each in tags.get(plan.key, {}).items()}
+            shared |= {VARIED: varied, COLOUR: colour(study, list(tags).index(plan.key))}
             self.plans[index] = replace(plan, point=replace(plan.point, tags=shared))
 
     def outcomes(self, standing: Any) -> list[Outcome]:
@@ -195,7 +202,7 @@ class _Prepared:
             plan = self.plans[index]
             seen = standing(plan)
             keys = tuple(run.key for run in plan.runs)
-            found.append(Outcome(point, seen.state, seen.reason, seen.found, keys))
+            found.append(Outcome(plan.point, seen.state, seen.reason, seen.found, keys))
         return found
 
 

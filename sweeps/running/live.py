@@ -18,10 +18,14 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from rgbt.tracking.fit import SHORTEST, shortened
 from sweeps.running.work import Work
 
 CONSOLE = Console(stderr=True)
 LABEL_WIDTH = 52
+BESIDE = 68
+"""Characters of a line beside the label: bar, share, status and score."""
+
 SHORT_S = 5.0
 """A point that took less was not trained, its result was known."""
 
@@ -93,12 +97,13 @@ class View:
         if now - self._counted > 5:
             self._counted, self._done = now, self._count()
         rows = Table.grid(padding=(0, 2))
-        for work in works:
+        room = max(SHORTEST, min(LABEL_WIDTH, CONSOLE.width - BESIDE))
+        labels = shortened([work.plan.point.label for work in works], [room] * len(works))
+        for work, label in zip(works, labels, strict=True):
             score = "" if math.isnan(work.score) else f"val mIoU {100 * work.score:.2f}"
             bar = ProgressBar(total=1.0, completed=work.done_share, width=24)
-            label = Text(work.plan.point.label[:LABEL_WIDTH])
             rows.add_row(
-                "  ", label, bar, f"{100 * work.done_share:3.0f} %", Text(work.status), score
+                "  ", Text(label), bar, f"{100 * work.done_share:3.0f} %", Text(work.status), score
             )
         self._live.update(Group(Text(self._headline(works)), rows))
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.command import composing
-from rgbt.config import build, check, compose
+from rgbt.config import build, check, compose, with_pixels
 from rgbt.identity import run_key
 from sweeps.points import Evaluation, Point
 
@@ -26,12 +26,14 @@ class PlannedRun:
         dataset: fingerprint of its data set.
         overrides: of `python -m rgbt.run`.
         steps: optimiser steps it takes.
+        pixel_factor: size of its images relative to the paper's.
     """
 
     key: str
     dataset: str
     overrides: tuple[str, ...]
     steps: int
+    pixel_factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,13 @@ class Plan:
         point: the point.
         key: names the point in a study: the key of its run, or a hash where there is more to it.
         runs: one, or one per seed.
+        pixel_factor: size of its images relative to the paper's.
     """
 
     point: Point
     key: str
     runs: tuple[PlannedRun, ...]
+    pixel_factor: float = 1.0
 
 
 class Planner:
@@ -81,7 +85,8 @@ class Planner:
             ]
             parts = [[run.key for run in runs], asked]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
-        return Plan(point, key, runs)
+        factor = runs[0].pixel_factor
+        return Plan(replace(point, label=with_pixels(point.label, factor)), key, runs, factor)
 
     def config(self, overrides: Sequence[str]) -> DictConfig:
         """The checked configuration of one run.
@@ -98,7 +103,13 @@ class Planner:
         every = (*self.base, *overrides)
         config = self.config(every)
         key = run_key(config)
-        return PlannedRun(key, self._fingerprint(config), every, int(config.trainer.max_steps))
+        return PlannedRun(
+            key=key,
+            dataset=self._fingerprint(config),
+            overrides=every,
+            steps=int(config.trainer.max_steps),
+            pixel_factor=float(config.scale.pixel_factor),
+        )
 
     def _fingerprint(self, config: DictConfig) -> str:
         text = json.dumps(_plain(config.dataset), sort_keys=True)

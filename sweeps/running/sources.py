@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -10,10 +9,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from rgbt.checks import InputError, RunError
+from rgbt.naming import VARIED
 from rgbt.tracking.folder import MetricLine
 from rgbt.tracking.provenance import without_passwords
 from sweeps import attributes as names
-from sweeps.points import Point
+from sweeps.points import COLOUR, Point, colour
 from sweeps.running.found import Found, Runs, in_percent
 from sweeps.running.ledger import Claim, Ledger
 from sweeps.running.plan import Plan, Planner
@@ -127,6 +127,7 @@ class ListSource:
                 names.LABEL: plan.point.label,
                 names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],
                 names.RUNS: [run.key for run in plan.runs],
+                names.PIXELS: plan.pixel_factor,
             }
             params = {k: v for k, v in plan.point.params.items() if k in self._distributions}
             asked = {name: self._distributions[name] for name in params}
@@ -256,6 +257,7 @@ class SearchSource:
             names.LABEL: point.label,
             names.OVERRIDES: [without_passwords(word) for word in point.overrides],
             names.RUNS: [run.key for run in plan.runs],
+            names.PIXELS: plan.pixel_factor,
         }
         self._ledger.note(trial.number, notes)
         return Task(plan, trial.number, self._report(trial))
@@ -278,7 +280,11 @@ class SearchSource:
             label=f"#{trial.number} " + " ".join(short(override) for override in chosen),
             overrides=(*self._fixed, *chosen),
             params={key: value for key, value in trial.params.items()},
-            tags={f"rgbt.study/{study}": str(trial.number)},
+            tags={
+                f"rgbt.study/{study}": str(trial.number),
+                VARIED: " ".join(params),
+                COLOUR: colour(study, trial.number),
+            },
             seeds=tuple(range(replicates)) if replicates > 1 else (),
         )
 
@@ -325,7 +331,6 @@ class SearchSource:
 def short(override: str) -> str:
     """An override for people: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
     key, _, value = override.lstrip("+").partition("=")
-    value = re.sub(r"\$\{px:(\d+)\}", r"\1px", value)
     with suppress(ValueError):
         value = f"{float(value):.4g}"
     return f"{key.rpartition('.')[2]}={value}"

@@ -18,6 +18,9 @@ BESIDE = 3
 WITH_SD = 12
 """Columns up to which the standard deviation stands behind its mean; else on a line of its own."""
 
+BESIDE_OURS = ("published", "difference")
+"""Header of the columns that belong to the one before."""
+
 DASH = "-"
 DOUBTFUL = "The printed value does not agree with the others of its row."
 
@@ -56,7 +59,7 @@ class Builder:
         """Above the fields of a line, from the names of the columns."""
         if not self.beside:
             return (Text(), Text("seeds"), *columns)
-        words = (Text("published"), Text("difference"))
+        words = tuple(map(Text, BESIDE_OURS))
         named = zip(self.columns, columns, strict=True)
         beside = [(text, *(words if column.printed else ())) for column, text in named]
         return (Text("seeds"), *(text for texts in beside for text in texts))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.tracking.files import write_atomic
-from rgbt.tracking.terminal import place_lines, show, tell
+from rgbt.tracking.terminal import line_width, place_lines, show, tell
 from sweeps.report.records import record
 from sweeps.running.lists import Outcome, other_code_line
 from sweeps.sheet.figure import draw_table
@@ -40,7 +40,7 @@ def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tra
     runs, sizes = wanted.runs(outcomes), parameter_cells(wanted)
     scored = score(wanted.name, wanted.table, runs, scale=wanted.scale, sizes=sizes)
     sheet = sheet_of(scored, wanted.typed())
-    show(terminal(sheet, plain=not sys.stdout.isatty()))
+    show(terminal(sheet, plain=not sys.stdout.isatty(), width=line_width()))
     failed = _tell_what_is_missing(scored, outcomes)
     try:
         files = write_files(scored, sheet, out)

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 from rich.text import Text as RichText
 
-from sweeps.sheet.lines import WITH_SD
+from rgbt.tracking.fit import SHORTEST, blocks, shortened
+from rgbt.tracking.terminal import WIDTH
+from sweeps.sheet.lines import BESIDE_OURS, WITH_SD
 from sweeps.sheet.sheet import Sheet
 from sweeps.sheet.texts import Text
 
@@ -24,32 +26,66 @@ WIDE = WITH_SD + 2
 LEGENDS = ("Bold: best, underlined: second best.", "*: best, _: second best.")
 
 
-def terminal(sheet: Sheet, *, plain: bool = False) -> RichText:
-    """The table for `rgbt.tracking.terminal.show`; as wide as it needs to be, never cut.
+def terminal(sheet: Sheet, *, plain: bool = False, width: int = WIDTH) -> RichText:
+    """The table for `rgbt.tracking.terminal.show`.
 
     Args:
         sheet: the table.
         plain: mark the best with signs, where neither bold nor underline would be shown.
+        width: of a line; labels are shortened and columns folded to it, numbers never cut.
     """
     header = [(Text(), *line) for line in _stacked(sheet.header)]
-    body = [(line.label, *line.fields) for line in sheet.lines]
-    columns = list(zip(*header, *body, strict=True))
-    tails = [max(len(_tail(text)) for text in column) for column in columns]
-    fields = [
-        [_rich(text, tail, plain=plain) for text, tail in zip(row, tails, strict=True)]
-        for row in (*header, *body)
-    ]
-    widths = [max(field.cell_len for field in column) for column in zip(*fields, strict=True)]
-    numeric = [any(text.text for text in column[: len(header)]) for column in columns]
-    lines = [_aligned(row, widths, numeric) for row in fields]
-    for line, row in zip(sheet.lines, lines[len(header) :], strict=True):
-        row.stylize("dim" if line.kind in ("sd", "difference") else "")
-    rule = RichText("─" * (sum(widths) + GAP * (len(widths) - 1)))
+    rows = [*header, *((line.label, *line.fields) for line in sheet.lines)]
+    fields = _fields(rows, plain=plain)
+    if sum(_widths(fields)) + GAP * (len(fields[0]) - 1) > width:
+        fields = _fields(_with_short_labels(rows, max(SHORTEST, width // 3)), plain=plain)
+    widths = _widths(fields)
+    # The labels: of the row, of the line where a row has several, and the number of seeds.
+    first = 2 if any(line.kind == "all" for line in sheet.lines) else 3
+    starts = [n for n, text in enumerate(header[-1]) if n >= first and text.text not in BESIDE_OURS]
+    shown: list[RichText] = []
+    for part in blocks(widths, width, gap=GAP, first=first, starts=starts):
+        shown += [RichText()] if shown else []
+        shown += _block(sheet, [[row[n].copy() for n in part] for row in fields])
     title = RichText(f"{sheet.title.text}{_bracketed(sheet.title)}", "bold")
     below = [f"[{index}] {note}" for index, note in enumerate(sheet.notes, start=1)]
     below += sheet.remarks_with(LEGENDS[plain])
-    top, rest = lines[: len(header)], lines[len(header) :]
-    return RichText("\n").join([title, *top, rule, *rest, rule, *map(RichText, below)])
+    return RichText("\n").join([title, *shown, *map(RichText, below)])
+
+
+def _fields(rows: Sequence[Sequence[Text]], *, plain: bool) -> list[list[RichText]]:
+    columns = list(zip(*rows, strict=True))
+    tails = [max(len(_tail(text)) for text in column) for column in columns]
+    return [
+        [_rich(text, tail, plain=plain) for text, tail in zip(row, tails, strict=True)]
+        for row in rows
+    ]
+
+
+def _widths(fields: Sequence[Sequence[RichText]]) -> list[int]:
+    return [max(field.cell_len for field in column) for column in zip(*fields, strict=True)]
+
+
+def _with_short_labels(rows: Sequence[Sequence[Text]], limit: int) -> list[tuple[Text, ...]]:
+    labels = [row[0].text for row in rows]
+    short = shortened(labels, [limit] * len(labels))
+    return [
+        (replace(label, text=text), *others)
+        for (label, *others), text in zip(rows, short, strict=True)
+    ]
+
+
+def _block(sheet: Sheet, fields: Sequence[Sequence[RichText]]) -> list[RichText]:
+    """Header and lines of some columns, between rules."""
+    widths, height = _widths(fields), len(fields) - len(sheet.lines)
+    numeric = [
+        any(text.plain.strip() for text in column) for column in zip(*fields[:height], strict=True)
+    ]
+    lines = [_aligned(row, widths, numeric) for row in fields]
+    for line, row in zip(sheet.lines, lines[height:], strict=True):
+        row.stylize("dim" if line.kind in ("sd", "difference") else "")
+    rule = RichText("─" * (sum(widths) + GAP * (len(widths) - 1)))
+    return [*lines[:height], rule, *lines[height:], rule]
 
 
 def _stacked(header: Sequence[Text]) -> list[tuple[Text, ...]]:

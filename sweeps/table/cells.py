@@ -128,7 +128,7 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[P
         found = {seed: values[column.name] for seed, values in by_seed.items() if values}
         if found:
             marks = {seed: _mark(outcomes[seed], value) for seed, value in found.items()}
-            cells[row.label, column.name] = _cell(found, marks, keys)
+            cells[row.label, column.name] = over_seeds(found, marks, keys)
     return cells
 
 
@@ -184,7 +184,16 @@ def _mark(outcome: CellRun, found: Value) -> str:
     return NO_VALUE if outcome.state == "finished" else outcome.state
 
 
-def _cell(found: Mapping[int, Value], marks: Mapping[int, str], keys: tuple[str, ...]) -> Cell:
+def over_seeds(
+    found: Mapping[int, Value], marks: Mapping[int, str] | None = None, keys: tuple[str, ...] = ()
+) -> Cell:
+    """Mean and spread of the values of several seeds.
+
+    Args:
+        found: by seed.
+        marks: by seed, the reason in a word where a value is missing.
+        keys: of the runs.
+    """
     values = [each for each in found.values() if not isinstance(each, str)]
     reasons: dict[str, list[int]] = {}
     for seed, each in found.items():
@@ -196,7 +205,7 @@ def _cell(found: Mapping[int, Value], marks: Mapping[int, str], keys: tuple[str,
         sd=statistics.stdev(values) if len(values) > 1 else math.nan,
         seeds=len(values),
         reason="; ".join(told),
-        mark=next((mark for mark in marks.values() if mark), ""),
+        mark=next((mark for mark in (marks or {}).values() if mark), ""),
         keys=keys,
     )
 

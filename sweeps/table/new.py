@@ -14,7 +14,7 @@ from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.command import composing
-from rgbt.config import check, compose
+from rgbt.config import PIXELS, check, compose
 from rgbt.tracking.files import write_atomic
 from sweeps.table.table import OWN as FOLDER
 from sweeps.table.table import PUBLISHED, load_table
@@ -173,7 +173,8 @@ def _row(
     varied = [factor for factor in factors if len(factor.values) > 1]
     pairs = list(zip(factors, point, strict=True))
     words = [f"{_short(factor.key, varied)}={value}" for factor, value in pairs if factor in varied]
-    label = re.sub(r"\\(.)", r"\1", " ".join(words))  # Hydra escapes ${px:64} inside a list
+    # Hydra escapes ${px:64} inside a list; which value it has depends on the scale.
+    label = PIXELS.sub(r"\1px", re.sub(r"\\(.)", r"\1", " ".join(words))).replace("'", "")
     overrides = [f"{factor.key}={value}" for factor, value in pairs]
     lines = _lines(label=label, experiment=experiment, overrides=overrides)
     if axis is not None:

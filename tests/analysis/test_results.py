@@ -108,6 +108,21 @@ def test_a_group_is_its_whole_name(runs: Path):
     assert [each.key for each in open_counts("crm", runs)] == ["ddd0"]
 
 
+def test_a_run_made_before_is_found_by_its_old_group_and_with_new_runs(runs: Path):
+    """It wrote ${px:64}; what it stands for is in its parameters."""
+    for seed, value in ((0, "${px:64}"), (1, "32")):
+        folder = make_run(runs, f"ddd{seed}", f"grbm patch_size={value}", seed)
+        run = RunFolder(folder)
+        description = run.description()
+        assert description is not None
+        run.describe(replace(description, params={"scale.pixel_factor": "0.5"}))
+    found = open_counts("grbm patch_size=32", runs)
+    assert [each.key for each in found] == ["ddd0", "ddd1"]
+    assert label_of(found) == "grbm patch_size=32"
+    assert [each.key for each in open_counts("grbm patch_size=${px:64}", runs)] == ["ddd0"]
+    assert "grbm patch_size=${px:64}" not in groups_in(runs)
+
+
 def test_a_list(runs: Path, tmp_path: Path):
     some(7).save(tmp_path / "x.npz")
     found = open_counts(f"aaa2, mlflow-aaa0 ,{tmp_path}/x.npz", runs)

@@ -93,6 +93,14 @@ def test_best_trials_come_in_the_direction_of_the_objective_with_val_and_test_si
     assert grid.rows[0][3:] == ("-", "-", "-", "-", "-")
 
 
+@pytest.mark.parametrize(("notes", "shown"), [({"pixels": 0.5}, "32"), ({}, "64px")])
+def test_pixels_are_shown_as_their_value(notes: dict[str, float], shown: str) -> None:
+    study, key = new_study("maximize"), "masker.patch_size"
+    choices = CategoricalDistribution(("${px:64}", "${px:8}"))
+    add(study, [8.0], params={key: "${px:64}"}, distributions={key: choices}, **notes)
+    assert trials_grid(read(study)).rows[0][1] == shown
+
+
 def test_only_ten_best_are_shown() -> None:
     study = new_study("maximize")
     for value in range(12):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.points import Evaluation, Point
+from rgbt.naming import VARIED
+from sweeps.points import COLOUR, Evaluation, Point, colour, varied_keys
 from sweeps.running import lists
 from sweeps.running.found import Found, Runs
 from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey
@@ -81,7 +84,24 @@ def test_points_that_are_one_run_share_their_tags(
     monkeypatch.setattr(lists, "Planner", OneKey)
     rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
     prepared = lists._Prepared(wanted(tmp_path, *rows))
-    assert [plan.point.tags for plan in prepared.plans.values()] == [{"table": "1 | 1.0"}] * 2
+    first, second = (plan.point.tags for plan in prepared.plans.values())
+    assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
+
+
+def test_what_varies_are_the_keys_that_not_all_points_share() -> None:
+    words = [("+e=a", f"+y={y}", f"seed={seed}") for y in (1, 2) for seed in (0, 1)]
+    points = [Point(str(index), each) for index, each in enumerate(words)]
+    assert varied_keys(points) == ["y", "seed"]
+    assert varied_keys(points[:1]) == varied_keys([]) == []
+
+
+def test_runs_of_a_grid_have_colours_that_can_be_told_apart() -> None:
+    colours = [colour("s", index) for index in range(20)]
+    assert all(re.fullmatch("#[0-9a-f]{6}", each) for each in colours)
+    assert len(set(colours)) == 20
+    channels = np.array([[int(each[n : n + 2], 16) for n in (1, 3, 5)] for each in colours[:9]])
+    apart = np.abs(channels[:, None] - channels[None]).sum(-1) + 999 * np.eye(9, dtype=int)
+    assert apart.min() > 40
 
 
 def test_a_mistake_of_all_points_is_one_of_the_call(

@@ -43,6 +43,12 @@ def test_a_run_is_planned_under_the_key_that_the_command_gives_it(
     assert plan.point.label == "p"
 
 
+def test_a_label_shows_the_value_of_pixels_at_the_scale(planner: Planner) -> None:
+    point = Point("patch_size=${px:64}", ("masker.patch_size=${px:64}",))
+    plan = planner.plan(point)
+    assert (plan.point.label, plan.pixel_factor) == ("patch_size=32", 0.5)
+
+
 def test_seeds_make_a_run_each_and_evaluations_a_point_of_its_own(planner: Planner) -> None:
     single = planner.plan(Point("p", ("seed=1",)))
     both = planner.plan(Point("p", (), seeds=(0, 1)))

@@ -14,9 +14,10 @@ from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
 
 from rgbt.metrics.counts import Counts
+from rgbt.naming import VARIED
 from rgbt.tracking.folder import MetricLine
 from sweeps import attributes as names
-from sweeps.points import Evaluation, Point
+from sweeps.points import COLOUR, Evaluation, Point, colour
 from sweeps.running.ledger import Claim
 from sweeps.running.sources import ListSource, Task, known, reason_of, short
 from sweeps.settings import Objective
@@ -188,7 +189,9 @@ def test_a_search_asks_the_sampler_and_notes_the_point(tmp_path: Path) -> None:
     assert trial.user_attrs[names.OVERRIDES] == [override]
     assert trial.user_attrs[names.RUNS] == [task.plan.key]
     assert trial.user_attrs[names.LABEL] == task.plan.point.label == f"#0 x={x:.4g}"
-    assert task.plan.point.tags == {"rgbt.study/study": "0"}
+    tags = {"rgbt.study/study": "0", VARIED: "x", COLOUR: colour("study", 0)}
+    assert task.plan.point.tags == tags
+    assert trial.user_attrs[names.PIXELS] == 1.0
     assert task.plan.point.seeds == ()
 
 

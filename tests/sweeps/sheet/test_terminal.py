@@ -6,6 +6,7 @@ import math
 import re
 from typing import Any
 
+import pytest
 from rich.text import Text as RichText
 
 from sweeps.sheet.files import latex, markdown, tidy_csv
@@ -98,6 +99,20 @@ def test_wide_tables_break_names_and_put_sd_below() -> None:
     assert shown[5].split() == ["±", "sd", *["14.14"] * 13]
     many = tuple(Column(name=f"c{n}", metric="pixel_accuracy") for n in range(60))
     assert lines(wide(many))[3].split() == ["a", "ours", "2", *["50.00"] * 60]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 120, 200])
+@pytest.mark.parametrize("columns", [WIDE, STACKED, STACKED[:3]], ids=len)
+def test_a_table_fits_the_terminal_and_no_number_is_cut(
+    columns: tuple[Column, ...], width: int
+) -> None:
+    sheet = sheet_of(wide(columns))
+    whole = str(terminal(sheet, plain=True))
+    table = str(terminal(sheet, plain=True, width=width)).split("Published:")[0]
+    assert max(map(len, table.splitlines()[1:])) <= width
+    for number in ("50.00", "14.14", "48.0", "49.25", "+2.00", "+0.75"):
+        assert table.count(number) == whole.count(number)
+    assert table.count("\na ") == table.count("seeds"), "each block begins with the labels"
 
 
 def test_numbers_stand_below_each_other_behind_footnotes_too() -> None:

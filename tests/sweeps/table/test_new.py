@@ -36,7 +36,7 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
     write_new("two", "grbm", ["masker.sigma_div=1,2", "masker.patch_size='${px:64}',32"], tmp_path)
     table = load_table("two", tmp_path)
     assert [row.label for row in table.rows][:2] == [
-        "sigma_div=1 patch_size='${px:64}'",
+        "sigma_div=1 patch_size=64px",
         "sigma_div=1 patch_size=32",
     ]
     assert len(table.rows) == 4
