@@ -163,7 +163,7 @@ def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path
     assert values_of(found, row, column, runs) == ()  # recorded without the column
     assert found.scored.cells["A", "TC"].mean == pytest.approx(sum(expected) / 2)
     asked = asked_of(found, row, column)
-    source = Source(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), "released")
+    source = Source(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), None)
     assert asked == (source, "class/car/TC")
     intervals = Intervals(runs)
     intervals.ask(*asked)
