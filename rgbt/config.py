@@ -140,7 +140,7 @@ def typed(node: DictConfig, path: str, nested: Callable[[DictConfig, str], Any])
     """Values of a node as its constructor takes them; `nested` turns a node inside it into one."""
     target = _target(node, path)
     parameters = inspect.signature(target).parameters
-    hints = annotations(target)
+    hints = setting_types(target)
     values = {}
     for key, value in _items(node, path):
         if key in OF_THE_RUN.get(path, {}):
@@ -186,7 +186,7 @@ def _target(node: DictConfig, path: str) -> Any:
 
 
 @cache
-def annotations(target: Any) -> dict[str, Any]:
+def setting_types(target: Any) -> dict[str, Any]:
     """What the settings of a constructor take, by key: types with their ranges."""
     function = target.__init__ if inspect.isclass(target) else target
     hints = typing.get_type_hints(function, include_extras=True)

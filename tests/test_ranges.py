@@ -14,7 +14,7 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, Pixels, Share
-from rgbt.config import TOP_LEVEL, annotations, check_node, conf_dir
+from rgbt.config import TOP_LEVEL, check_node, conf_dir, setting_types
 from rgbt.values import check_value, expected
 from sweeps.settings import Settings
 
@@ -115,7 +115,7 @@ OUTSIDE: dict[str, dict[str, list[Any]]] = {
 
 @pytest.mark.parametrize("target", OUTSIDE)
 def test_values_outside_a_range_are_refused(target: str) -> None:
-    hints = annotations(get_object(f"rgbt.{target}"))
+    hints = setting_types(get_object(f"rgbt.{target}"))
     for key, values in OUTSIDE[target].items():
         for value in values:
             with pytest.raises(InputError, match=rf"^'node\.{key}[^']*' (must be|takes an object)"):
@@ -143,7 +143,7 @@ def bounded(annotation: Any) -> bool:
 
 @pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.Settings"])
 def test_every_number_and_text_has_a_range(target: str) -> None:
-    for key, annotation in annotations(get_object(target)).items():
+    for key, annotation in setting_types(get_object(target)).items():
         for leaf in leaves(annotation):
             assert bounded(leaf), f"{target}.{key}: declare a range for {leaf} (rgbt.checks)"
 
@@ -245,4 +245,4 @@ def test_nan_and_infinity_are_refused_without_a_declared_range() -> None:
 
 def test_settings_of_a_sweep_are_those_of_its_file() -> None:
     node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
-    assert set(annotations(Settings)) == set(node) - {"_target_"}
+    assert set(setting_types(Settings)) == set(node) - {"_target_"}
