@@ -297,6 +297,12 @@ def _check_loss(loss: object, session: Session) -> None:
             f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts "
             f"{predicts}; choose {advice[str(predicts)]}, or another network."
         )
+    classes = getattr(loss, "num_classes", session.dataset.num_classes)
+    if classes != session.dataset.num_classes:
+        raise InputError(
+            f"loss.num_classes is {classes} but {session.dataset.name} has "
+            f"{session.dataset.num_classes} classes; omit it, so that the data set decides."
+        )
     for name, domain in session.domains.named.items():
         if domain.confidence and not getattr(loss, "reads_confidence", False):
             raise InputError(

@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import without_passwords
@@ -94,19 +94,26 @@ def search(wanted: Search, settings: Settings) -> None:
 
 
 def _probe(wanted: Search) -> Plan:
-    """One point of the space, so that what is wrong with all of them is told before the first.
+    """The lowest point of the space, checked with the highest one before the first trial.
 
     Raises:
-        InputError: the point cannot be composed, or its data set is not there.
+        InputError: an end that a setting does not take, a point that cannot be composed, or no
+            data set.
     """
+    planner = Planner()
+    planner.config((*wanted.fixed, *_end_of(wanted.parameters, "high")))
+    lowest = (*wanted.fixed, *_end_of(wanted.parameters, "low"))
+    return planner.plan(Point(label="probe", overrides=lowest))
+
+
+def _end_of(parameters: tuple[Parameter, ...], end: Literal["low", "high"]) -> list[str]:
+    """Overrides with every number at one end of its range, and the first of all choices."""
     from optuna.trial import FixedTrial
 
-    lowest = {
-        parameter.key: parameter.choices[0] if parameter.choices else parameter.low
-        for parameter in wanted.parameters
+    values = {
+        each.key: each.choices[0] if each.choices else getattr(each, end) for each in parameters
     }
-    chosen = as_overrides(suggest(FixedTrial(lowest), wanted.parameters))
-    return Planner().plan(Point(label="probe", overrides=(*wanted.fixed, *chosen)))
+    return list(as_overrides(suggest(FixedTrial(values), parameters)))
 
 
 def _check_consistency(probe: Plan, settings: Settings) -> None:

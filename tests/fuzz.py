@@ -206,7 +206,7 @@ def within(seconds: int) -> Iterator[None]:
 
 
 def outcome(
-    use: Callable[[DictConfig, Case], None], config: DictConfig, case: Case, seconds: int = 60
+    use: Callable[[DictConfig, Case], None], config: DictConfig, case: Case, seconds: int = 120
 ) -> str:
     """ "refused", "accepted", or what is wrong with either."""
     threads = torch.get_num_threads()

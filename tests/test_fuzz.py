@@ -25,7 +25,7 @@ def test_no_senseless_value_passes_the_check() -> None:
     configs = {name: composed(name) for name in EXPERIMENTS[:3]}
     wrong = [
         f"{case}: {found}"
-        for config, case in random.Random(SEED).sample(list(cases(configs)), NUM_CHECKED)
+        for config, case in random.Random(SEED).sample([*cases(configs)], NUM_CHECKED)
         if (found := outcome(checked, config, case)) not in FINE
     ]
     assert not wrong, "\n".join(wrong)

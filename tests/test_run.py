@@ -156,13 +156,17 @@ BAD_OVERRIDES = {
     "number for a choice": (["schedule.per=week"], "'schedule.per'"),
     "fraction for a count": (["trainer.accumulate=1.5"], "'trainer.accumulate'"),
     "collaborator as a setting": (["+scheme.model=1"], "'scheme.model'"),
-    "negative rate": (["optimizer.lr=-1"], "optimizer.lr must be positive"),
-    "negative warm-up": (["schedule.warmup_steps=-5"], "schedule.warmup_steps must lie in"),
-    "no thread": (["trainer.threads=0"], "trainer.threads must be at least 1"),
+    "negative rate": (["optimizer.lr=-1"], "'optimizer.lr' must be a number above 0 and"),
+    "negative warm-up": (
+        ["schedule.warmup_steps=-5"],
+        "'schedule.warmup_steps' must be a whole number from 0",
+    ),
+    "no thread": (["trainer.threads=0"], "'trainer.threads' must be a whole number from 1"),
     "no such device": (["trainer.accelerator=mps"], "trainer.accelerator=mps"),
     "other number of classes": (["model.num_classes=5"], "model.num_classes is 5"),
     "no override": (["learning rate 3"], "expected key=value"),
     "unknown selection split": (["trainer.selection_split=vall"], "no split 'vall'"),
+    "not a number": (["trainer.clip_norm=nan"], "'trainer.clip_norm' must be a number above 0"),
     "picture of a run": (["out=x.png"], "leave `out` away"),
     "missing root": (["dataset=mfnet", "~dataset.root"], "'dataset.root'"),
     "root without value": (["dataset=mfnet", "dataset.root=???"], "'dataset.root' has no value"),
@@ -397,7 +401,7 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
         call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
     )
     assert code == 1
-    assert "1 of 3 points failed, first sigma_div=0: masker.sigma_div must be positive" in err
+    assert "1 of 3 points failed, first sigma_div=0: 'masker.sigma_div' must be" in err
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 

@@ -211,8 +211,11 @@ REFUSED = {
     "crop of another shape": (["scale.crop_hw=[48,48]"], "intrinsics of another image size"),
     "no rectangle": (["scheme.view.yaw=[-50,50]"], "leave no valid rectangle"),
     "no rectangle, measured": (["consistency.view.yaw=[-50,50]"], "leave no valid rectangle"),
-    "too steep": (["scheme.view.pitch=[-90,0]"], "view.pitch must lie in [-60, 60], got -90"),
-    "turned round": (["scheme.view.roll=[5,-5]"], "view.roll must be (low, high)"),
+    "too steep": (
+        ["scheme.view.pitch=[-90,0]"],
+        "'scheme.view.pitch[0]' must be a number from -60 to 60",
+    ),
+    "turned round": (["scheme.view.roll=[5,-5]"], "a list of 2 (the smaller one first)"),
     "no such mode": (["scheme.view.mode=rot"], "'scheme.view.mode'"),
     "single frames": (["scheme=supervised"], "choose scheme=temporal_paper"),
     "loss of single frames": (["loss=cross_entropy"], "choose loss=temporal_paper"),

@@ -418,7 +418,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "verdict loss": ({"verdict_loss": "least_square"}, "did you mean 'least_squares'"),
     "no probability": (
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
-        "must lie in [0, 1] with scheme.verdict_loss=cross_entropy, got 0 and -1",
+        r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
     ),
     "equal values": ({"target_value": 0.0}, "are both 0, so that the critic has nothing"),
     "labels not read": (

@@ -111,7 +111,7 @@ def test_killed_and_called_again_loses_nothing_and_runs_nothing_twice(
     # Only what was killed was begun twice; it went on from its checkpoint.
     assert sorted(starts) == [1, 1, 2]
     text = table_of(runs)
-    assert "masker.sigma_div must be positive, got 0" in text
+    assert "'masker.sigma_div' must be a number from 0.001" in text
 
     monkeypatch.syspath_prepend(tmp_path)
     assert call(entry, *words[3:])[0] == 1

@@ -15,7 +15,7 @@ from sweeps import attributes as names
 from sweeps.running.found import open_runs
 from sweeps.running.ledger import Ledger
 from sweeps.running.storage import load_study, open_storage
-from sweeps.search import Search, search
+from sweeps.search import Search, _probe, search
 from sweeps.settings import Objective, Settings
 from sweeps.space.space import parse_space
 from tests.sweeps.fakes import settings as plain_settings
@@ -152,6 +152,21 @@ def test_what_is_wrong_with_every_trial_is_told_before_the_first(
     with pytest.raises(InputError, match=r"trainer\.max_steps"):
         search(mistaken, settings())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "refused"), [(-1, 4, "low"), (1, 10**6, "high"), (0.5, 32, None)]
+)
+def test_ends_that_a_setting_does_not_take_are_refused_before_the_first_trial(
+    wanted: Search, low: float, high: float, refused: str | None
+) -> None:
+    space = {"masker.sigma_div": {"type": "float", "low": low, "high": high}}
+    search = replace(wanted, parameters=parse_space(space))
+    if refused is None:
+        assert _probe(search).runs
+        return
+    with pytest.raises(InputError, match=r"'masker.sigma_div' must be a number from 0.001 to"):
+        _probe(search)
 
 
 def test_a_search_without_a_finished_trial_ends_in_an_error(
