@@ -215,23 +215,3 @@ def test_paths_are_read_as_they_are_typed() -> None:
     assert root == f"dataset.root={Path.home()}/MF"
     assert grid == "model.weights=a,b"
     assert readable_paths(["-m", "masker.sigma_div=1,2"]) == ["-m", "masker.sigma_div=1,2"]
-
-
-@pytest.mark.parametrize(
-    "dataset", ["mfnet", "pst900", "kp", "freiburg", "synth", "synth_kp", "synth_freiburg"]
-)
-def test_the_smoke_test_fits_every_data_set(dataset: str) -> None:
-    root = [] if dataset.startswith("synth") else ["dataset.root=/data"]
-    config = compose(["+experiment=grbm", f"dataset={dataset}", *root, "+debug=smoke"])
-    check(config)
-    assert config.trainer.max_steps == 2
-    sizes = {key: config.dataset[key] for key in config.dataset if key.startswith("num_tr")}
-    assert all(size == 6 for size in sizes.values())
-    assert bool(sizes) == dataset.startswith("synth")
-
-
-def test_keys_of_smoke_runs_are_what_they_were() -> None:
-    """Also of those that smoke_freiburg made."""
-    known = {"grbm": "2af865ec1d57", "crm_pst900": "39681806fb79", "heatnet": "4ce4547558c9"}
-    found = {name: run_key(compose([f"+experiment={name}", "+debug=smoke"])) for name in known}
-    assert found == known

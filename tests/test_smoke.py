@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from rgbt.config import check, compose
+from rgbt.identity import run_key
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run
 from tests.conftest import write_data
 from tests.data.folder_files import PATTERNS, write_folder
@@ -17,7 +19,7 @@ from tests.data.pst900_files import write_pst900
 OWN = (
     *(f"dataset.{key}='{text}'" for key, text in PATTERNS.items()),
     *("dataset.num_classes=3", "dataset.classes=[background,person,car]"),
-    "dataset.thermal_range=[20000,24000]",
+    *("dataset.thermal_range=[20000,24000]", "metric.regions=2"),
 )
 ON_DISK: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "mfnet": (lambda root: write_data(root, SPLITS, (24, 32)), ()),
@@ -61,3 +63,23 @@ def test_the_plus_is_asked_for(call: Call, tmp_path: Path) -> None:
     code, _, err = call(main, "+experiment=grbm", "debug=smoke", f"runs_dir={tmp_path}")
     assert code == 2
     assert_one_sentence(err, "'debug=smoke' needs a plus: +debug=smoke.")
+
+
+@pytest.mark.parametrize(
+    "dataset", ["mfnet", "pst900", "kp", "freiburg", "synth", "synth_kp", "synth_freiburg"]
+)
+def test_the_smoke_test_fits_every_data_set(dataset: str) -> None:
+    root = [] if dataset.startswith("synth") else ["dataset.root=/data"]
+    config = compose(["+experiment=grbm", f"dataset={dataset}", *root, "+debug=smoke"])
+    check(config)
+    assert config.trainer.max_steps == 2
+    sizes = {key: config.dataset[key] for key in config.dataset if key.startswith("num_tr")}
+    assert all(size == 6 for size in sizes.values())
+    assert bool(sizes) == dataset.startswith("synth")
+
+
+def test_keys_of_smoke_runs_are_what_they_were() -> None:
+    """Also of those that smoke_freiburg made."""
+    known = {"grbm": "2af865ec1d57", "crm_pst900": "39681806fb79", "heatnet": "4ce4547558c9"}
+    found = {name: run_key(compose([f"+experiment={name}", "+debug=smoke"])) for name in known}
+    assert found == known
