@@ -1,0 +1,51 @@
+"""CSV that a spreadsheet can open: no cell of text is taken for a formula.
+
+A label such as ``=HYPERLINK(...)`` would be executed there. Such cells get an apostrophe in front,
+which spreadsheets understand as "this is text"; reading takes it off again.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
+"""Beginning of a cell that gets an apostrophe; also of one that would look as if it had got one."""
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Rows, header first, as the text of a CSV file with ``\\n`` at the end of lines."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([_as_text(cell) for cell in row] for row in rows)
+    return stream.getvalue()
+
+
+def read_csv(text: str) -> tuple[list[str], list[dict[str, Any]]]:
+    """Header and lines of what `csv_text` wrote, cells as they were given to it, as text."""
+    reader = csv.DictReader(io.StringIO(text))
+    reader.fieldnames = [_original(name) for name in reader.fieldnames or ()]
+    lines = [{name: _original(cell) for name, cell in line.items()} for line in reader]
+    return list(reader.fieldnames or ()), lines
+
+
+def _as_text(cell: object) -> object:
+    if not isinstance(cell, str) or FORMULA.match(cell) is None or _is_number(cell):
+        return cell
+    return f"'{cell}"
+
+
+def _original(cell: Any) -> Any:
+    is_marked = isinstance(cell, str) and cell.startswith("'") and FORMULA.match(cell) is not None
+    return cell[1:] if is_marked else cell
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
