@@ -11,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.command import plain_command
 from rgbt.config import NODES, build, check_node, compose, conf_dir
 from rgbt.stored_config import (
     check_targets,
@@ -21,7 +22,7 @@ from rgbt.stored_config import (
     shipped_targets,
     targets,
 )
-from tests.commands import Call, Trained, assert_one_sentence
+from tests.commands import Call, assert_one_sentence
 
 LAB = "import os\nfrom pathlib import Path\nPath(__file__).with_suffix('.imported').touch()\n" + (
     "from lab_base import Base\nclass Plain:\n    def __init__(self, *, width: int = 1) -> None:\n"
@@ -68,10 +69,10 @@ def test_others_targets_are_refused_before_they_are_imported(lab: Path, target: 
     ):
         with pytest.raises(InputError, match=r"^store: '.*_target_' names ") as refused:
             check_targets(settings, (), "store")
-        assert_one_sentence_like(str(refused.value))
+        assert_printable(str(refused.value))
 
 
-def assert_one_sentence_like(text: str) -> None:
+def assert_printable(text: str) -> None:
     assert text.isprintable()
     assert len(text) < 450
 
@@ -150,9 +151,9 @@ def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None
 def test_composed_configurations_follow_hydras_policy(target: str, tmp_path: Path) -> None:
     loud = OmegaConf.create({"x": {"_target_": target, "command": f"touch {tmp_path / 'marker'}"}})
     for use in (build, lambda each: check_node(each, "x")):
-        with pytest.raises(InputError, match=r"'x\._target_': Target '.*' is blocklisted") as said:
+        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as said:
             use(loud.x)
-        assert_one_sentence_like(str(said.value))
+        assert_printable(str(said.value))
     hidden = {"_target_": "hydra.utils.get_object", "path": target}
     with pytest.raises(InputError, match="is blocklisted"):
         build(OmegaConf.create({"x": hidden}).x)
@@ -167,18 +168,12 @@ def test_a_module_that_is_imported_anew_is_built_anew(lab: Path) -> None:
     assert type(second) is sys.modules["my_lab"].Plain is not first
 
 
-def test_a_hostile_run_folder_runs_nothing(
-    trained: Trained, call: Call, tmp_path: Path, lab: Path
-) -> None:
+def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path) -> None:
     from rgbt import consistency, evaluate, predict, robustness
-    from rgbt.command import plain_command
-    from rgbt.weights.__main__ import INSPECT, inspect
 
     marker, run = tmp_path / "marker", tmp_path / "run"
     run.mkdir()
-    source = trained()
-    (run / "best.pt").symlink_to(source / "best.pt")
-    settings = read_settings(source / "config.yaml")
+    settings: Any = OmegaConf.to_container(compose(["+experiment=crm"]), resolve=True)
     evil = {"_target_": "os.system", "command": f"touch {marker}"}
     commands: list[tuple[Any, tuple[str, ...]]] = [
         (plain_command(evaluate.OWN, evaluate.main), (f"run={run}",)),
@@ -196,16 +191,13 @@ def test_a_hostile_run_folder_runs_nothing(
             code, _, err = call(entry, *words)
             assert code == 2
             assert_one_sentence(err, f"'{name}._target_' names os.system")
-    (run / "config.yaml").write_text(json.dumps({**settings, "model": evil}))
-    code, _, err = call(plain_command(INSPECT, inspect), f"file={run / 'best.pt'}")
-    assert code == 2
-    assert_one_sentence(err, "'model._target_' names os.system, which no file of conf/model names")
     (run / "config.yaml").write_text(json.dumps({**settings, "loss": node("my_lab.Plain")}))
     code, _, err = call(commands[0][0], f"run={run}")
     assert_one_sentence(err, "add trust=my_lab.")
     assert not (lab / "my_lab.imported").exists()
     code, _, err = call(commands[0][0], f"run={run}", "trust=my_lab")
-    assert code == 0, err
+    assert_one_sentence(err, "best.pt")  # the next thing that this folder lacks
+    assert (lab / "my_lab.imported").exists()
     assert not marker.exists()
 
 

@@ -12,12 +12,14 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from rgbt.checks import InputError
+
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
 """Beginning of a cell that gets an apostrophe; also of one that would look as if it had got one."""
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows, header first, as the text of a CSV file with ``\\n`` at the end of lines."""
+    """Rows, header first, as the text of a CSV file."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerows([_as_text(cell) for cell in row] for row in rows)
@@ -25,11 +27,19 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def read_csv(text: str) -> tuple[list[str], list[dict[str, Any]]]:
-    """Header and lines of what `csv_text` wrote, cells as they were given to it, as text."""
+    """Header and lines of what `csv_text` wrote, cells as they were given to it, as text.
+
+    Raises:
+        InputError: it is no CSV.
+    """
     reader = csv.DictReader(io.StringIO(text))
-    reader.fieldnames = [_original(name) for name in reader.fieldnames or ()]
-    lines = [{name: _original(cell) for name, cell in line.items()} for line in reader]
-    return list(reader.fieldnames or ()), lines
+    try:
+        header = [_original(name) for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        lines = [{name: _original(cell) for name, cell in line.items()} for line in reader]
+    except csv.Error as error:
+        raise InputError(f"a CSV file of the store is damaged: {error}.") from error
+    return header, lines
 
 
 def _as_text(cell: object) -> object:
