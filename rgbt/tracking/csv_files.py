@@ -43,9 +43,10 @@ def read_csv(text: str) -> tuple[list[str], list[dict[str, Any]]]:
 
 
 def _as_text(cell: object) -> object:
-    if not isinstance(cell, str) or FORMULA.match(cell) is None or _is_number(cell):
+    if not isinstance(cell, str):
         return cell
-    return f"'{cell}"
+    text = cell.replace("\r", "\n")  # the writer does not quote a carriage return
+    return f"'{text}" if FORMULA.match(text) and not _is_number(text) else text
 
 
 def _original(cell: Any) -> Any:

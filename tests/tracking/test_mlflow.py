@@ -318,7 +318,7 @@ def test_sync_asks_for_a_password_that_is_not_kept(tmp_path: Path) -> None:
         json.dumps({"uri": "postgresql://me:***@host/db", "experiment": "rgbt"})
     )
     with pytest.raises(InputError, match="give uri="):
-        sync.sync.tracking_of(folder, {})
+        sync.tracking_of(folder, {})
 
 
 @pytest.mark.parametrize(("name", "kind"), [("mlflow", MlflowTracking), ("none", NoTracking)])

@@ -299,7 +299,8 @@ def test_a_hostile_artifact_is_a_remark_and_runs_nothing(group: str, tmp_path: P
     remarks: list[str] = []
     runs = [run_of({**config, "group": "evil"}), run_of(masked_config())]
     (picture,) = mask_pictures(runs, quiet, remarks)
-    assert picture.title == "grbm"
+    assert picture.title == ("grbm" if group == "masker" else "evil")
+    assert ("embedded" in picture.caption) == (group == "dataset")
     (remark,) = remarks
     assert f"its config.yaml: '{group}._target_' names os.system, which no file of" in remark
     assert not (tmp_path / "marker").exists()
