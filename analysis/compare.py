@@ -311,20 +311,18 @@ def _write(out: Path, grid: Grid, said: str, comparison: Comparison) -> None:
 
 def comparison_csv(comparison: Comparison) -> str:
     """One line per score with all digits; empty where there is no value."""
-    import csv
-    import io
+    from rgbt.tracking.csv_files import csv_text
 
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     ends = ("images_low", "images_high", "p_images", "both_low", "both_high", "p_both", "p_holm")
-    writer.writerow(("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends))
+    rows: list[tuple[object, ...]] = []
+    rows.append(("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends))
     for each in comparison.differences:
         images = (each.images.low, each.images.high) if each.images else ("", "")
         both = (each.both.low, each.both.high) if each.both else ("", "")
         values = (*images, each.p_images, *both, each.p_both, each.p_corrected)
         row = (each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value, *values)
-        writer.writerow((each.metric, *("" if value != value else value for value in row)))
-    return stream.getvalue()
+        rows.append((each.metric, *("" if value != value else value for value in row)))
+    return csv_text(rows)
 
 
 if __name__ == "__main__":

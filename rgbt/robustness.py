@@ -6,8 +6,6 @@ file that says what it was made of. What is there already is not made again.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -183,20 +181,19 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
 
 def _write_tables(measured: Sequence[Measured], grid: Grid, place: Path) -> None:
     """The numbers and the table in `place` with .csv and .md."""
+    from rgbt.tracking.csv_files import csv_text
     from rgbt.tracking.files import write_atomic
 
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     scores = list(measured[0].mious)
-    writer.writerow(("row", "title", "unit", "severity", "view", *scores))
+    rows: list[tuple[object, ...]] = [("row", "title", "unit", "severity", "view", *scores)]
     for each in measured:
         asked = each.asked
         values = [100 * each.mious[score] for score in scores]
-        writer.writerow(
+        rows.append(
             (asked.row, asked.title, asked.unit, f"{asked.severity:g}", asked.view, *values)
         )
     # Names hold dots of severities: endings are added, not exchanged.
-    write_atomic(place.with_name(f"{place.name}.csv"), stream.getvalue().encode())
+    write_atomic(place.with_name(f"{place.name}.csv"), csv_text(rows).encode())
     write_atomic(place.with_name(f"{place.name}.md"), grid.to_markdown().encode())
 
 

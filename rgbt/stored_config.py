@@ -92,7 +92,7 @@ def check_targets(
     """
     shipped = shipped_targets(group)
     for key, target in targets(settings):
-        if target in shipped or target in trust:
+        if isinstance(target, str) and (target in shipped or target in trust):
             continue
         home = _trusted_home(target, trust)
         if home is not None and any(_is_inside(home, module) for module in trust):
@@ -170,7 +170,7 @@ def _refusal(source: str, key: str, target: Any, home: str | None, group: str) -
         return f"{what}It is not built: the configuration was damaged or made to run code."
     return (
         f"{what}A configuration can run any code that it names. Only if you know this code and who "
-        f"made the configuration, add trust={target.rpartition('.')[0] or target}."
+        f"made the configuration, add trust={_shown(target.rpartition('.')[0] or target)}."
     )
 
 

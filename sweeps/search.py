@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from rgbt.checks import InputError, RunError
-from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
 from sweeps.points import Point
@@ -83,7 +82,7 @@ def search(wanted: Search, settings: Settings) -> None:
     }
     study = begin_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
     if names.COMMAND not in study.user_attrs:
-        study.set_user_attr(names.COMMAND, without_passwords(shlex.join(sys.orig_argv)))
+        study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     ledger = Ledger(study, storage, Owner.me())
     tell(f"study {wanted.study}: the same command on other machines takes part in it.")
     _drive(wanted, settings, ledger)
@@ -189,7 +188,7 @@ def _preview(wanted: Search, settings: Settings) -> None:
         sys.stdout.write(f"  {parameter}\n")
     for objective in settings.objectives:
         sys.stdout.write(f"  {objective.direction} {objective.metric}\n")
-    sys.stdout.write(f"  python -m rgbt.run {without_passwords(shlex.join(wanted.fixed))} ...\n")
+    sys.stdout.write(f"  python -m rgbt.run {command_line(wanted.fixed)} ...\n")
     if settings.trials is not None:
         left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")

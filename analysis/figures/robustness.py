@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ from analysis.robustness import CLEAN, Level, Training
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
+from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import Grid, number
 
 if TYPE_CHECKING:
@@ -242,21 +241,8 @@ def _said(curve: Curve) -> str:
 
 def numbers(data: Sequence[Panel]) -> dict[str, str]:
     """Ending of a file -> its text: the figure's numbers as a table, and as CSV with all digits."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(
-        (
-            "degradation",
-            "severity",
-            "unit",
-            "method",
-            "seeds",
-            "mIoU",
-            "sd",
-            "relative",
-            "relative_sd",
-        )
-    )
+    header = ("degradation", "severity", "unit", "method", "seeds", "mIoU", "sd")
+    lines: list[tuple[object, ...]] = [(*header, "relative", "relative_sd")]
     rows = []
     for panel, place, said in _places(data):
         cells = []
@@ -267,14 +253,14 @@ def numbers(data: Sequence[Panel]) -> dict[str, str]:
             both = [each[place] for kind in (False, True) for each in curve.summary(kind)]
             seeds = len(curve.mious)
             plain = ["" if math.isnan(each) else each for each in both]
-            writer.writerow((*said, panel.unit, curve.method, seeds, *plain))
+            lines.append((*said, panel.unit, curve.method, seeds, *plain))
             spread = "" if math.isnan(both[1]) else f" ± {both[1]:.2f}"
             cells.append(f"{number(both[0])}{spread} ({both[2]:.1f} %)")
         rows.append((*said, *cells))
     title = "mIoU in percent, mean ± standard deviation over seeds (percent of the clean mIoU)"
     methods = [curve.method for curve in data[0].curves]
     grid = Grid(title, ("degradation", "severity", *methods), tuple(rows))
-    return {".md": grid.to_markdown(), ".csv": stream.getvalue()}
+    return {".md": grid.to_markdown(), ".csv": csv_text(lines)}
 
 
 def _places(data: Sequence[Panel]) -> list[tuple[Panel, int, tuple[str, str]]]:

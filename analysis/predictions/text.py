@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +11,7 @@ from analysis.predictions.scoring import Scored
 from analysis.predictions.table import ALL, Cell, Metric, Score, ScoreTable
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
+from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, class_labels, number
 
 COLUMNS = (
@@ -133,16 +132,14 @@ def tidy_csv(tables: Sequence[ScoreTable]) -> str:
     percent (Var: squared percent points), empty where there is none. Where every mean is the same
     under both conventions, intervals stand with "released" alone.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[tuple[object, ...]] = [COLUMNS]
     for table in tables:
         for cell, score in table.scores.items():
             of = (cell.region or WHOLE, cell.class_name or "mean", cell.metric, cell.absent)
             where = (table.name, table.split, table.partition, cell.images)
             values = map(_plain, (score.value, score.low, score.high))
-            writer.writerow((*where, table.num_images[cell.images], *of, *values))
-    return text.getvalue()
+            rows.append((*where, table.num_images[cell.images], *of, *values))
+    return csv_text(rows)
 
 
 def _title(table: ScoreTable) -> str:

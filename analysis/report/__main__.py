@@ -6,7 +6,6 @@ Progress goes to stderr; where the page is, how large it is and what it holds to
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,9 +52,10 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
     from analysis.report.collect import Asked, collect
     from analysis.report.page import write_page
+    from rgbt.tracking.provenance import command_line
     from rgbt.tracking.terminal import place_lines, show, tell
 
-    typed = shlex.join(["python", "-m", "analysis.report", *sys.argv[1:]])
+    typed = command_line(["python", "-m", "analysis.report", *sys.argv[1:]])
     with Progress(console=Console(stderr=True)) as progress:
 
         def track(items: Sequence[Any], what: str) -> Any:

@@ -31,7 +31,7 @@ class Asked:
         tracking: as the configuration builds it.
         runs_dir: folder of runs; their files are read there where it has them.
         resamples: of the images, for intervals and p-values.
-        command: that makes the page again.
+        command: that makes the page again, without passwords.
         trust: modules of which the report may build maskers and data sets.
     """
 
@@ -75,7 +75,7 @@ def collect(asked: Asked, track: Track) -> ReportData:
         title=TITLE,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         store=_address(asked.tracking),
-        command=without_passwords(asked.command),
+        command=asked.command,
         runs=tuple(run.entry for run in runs),
         tables=tables,
         studies=studies,

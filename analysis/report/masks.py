@@ -68,7 +68,7 @@ def mask_pictures(
     pictures = []
     for masked in track(maskers[:MOST], "masks"):
         try:
-            pictures.append(picture(masked, trust))
+            pictures.append(picture(masked, remarks, trust))
         except (InputError, OSError) as error:
             remarks.append(f"Masks of '{masked.groups[0]}' cannot be drawn: {error}")
     return tuple(pictures)
@@ -100,19 +100,23 @@ def _node(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     }
 
 
-def picture(masked: Masked, trust: Collection[str] = ()) -> Picture:
+def picture(masked: Masked, remarks: list[str], trust: Collection[str] = ()) -> Picture:
     """Draws of one masker: RGB above, thermal below, hidden pixels coloured.
 
     Raises:
-        InputError: the masker or its data set is not trusted, cannot be built, or does not
-            fit the images.
+        InputError: the masker is not trusted, cannot be built, or does not fit the images.
     """
     from analysis.figures.masks import mask_examples, whole_cells
 
-    for group, values in (("masker", masked.masker), ("dataset", masked.dataset)):
-        check_targets({group: values}, trust, "its config.yaml", group)
+    check_targets({"masker": masked.masker}, trust, "its config.yaml", "masker")
     masker = _built("masker", masked.masker)
-    sample, source = _sample(masked.dataset)
+    node = masked.dataset
+    try:
+        check_targets({"dataset": node}, trust, "its config.yaml", "dataset")
+    except InputError as error:
+        remarks.append(f"Masks of '{masked.groups[0]}' are drawn on the embedded data set: {error}")
+        node = {}
+    sample, source = _sample(node)
     draws = {str(index): masker for index in range(DRAWS)}
     size = masked.masker.get("patch_size")
     multiple = whole_cells([size] if isinstance(size, int) else [])

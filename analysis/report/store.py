@@ -19,6 +19,10 @@ from rgbt.tracking.provenance import without_passwords
 PAGE = 500
 """Runs asked for at a time."""
 
+MOST_TEXT = 10_000_000
+MOST_FETCHED = 200_000_000
+"""Bytes of a text file, and of a file that is copied from a server; larger ones are not read."""
+
 SQLITE = "sqlite:///"
 REASON_LENGTH = 160
 
@@ -56,12 +60,14 @@ class Files:
         """The file as text; None: there is none.
 
         Raises:
-            InputError: it cannot be fetched, or is no text.
+            InputError: it cannot be fetched, is too large, or is no text.
         """
         found = self.find(path)
         if found is None:
             return None
         try:
+            if found.stat().st_size > MOST_TEXT:
+                raise InputError(f"{found} is larger than {MOST_TEXT:,} bytes; it is not read.")
             return found.read_text()
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{found} cannot be read ({error}).") from error
@@ -218,8 +224,11 @@ class _Places:
     def _fetch(self, run_id: str, path: str) -> Path | None:
         parent = str(PurePosixPath(path).parent)
         listed = self.client.list_artifacts(run_id, None if parent == "." else parent)
-        if path not in {item.path for item in listed}:
+        sizes = {item.path: item.file_size or 0 for item in listed}
+        if path not in sizes:
             return None
+        if sizes[path] > MOST_FETCHED:
+            raise InputError(f"it is larger than {MOST_FETCHED:,} bytes")
         folder = self.copies / run_id
         folder.mkdir(parents=True, exist_ok=True)
         return Path(self.client.download_artifacts(run_id, path, str(folder)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from analysis.report.data import StudyEntry, TrialEntry
 from analysis.report.store import StoredRun
 from rgbt.checks import InputError
+from rgbt.tracking.csv_files import read_csv
 from rgbt.tracking.provenance import without_passwords
 
 TRIALS_FILE = "trials.csv"
@@ -80,14 +79,12 @@ def read_study(stored: StoredRun) -> StudyEntry:
 def _trials(
     text: str, name: str, objectives: tuple[str, ...], maximize: tuple[bool, ...]
 ) -> tuple[TrialEntry, ...]:
-    reader = csv.DictReader(io.StringIO(text))
-    header = list(reader.fieldnames or ())
+    header, lines = read_csv(text)
     missing = [column for column in (*FIRST, *objectives, *LAST) if column not in header]
     if missing:
         raise InputError(f"study '{name}': its {TRIALS_FILE} lacks the column '{missing[0]}'.")
     # Parameters stand between the label and the first score, see `sweeps.report.tables`.
     params = header[len(FIRST) : header.index(objectives[0])]
-    lines = list(reader)
     try:
         values = [tuple(_numbers(line, objectives)) for line in lines]
         return tuple(_entries(lines, values, params, pareto_front(values, maximize)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -11,6 +9,7 @@ from dataclasses import dataclass
 
 from analysis.report.store import StoredRun
 from rgbt.checks import InputError
+from rgbt.tracking.csv_files import read_csv
 
 CSV_FILE = "table.csv"
 HEADER = ("table", "row", "column", "mean", "sd", "n", "published", "difference", "reason", "runs")
@@ -100,14 +99,14 @@ def read_recorded(stored: StoredRun) -> Recorded:
 
 
 def _lines(text: str, name: str) -> dict[tuple[str, str], Line]:
-    reader = csv.DictReader(io.StringIO(text))
-    missing = [column for column in HEADER if column not in (reader.fieldnames or ())]
+    header, lines = read_csv(text)
+    missing = [column for column in HEADER if column not in header]
     if missing:
         raise InputError(
             f"table '{name}': its {CSV_FILE} lacks the column '{missing[0]}'; run it again."
         )
     try:
-        return {(line["row"], line["column"]): _line(line) for line in reader}
+        return {(line["row"], line["column"]): _line(line) for line in lines}
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"table '{name}': its {CSV_FILE} is damaged ({error}).") from error
 

@@ -5,8 +5,6 @@ A grid has a column per region, or, with many regions, a row per region.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Sequence
 
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from analysis.statistics import derive
 from analysis.statistics.data import MODALITIES, SpatialStatistics
 from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Finding, Range
+from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, number
 
 COLUMNS = 12
@@ -162,17 +161,15 @@ def heading(stats: SpatialStatistics) -> str:
 
 def to_csv(stats: SpatialStatistics) -> str:
     """One value per line, with everything it depends on in its own column (`CSV_COLUMNS`)."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
+    rows: list[tuple[object, ...]] = [CSV_COLUMNS]
     for part in stats.subsets():
         images = int(stats.chosen(part).sum())
         start = (stats.dataset, stats.split, stats.partition, images, part)
         for keys, values in _quantities(stats, part):
             for region, value in enumerate(values.tolist(), start=1):
                 cell = "" if math.isnan(value) else f"{value:.8g}"
-                writer.writerow((*start, *keys, region, cell))
-    return stream.getvalue()
+                rows.append((*start, *keys, region, cell))
+    return csv_text(rows)
 
 
 def _quantities(

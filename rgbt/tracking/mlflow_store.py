@@ -10,6 +10,7 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -160,15 +161,19 @@ class MlflowTracking:
 
     def _sent(self, folder: RunFolder) -> Sent:
         """What this store has of the run; nothing if the folder was sent to another one."""
-        fresh = Sent(without_passwords(self.uri), self.experiment, self.artifact_uri)
+        uri, place = without_passwords(self.uri), self.artifact_uri
+        fresh = Sent(uri, self.experiment, None if place is None else without_passwords(place))
         try:
             sent = read_sent(folder)
         except InputError as error:
             # Repaired by the next write: `fill` finds the run by its key and sends everything.
             sys.stderr.write(f"rgbt: {error}\n")
             return fresh
-        same = sent is not None and (sent.uri, sent.experiment) == (fresh.uri, fresh.experiment)
-        return sent if sent is not None and same else fresh
+        # A version that hid less may have stored it: both are compared as they are hidden now.
+        same = sent is not None and without_passwords(sent.uri) == uri
+        if sent is not None and same and sent.experiment == self.experiment:
+            return replace(sent, uri=uri)
+        return fresh
 
     def _guarded(self, status: Status) -> None:
         """Sync; what the store raises becomes a line on stderr, once."""

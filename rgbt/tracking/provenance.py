@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
@@ -27,7 +28,7 @@ def provenance() -> dict[str, Any]:
     """What is needed to say how this process's results were made.
 
     Returns:
-        ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords in addresses hidden), ``cwd``,
+        ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords hidden), ``cwd``,
         ``pid``, ``git_commit`` and ``git_dirty`` (None where this code is not under git),
         ``untracked`` (files the diff does not show), ``diff`` (text), ``code`` (`package_digest`),
         ``threads`` (of torch on the CPU), ``python``, ``packages``
@@ -36,7 +37,7 @@ def provenance() -> dict[str, Any]:
     """
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": without_passwords(shlex.join(sys.orig_argv)),
+        "command": command_line(sys.orig_argv),
         "cwd": str(Path.cwd()),
         "pid": os.getpid(),
         **code(),
@@ -61,14 +62,62 @@ def package_digest(package: Path) -> str:
     return digest.hexdigest()
 
 
-def without_passwords(text: str) -> str:
-    """`text` with the passwords of addresses replaced by ``***``.
+HIDDEN = "***"
 
-    These are ``scheme://user:password@host``, whatever the password holds but spaces, and
-    ``?password=...``.
+ADDRESS = r"(?<![\w+.-])((?:[\w+.-]+)?://"
+"""The scheme of an address; a match begins with it and not inside it."""
+
+LONGEST = 2000
+"""Characters of a password; a limit, so that no text takes minutes."""
+
+KEYS = (
+    r"(?<![\w.-])(?:[\w.-]*(?:password|passwd)|token|"
+    r"(?:\w*_)?(?:(?:api|access)_?key|secret|(?:access|auth|session|tracking)_?token))"
+)
+"""Names of what gives access. A setting such as mask_token or num_tokens is none of them."""
+
+SECRETS = (
+    # scheme://user:password@host. The password reaches to the last @, and may hold "/", as for
+    # SQLAlchemy. For http, digits and "/" after the colon are a port and a path.
+    (
+        rf"(?!https?://[^/\s:@'\"]*:\d+[/?#]){ADDRESS}[^/\s:@'\"]*):[^\s'\"]{{1,{LONGEST}}}@",
+        rf"\1:{HIDDEN}@",
+    ),
+    # The same inside an address, percent-encoded.
+    (
+        rf"(%3A%2F%2F(?:(?!%3A|%40|%2F)[^\s&'\"])*%3A)[^\s&'\"]{{1,{LONGEST}}}%40",
+        rf"\1{HIDDEN}%40",
+    ),
+    # scheme://token@host; before a database, and in ssh://git@host, it is the name of a user.
+    (
+        rf"(?!(?:postgres|mysql|mariadb|mssql|oracle|(?:git\+)?ssh)[\w+.-]*://)"
+        rf"{ADDRESS})[^/\s:@'\"]+@",
+        rf"\1{HIDDEN}@",
+    ),
+    # password=..., sslpassword='...', MLFLOW_TRACKING_TOKEN=..., in addresses, libpq's key=value
+    # texts and commands.
+    (
+        rf"({KEYS}(?:\s*=\s*|%3D))"
+        r"(?:'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|[^\s&'\"]+)",
+        rf"\1{HIDDEN}",
+    ),
+)
+
+
+def without_passwords(text: str) -> str:
+    """`text` with what gives access replaced by ``***``: it may be stored and shown.
+
+    Hidden are ``user:password@`` and ``token@`` of addresses, and the values of keys such as
+    ``password=`` and ``token=``. Applied twice it gives the same.
     """
-    text = re.sub(r"(://[^/\s:@]+):(?!\d+/)[^\s'\"]+@", r"\1:***@", text)
-    return re.sub(r"([?&]password=)[^&\s'\"]+", r"\1***", text)
+    for pattern, replacement in SECRETS:
+        text = re.sub(pattern, replacement, text, flags=re.IGNORECASE)
+    return text
+
+
+def command_line(words: Sequence[str]) -> str:
+    """A command as one types it, without passwords: quotes of the shell do not end one."""
+    return shlex.join(map(without_passwords, words))
 
 
 def _code(file: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_fill import Status, read_sent
 from rgbt.tracking.mlflow_server import ui_command
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.provenance import HIDDEN, without_passwords
 from rgbt.tracking.replaced import REPLACED, runs_dir_of
 
 KEYS = ("run", "runs_dir", "uri", "artifact_uri", "experiment")
@@ -63,13 +64,19 @@ def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
     """
     sent = read_sent(folder)
     uri = options.get("uri", sent.uri if sent else None)
-    if uri is not None and ":***@" in uri:
-        raise InputError(f"{folder.path}: the password of {uri} is not kept; give uri=... with it.")
-    same_store = sent is not None and uri == sent.uri
-    artifact_uri = sent.artifact_uri if sent is not None and same_store else None
+    artifact_uri = None
+    if sent is not None and uri is not None:
+        same_store = without_passwords(uri) == without_passwords(sent.uri)
+        artifact_uri = sent.artifact_uri if same_store else None
+    artifact_uri = options.get("artifact_uri", artifact_uri)
+    for key, address in (("uri", uri), ("artifact_uri", artifact_uri)):
+        if address is not None and HIDDEN in address:
+            raise InputError(
+                f"{folder.path}: the password of {address} is not kept; give {key}=... with it."
+            )
     return MlflowTracking(
         uri,
-        artifact_uri=options.get("artifact_uri", artifact_uri),
+        artifact_uri=artifact_uri,
         experiment=options.get("experiment", sent.experiment if sent else EXPERIMENT),
         runs_dir=str(runs_dir_of(folder)),
     )

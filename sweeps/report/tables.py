@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.metrics import names as metric_names
+from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps import attributes
 from sweeps.report.data import Importances, StudyData, pruning, short_names
@@ -101,12 +100,10 @@ def trials_csv(data: StudyData) -> str:
     names = list(data.distributions)
     scores = _score_names(data, data.trials)
     header = ["trial", "state", "label", *names, *scores, "seconds", "last_step", "runs", "reason"]
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(header)
+    rows: list[list[object]] = [[*header]]
     for trial in data.trials:
         results = _scores(data, trial)
-        writer.writerow(
+        rows.append(
             [
                 *(trial.number, WORDS[trial.state.name], data.label(trial)),
                 *(trial.params.get(name, "") for name in names),
@@ -117,7 +114,7 @@ def trials_csv(data: StudyData) -> str:
                 _reason(trial),
             ]
         )
-    return file.getvalue()
+    return csv_text(rows)
 
 
 def markdown_table(grid: Grid) -> str:

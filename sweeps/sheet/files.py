@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable
 
+from rgbt.tracking.csv_files import csv_text
 from sweeps.sheet.sheet import Sheet
 from sweeps.sheet.texts import Text
 from sweeps.table.cells import Cell
@@ -94,9 +93,7 @@ def tidy_csv(scored: Scored) -> str:
     Columns: `CSV_HEADER`; empty where there is no value. Values are in the unit of the table;
     `n` is the number of seeds, `runs` are keys of runs.
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(CSV_HEADER)
+    rows: list[tuple[object, ...]] = [CSV_HEADER]
     nothing = Cell(math.nan, math.nan, 0)
     for row in scored.table.rows:
         for column in scored.table.columns:
@@ -106,8 +103,8 @@ def tidy_csv(scored: Scored) -> str:
             ours = (_plain(cell.mean), _plain(cell.sd), cell.seeds)
             theirs = ("" if printed is None else printed, _plain(scored.difference(row, column)))
             place = (scored.name, row.label, column.name)
-            writer.writerow((*place, *ours, *theirs, reason, " ".join(cell.keys)))
-    return stream.getvalue()
+            rows.append((*place, *ours, *theirs, reason, " ".join(cell.keys)))
+    return csv_text(rows)
 
 
 def _plain(value: float) -> str:

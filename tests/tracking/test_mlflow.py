@@ -20,7 +20,7 @@ from rgbt.config import build, check_node
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.files import holding
 from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_fill import artifact_table, read_sent, shown, write_sent
+from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, shown, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
@@ -403,3 +403,31 @@ def test_a_run_described_anew_is_renamed(runs_dir: Path) -> None:
     tracker = tracking(runs_dir)
     tracker.start(folder, "grbm sigma_div=4 seed=0", TAGS, PARAMS)
     assert client(runs_dir).get_run(run_id(folder)).info.run_name == "grbm sigma_div=4 seed=0"
+
+
+def test_a_store_is_the_same_however_much_of_its_address_was_hidden(tmp_path: Path) -> None:
+    uri, hidden = (
+        "postgresql://u:123/abc@h/db?sslpassword=x",
+        "postgresql://u:***@h/db?sslpassword=***",
+    )
+    partly = "postgresql://u:123/abc@h/db?sslpassword=***"
+    folder, place = RunFolder(tmp_path / "run"), "sftp://u:pw@h/files"
+    store = MlflowTracking(uri, artifact_uri=place, experiment="e", runs_dir=str(tmp_path))
+    assert store._sent(folder) == Sent(hidden, "e", "sftp://u:***@h/files")
+    for stored in (hidden, uri, partly, "postgresql://u:***@h/db?sslpassword=x"):
+        write_sent(folder, Sent(stored, "e", None, "1", "the run"))
+        assert store._sent(folder) == Sent(hidden, "e", None, "1", "the run")
+    write_sent(folder, Sent("postgresql://u:***@other/db", "e", None, "1", "the run"))
+    assert store._sent(folder).run_id == ""
+
+
+@pytest.mark.parametrize("uri", ["postgresql://u:***@h/db", "https://***@h", "x://h?password=***"])
+def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> None:
+    folder = RunFolder(tmp_path / "run")
+    write_sent(folder, Sent(uri, "e"))
+    with pytest.raises(InputError, match=r"give uri=\.\.\. with it"):
+        sync.tracking_of(folder, {})
+    write_sent(folder, Sent("http://h:5000", "e", "sftp://u:***@h/files"))
+    with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
+        sync.tracking_of(folder, {})
+    assert sync.tracking_of(folder, {"artifact_uri": "sftp://u:pw@h/files"}).uri == "http://h:5000"

@@ -291,6 +291,35 @@ def test_masks_of_a_data_set_that_is_elsewhere_are_drawn_on_the_embedded_one() -
     assert remarks == []
 
 
+@pytest.mark.parametrize("group", ["masker", "dataset"])
+def test_a_hostile_artifact_is_a_remark_and_runs_nothing(group: str, tmp_path: Path) -> None:
+    evil = {"_target_": "os.system", "command": f"touch {tmp_path / 'marker'}"}
+    others = {k: v for k, v in masked_config().items() if not k.startswith(f"{group}.")}
+    config = others | {f"{group}.{key}": value for key, value in evil.items()}
+    remarks: list[str] = []
+    runs = [run_of({**config, "group": "evil"}), run_of(masked_config())]
+    (picture,) = mask_pictures(runs, quiet, remarks)
+    assert picture.title == ("grbm" if group == "masker" else "evil")
+    assert ("embedded" in picture.caption) == (group == "dataset")
+    (remark,) = remarks
+    assert f"its config.yaml: '{group}._target_' names os.system, which no file of" in remark
+    assert not (tmp_path / "marker").exists()
+
+
+def test_a_masker_of_ones_own_is_drawn_where_it_is_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_maskers.py").write_text(
+        "from rgbt.maskers.masker import Masker\n\nclass Mine(Masker):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    runs = [run_of(masked_config(_target_="my_maskers.Mine"))]
+    remarks: list[str] = []
+    assert mask_pictures(runs, quiet, remarks) == ()
+    assert "add trust=my_maskers" in remarks[0]
+    assert len(mask_pictures(runs, quiet, remarks, trust=("my_maskers",))) == 1
+
+
 def test_a_masker_that_cannot_be_built_is_told() -> None:
     remarks: list[str] = []
     runs = [run_of(masked_config(sampler="guess"))]
