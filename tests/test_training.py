@@ -46,3 +46,19 @@ def test_little_waiting_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
     earlier = [("train", {"loss": 1.0}), ("val", {"wait_share": 0.9})]
     assert told(capsys, earlier, None) == "", "lines of before it was measured, and of no step"
     assert "31%" in told(capsys, [*earlier, *steps(0.31)], None)
+
+
+@pytest.mark.parametrize(
+    ("saved", "said"),
+    [
+        (2, "rgbt: steps 3 to 5 were not saved before and are repeated.\n"),
+        (5, ""),
+    ],
+)
+def test_steps_that_were_not_saved_are_named_on_resuming(
+    capsys: pytest.CaptureFixture[str], saved: int, said: str
+) -> None:
+    folder: Any = SimpleNamespace(lines=lambda: [SimpleNamespace(step=step) for step in (1, 5)])
+    nothing: Any = None
+    Run(nothing, folder, nothing, nothing)._tell_repeated(saved)
+    assert capsys.readouterr().err == said
