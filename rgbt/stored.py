@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config import check, compose, flatten, register_resolvers
 from rgbt.data.label_map import LabelMap
-from rgbt.engine.checkpoint import load_checkpoint, restore_weights
+from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
 from rgbt.identity import run_key, weights_file
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, names_key, open_session
@@ -151,8 +151,7 @@ def open_run(
             )
     restore_weights(session.model, payload["model"], weights)
     _tell_other_splits(folder, trained_on, session)
-    step = payload["step"] if checkpoint == "best" else payload["state"]["step"]
-    return Stored(session, step, folder / "evaluations", config.name)
+    return Stored(session, step_of(payload, weights), folder / "evaluations", config.name)
 
 
 def _tell_other_splits(folder: Path, trained_on: str | None, session: Session) -> None:

@@ -66,6 +66,13 @@ class Training:
             ("tests.dying", instant, "rgbt.run", *words), environment, self.log
         )
 
+    def wait_for_training(self, job: LocalJob, pid: int) -> None:
+        """Until the process holds the lock of its run folder, or has ended."""
+        while job.poll() is None:
+            if any(f"process {pid} " in lock.read_text() for lock in self.place.glob("*/lock")):
+                return
+            time.sleep(0.005)
+
     def finish(self) -> Path:
         assert ended(self.start()) == 0, self.log.read_text()[-3000:]
         return only_run(self.place)
@@ -85,6 +92,11 @@ class Bench:
     executor: LocalExecutor
     undisturbed: Path
     seconds: float
+
+    @property
+    def training_seconds(self) -> float:
+        result = json.loads((self.undisturbed / "result.json").read_text())
+        return float(result["seconds_of_last_process"])
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +130,7 @@ def check(bench: Bench, place: Path) -> None:
     folder, straight = only_run(place), bench.undisturbed
     result, expected = (json.loads((f / "result.json").read_text()) for f in (folder, straight))
     for one in (result, expected):
-        one.pop("seconds_of_last_process")
+        del one["seconds_of_last_process"], one["name"]  # the name says how many workers
     assert result == expected
     assert lines(folder) == lines(straight)
     for name in ("best.pt", "last.pt"):
@@ -161,10 +173,14 @@ def test_killed_at_random_instants(bench: Bench, series: int) -> None:
     )
     for _ in range(6):
         job = training.start()
-        time.sleep(draw.uniform(0.0, 0.8) * bench.seconds)
-        number = draw.choice(ENDINGS)
         pid = job._process.pid
         assert pid is not None
+        number = draw.choice(ENDINGS)
+        if draw.random() < 0.8:  # while it trains, else at any moment
+            training.wait_for_training(job, pid)
+            time.sleep(draw.uniform(0.0, 1.0) * bench.training_seconds)
+        else:
+            time.sleep(draw.uniform(0.0, 1.0) * bench.seconds)
         if draw.random() < 0.5:
             job._signal(number)
         elif job.poll() is None:

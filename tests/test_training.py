@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from rgbt.engine.checkpoint import State
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from rgbt.training import Run, _show_again
@@ -71,3 +72,23 @@ def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
     kept = folder.description()
     assert kept is not None
     assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
+
+
+@pytest.mark.parametrize(
+    ("saved", "said"),
+    [
+        (2, "rgbt: steps 3 to 5 were not saved before and are repeated.\n"),
+        (5, ""),
+    ],
+)
+def test_steps_that_were_not_saved_are_named_on_resuming(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], saved: int, said: str
+) -> None:
+    folder, nothing = RunFolder(tmp_path), cast(Any, None)
+    for step in range(1, 6):
+        folder.append(step, "train", {"loss": 1.0})
+    trainer = SimpleNamespace(log_every=1)
+    prepared: Any = SimpleNamespace(session=SimpleNamespace(trainer=trainer))
+    state = State(seed=0, step=saved, evaluated_step=saved)
+    Run(prepared, folder, nothing, nothing)._truncate(state)
+    assert capsys.readouterr().err == said

@@ -103,6 +103,19 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return payload
 
 
+def step_of(payload: Mapping[str, Any], source: Path) -> int:
+    """The step of a last or a best checkpoint.
+
+    Raises:
+        InputError: it does not say.
+    """
+    state = payload.get("state", payload)
+    step = state.get("step") if isinstance(state, dict) else None
+    if not isinstance(step, int):
+        raise InputError(f"{source} does not say its step; give a checkpoint written by rgbt.run.")
+    return step
+
+
 def _is_state_dict(value: object) -> bool:
     """Whether a value is tensors by name."""
     return isinstance(value, dict) and all(

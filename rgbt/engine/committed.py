@@ -22,7 +22,7 @@ from typing import Any
 
 from rgbt.checkpoints.stored import save
 from rgbt.checks import InputError, RunError
-from rgbt.engine.checkpoint import State, load_checkpoint
+from rgbt.engine.checkpoint import State, load_checkpoint, step_of
 
 BEST = "best.pt"
 NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES)
@@ -107,10 +107,11 @@ class Checkpoints:
             RunError: it holds the weights of another step.
         """
         payload = load_checkpoint(self.best)
-        if payload.get("step") != step:
+        found = step_of(payload, self.best)
+        if found != step:
             raise RunError(
-                f"{self.best} is of step {payload.get('step')}, the best evaluation of this run of "
-                f"step {step}; {self._begin_again()}"
+                f"{self.best} is of step {found}, the best evaluation of this run of step {step}; "
+                f"{self._begin_again()}"
             )
         weights: dict[str, Any] = payload["model"]
         return weights
@@ -133,10 +134,11 @@ class Checkpoints:
             raise InputError(f"{path} holds no state of a training.") from error
         named = self._by_step / str(state.best_step) / BEST
         # Runs of before there was this folder have their best weights beside last.pt.
-        best = load_checkpoint(named if named.exists() else self.best) if state.best_step else {}
+        best = named if named.exists() else self.best
+        found = step_of(load_checkpoint(best), best) if state.best_step else 0
         # A later one was written by a process that was killed before it committed it.
-        if best and best.get("step") != state.best_step and best["step"] <= state.step:
-            raise InputError(f"{self.best} is not of step {state.best_step}.")
+        if found != state.best_step and found <= state.step:
+            raise InputError(f"{best} is of step {found}, not {state.best_step}.")
         return payload, state
 
     def _fallen_back(self, damage: InputError) -> tuple[dict[str, Any], State]:

@@ -223,3 +223,58 @@ def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
         RunFolder(tmp_path).result()
     with pytest.raises(InputError, match="no such folder"):
         runs_in(tmp_path / "missing")
+
+
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    (tmp_path / "lock").write_text("process 4711 on node7")
+    (tmp_path / "evaluations").mkdir()
+    (tmp_path / "checkpoints" / "3").mkdir(parents=True)
+    left = (
+        *(".run.json.4711", "counts_val.npz.4711.partial", ".last.pt.partial"),
+        *("evaluations/a.npz.4711.partial", "checkpoints/3/.best.pt.partial", ".best.pt.partial"),
+        *(".last_previous.pt.partial", ".counts_val.npz.partial", ".old.json.98"),
+    )
+    # Of others, that may be at it now; and names that mean something else.
+    kept = (".mlflow.json.99", "evaluations/b.npz.99.partial", "notes.4711", "run.json")
+    for name in (*left, *kept):
+        (tmp_path / name).touch()
+    os.utime(tmp_path / ".old.json.98", (0, 0))
+    with folder.lock():
+        found = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert found == {*kept, "lock"}
+    (tmp_path / f".run.json.{os.getpid()}").touch()
+    folder.clean()
+    assert not (tmp_path / f".run.json.{os.getpid()}").exists()
+
+
+def test_nobody_is_disturbed_by_cleaning(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    with folder.lock():
+        (tmp_path / ".last.pt.partial").touch()
+        RunFolder(tmp_path).clean()
+        assert (tmp_path / ".last.pt.partial").exists()
+
+
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: int) -> None:
+        raise KeyboardInterrupt
+
+    write_atomic(tmp_path / "run.json", b"old")
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(tmp_path / "run.json", b"new")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+    assert (tmp_path / "run.json").read_bytes() == b"old"
+
+
+def test_lines_of_an_evaluation_that_was_not_committed_are_dropped(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    for step, kind in ((2, "train"), (2, "val"), (4, "train"), (4, "val"), (4, "test")):
+        folder.append(step, kind, {"x": 1.0})
+    folder.truncate_after(4, 2)
+    assert [(line.step, line.kind) for line in folder.lines()] == [
+        *((2, "train"), (2, "val"), (4, "train"))
+    ]
