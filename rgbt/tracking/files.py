@@ -71,7 +71,7 @@ def _try_lock(descriptor: int, *, wait: bool) -> str | None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
-        return os.pread(descriptor, 200, 0).decode() or "another process"
+        return os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
     return None
