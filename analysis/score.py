@@ -167,7 +167,7 @@ def _check_same_source(out: Path | None, source: str) -> None:
     if out is None or not (out / "scores.csv").is_file():
         return
     noted = out / SOURCE
-    earlier = noted.read_text().strip() if noted.is_file() else "another call"
+    earlier = noted.read_text(errors="replace").strip() if noted.is_file() else "another call"
     if earlier != source:
         raise InputError(f"out={out} holds the scores of {earlier}; give {source} its own folder.")
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlparse
 
-from rgbt.checks import InputError, RunError, nearest
+from rgbt.checks import TEXT, InputError, RunError, nearest, read_bytes
 from rgbt.tracking.mlflow_client import ENVIRONMENT
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.provenance import without_passwords
@@ -66,9 +66,7 @@ class Files:
         if found is None:
             return None
         try:
-            if found.stat().st_size > MOST_TEXT:
-                raise InputError(f"{found} is larger than {MOST_TEXT:,} bytes; it is not read.")
-            return found.read_text()
+            return read_bytes(found, TEXT).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{found} cannot be read ({error}).") from error
 

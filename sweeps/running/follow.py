@@ -94,7 +94,8 @@ def _last_words(log: Path, start: int) -> str:
 def stop_holder(folder: Path, number: signal.Signals) -> None:
     """Send a signal to the process that trains in `folder`, if it is on this machine."""
     lock = folder / "lock"
-    found = re.fullmatch(r"process (\d+) on (\S+)", lock.read_text()) if lock.exists() else None
+    said = lock.read_text(errors="replace") if lock.exists() else ""
+    found = re.fullmatch(r"process (\d+) on (\S+)", said)
     if found and found.group(2) == os.uname().nodename:
         with suppress(ProcessLookupError):  # it has ended between our two looks
             os.kill(int(found.group(1)), number)

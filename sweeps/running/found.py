@@ -215,7 +215,7 @@ class Runs:
         copy = self.runs_dir / FETCHED / key
         known = copy / "run_id"
         if known.exists():
-            found = Found(key, copy, known.read_text())
+            found = Found(key, copy, known.read_text(errors="replace"))
             if found.dataset == dataset:
                 return found
         fetched: Found | None = self._guarded(lambda t: _fetch(t, (key, dataset), copy))
