@@ -8,10 +8,17 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.tracking.provenance import code
 from sweeps.points import Evaluation, Point
 from sweeps.running import lists
 from sweeps.running.found import Found, Runs
-from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey
+from sweeps.running.lists import (
+    Outcome,
+    PointList,
+    estimated_seconds,
+    other_code_line,
+    survey,
+)
 from sweeps.running.plan import Plan
 from tests.sweeps.fakes import counts, finish, plan_of, settings
 
@@ -82,6 +89,21 @@ def test_points_that_are_one_run_share_their_tags(
     rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
     prepared = lists._Prepared(wanted(tmp_path, *rows))
     assert [plan.point.tags for plan in prepared.plans.values()] == [{"table": "1 | 1.0"}] * 2
+
+
+def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
+    found = []
+    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
+        run = finish(tmp_path / name)
+        run.add_provenance({"code": digest, "diff": ""})
+        found.append(Found(name, run.path))
+    outcomes = [Outcome(Point("p", ()), "finished", found=tuple(found[:2]))] * 2
+    assert other_code_line(outcomes[:0]) == ""
+    assert other_code_line([Outcome(Point("p", ()), "finished", found=(found[1],))]) == ""
+    outcomes.append(Outcome(Point("q", ()), "finished", found=(found[2],)))
+    assert other_code_line(outcomes) == (
+        "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
+    )
 
 
 def test_a_mistake_of_all_points_is_one_of_the_call(
