@@ -60,7 +60,7 @@ def _contributing(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any
 
     What a process did after the step at which a later one began is not in the state.
     """
-    found = []
+    found: list[Mapping[str, Any]] = []
     kept_until = math.inf
     for entry in reversed(entries):
         begin = entry.get("from_step")  # None: of before it was noted

@@ -200,7 +200,7 @@ def test_a_configuration_that_changed_meanwhile_is_told(tmp_path: Path) -> None:
         return 0
 
     plan, key = single()
-    with pytest.raises(PointError, match=f"not as {key}: its configuration .* was changed"):
+    with pytest.raises(PointError, match=f"not as {key}: its configuration, .* was changed"):
         Bench(tmp_path, plan, other_key).run()
 
 
