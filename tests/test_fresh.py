@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from rgbt import source_code
+from rgbt.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.tracking import other_code
 from rgbt.tracking.folder import RunFolder, runs_in
@@ -89,6 +90,19 @@ def test_changed_tests_or_documents_are_no_other_code(
     moved = {**code(), "git_commit": "0" * 40, "git_dirty": True, "diff": "+a sentence\n"}
     monkeypatch.setattr(other_code, "code", lambda: moved)
     assert "other code" not in train(call, data, runs, "+experiment=crm", *short(1))[2]
+
+
+def test_a_run_of_before_threads_had_a_number_is_opened(call: Call, data: Path, runs: Path) -> None:
+    from rgbt import evaluate
+
+    folder = only_run(runs)
+    text = (folder / "config.yaml").read_text()
+    assert "threads: 1" in text
+    (folder / "config.yaml").write_text(text.replace("threads: 1", "threads: null"))
+    code, _, err = call(
+        plain_command(evaluate.OWN, evaluate.main), f"run={folder}", f"dataset.root={data}"
+    )
+    assert code == 0, err
 
 
 OWN_LOSS = """
