@@ -20,11 +20,12 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt import earlier, identity
 from rgbt.checks import InputError, RunError
 from rgbt.config import check, conf_dir
-from rgbt.earlier import earlier_runs, finish_earlier, labels_folder
+from rgbt.earlier import earlier_runs, finish_earlier, labels_folder, warn_of_other_code
 from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.naming import TAGS
 from rgbt.tracking.files import holding
+from rgbt.tracking.folder import RunFolder
 from tests.commands import Call, Trained, short
 from tests.composed import composed as configuration
 
@@ -410,6 +411,19 @@ def finished(experiment: str, tmp_path: Path) -> DictConfig:
     for each in earlier_runs(config):
         finish(each.config)
     return config
+
+
+def test_fresh_names_the_upstream_runs_that_other_code_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = list(earlier_runs(finished("sh_adversarial", tmp_path)))
+    warn_of_other_code(needed)
+    assert capsys.readouterr().err == ""
+    RunFolder(needed[0].folder).add_provenance({"code": "0" * 64, "diff": ""})
+    warn_of_other_code(needed)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"rgbt: warning: the upstream run {needed[0].folder} (model.weights)")
+    assert line.endswith("run +experiment=sh_source with fresh=true.")
 
 
 @pytest.mark.parametrize("state", ["missing", "begun", "whole"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from rgbt import source_code
 from rgbt.identity import run_key
-from rgbt.source_code import user_code
+from rgbt.source_code import counted_modules, user_code
 from tests.composed import composed
 
 Write = Callable[..., None]
@@ -85,6 +86,14 @@ def test_user_code_does_not_depend_on_where_it_lies(write: Write) -> None:
     before = user_code([TARGET])
     write({}, "elsewhere")
     assert user_code([TARGET]) == before
+
+
+def test_counted_modules_are_those_that_a_sweep_loads_for_its_runs(write: Write) -> None:
+    write()
+    user_code(["my_tools.two", TARGET])
+    assert counted_modules() == [], "nothing was imported"
+    importlib.import_module("my_tools")
+    assert counted_modules() == ["my_tools"]
 
 
 def test_user_code_of_an_installed_distribution_is_its_version() -> None:

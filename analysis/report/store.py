@@ -19,9 +19,8 @@ from rgbt.tracking.provenance import without_passwords
 PAGE = 500
 """Runs asked for at a time."""
 
-MOST_TEXT = 10_000_000
 MOST_FETCHED = 200_000_000
-"""Bytes of a text file, and of a file that is copied from a server; larger ones are not read."""
+"""Bytes of a file that is copied from a server; larger ones are not read."""
 
 SQLITE = "sqlite:///"
 REASON_LENGTH = 160

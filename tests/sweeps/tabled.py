@@ -55,6 +55,7 @@ class FakeFound:
     key: str
     made: Mapping[Evaluation | None, Counts]
     commit: str | None = "aaaaaaaaaa"
+    is_of_other_code: bool = False
 
     def counts(self, evaluation: Evaluation | None = None) -> Counts:
         return self.made[evaluation]

@@ -223,6 +223,7 @@ def test_all_tables_are_listed_and_only_listed(
         (("table=my/small", "workers=0"), "workers' must be a whole number from 1"),
         (("table=my/small", "workers=two"), "'workers'"),
         (("table=my/small", "retry=all"), "'retry'"),
+        (("table=my/small", "fresh=yes"), "fresh"),
         (("table=my/small", "seed=1"), "choose seeds=3"),
         (("table=my/small", "+experiment=crm"), "choose another table"),
         (("table=my/small", "tracking=mlfow"), "did you mean 'mlflow'"),

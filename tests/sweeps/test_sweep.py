@@ -104,6 +104,13 @@ def test_the_same_command_is_the_same_study_wherever_its_runs_lie(
     assert first.startswith("grbm-sigma_div-")
 
 
+def test_fresh_is_a_word_to_the_sweep_and_not_to_its_runs(asked: Asked, tmp_path: Path) -> None:
+    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "fresh=true")
+    (wanted,) = asked.lists
+    assert wanted.runs.fresh
+    assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
+
+
 def test_the_same_search_is_the_same_study_in_any_order(asked: Asked, tmp_path: Path) -> None:
     interval = "masker.sigma_div=interval(1,4)"
     budget = {"trials": 3}

@@ -23,6 +23,7 @@ from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, shown, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
+from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
@@ -224,6 +225,28 @@ def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> 
     assert store.get_run(sent.run_id).info.status == "FAILED"
     begin(folder, tracking(runs_dir))
     assert store.get_run(sent.run_id).info.status == "RUNNING"
+
+
+def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Path) -> None:
+    folder = RunFolder(runs_dir / "again")
+    tracker = tracking(runs_dir)
+    ids = []
+    for _ in range(2):
+        begin(folder, tracker)
+        conclude(folder)
+        tracker.finish("FINISHED")
+        ids.append(run_id(folder))
+        if len(ids) == 1:
+            replace_finished(folder, tracker)
+            folder = RunFolder(runs_dir / "again")
+    old, new = (client(runs_dir).get_run(each) for each in ids)
+    assert (old.info.run_name, new.info.run_name) == ("grbm seed=0 (replaced)", "grbm seed=0")
+    assert (old.info.status, new.info.status) == ("FINISHED", "FINISHED")
+    keys = ("rgbt.key", "rgbt.group", "rgbt.replaced")
+    assert [old.data.tags.get(key) for key in keys] == [
+        *("replaced/again-1", "grbm (replaced)", "true"),
+    ]
+    assert [new.data.tags.get(key) for key in keys] == ["abc", "grbm", None]
 
 
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from analysis.report.store import StoredRun, read_store
+from analysis.report import collect as collecting
+from analysis.report.store import Files, StoredRun, read_store
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from sweeps.running.found import Found
@@ -45,3 +46,21 @@ def test_without_mlflow_there_is_nothing_to_read(tmp_path: Path) -> None:
 def test_evaluations_lie_where_sweeps_puts_them(tmp_path: Path) -> None:
     assert Found("k", tmp_path).counts_file(RGB) == tmp_path / RGB.path
     assert RGB.path == RGB_FILE
+
+
+def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stored(run_id: str, **tags: str) -> StoredRun:
+        known = {"run_id": run_id, "name": run_id, "status": "RUNNING", "started": ""}
+        return StoredRun(
+            **known, seconds=None, tags=tags, params={}, metrics={}, files=Files((), None)
+        )
+
+    both = [stored("new"), stored("old", **{"rgbt.replaced": "true"})]
+    monkeypatch.setattr(collecting, "read_store", lambda *_: both)
+    for entries in ("table_entries", "study_entries", "mask_pictures", "difference_entries"):
+        monkeypatch.setattr(collecting, entries, lambda *_: ())
+    tracking = MlflowTracking("sqlite:///x", artifact_uri=None, experiment="r", runs_dir="x")
+    data = collecting.collect(
+        collecting.Asked(tracking, tmp_path, 1, ""), lambda things, _: list(things)
+    )
+    assert [run.run_id for run in data.runs] == ["new"]

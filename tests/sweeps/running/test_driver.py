@@ -142,7 +142,7 @@ def test_consistency_that_was_not_measured_says_how_to_get_it(tmp_path: Path) ->
 def test_a_configuration_that_changed_meanwhile_is_a_failure_that_says_so(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1), leave(0)).run()
     assert desk.states() == {"x=0": ["FAIL"]}
-    assert "was changed while the sweep was going on" in trial(desk, 0).user_attrs[names.REASON]
+    assert "was changed during the sweep" in trial(desk, 0).user_attrs[names.REASON]
 
 
 def test_after_too_many_failures_no_point_is_begun(tmp_path: Path) -> None:

@@ -169,10 +169,13 @@ def test_runs_are_opened_where_a_configuration_says(tmp_path: Path) -> None:
     from omegaconf import OmegaConf
 
     node = {"_target_": "rgbt.tracking.mlflow_store.NoTracking"}
-    config: Any = OmegaConf.create({"runs_dir": f"{tmp_path}/x/../runs", "tracking": node})
+    config: Any = OmegaConf.create(
+        {"runs_dir": f"{tmp_path}/x/../runs", "tracking": node, "fresh": True}
+    )
     runs = open_runs(config)
     assert runs.runs_dir == tmp_path.resolve() / "runs"
     assert isinstance(runs.tracking, NoTracking)
+    assert runs.fresh
 
 
 class Machines:

@@ -11,10 +11,17 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.naming import VARIED
+from rgbt.tracking.provenance import code
 from sweeps.points import COLOUR, Evaluation, Point, colour, varied_keys
 from sweeps.running import lists
 from sweeps.running.found import Found, Runs
-from sweeps.running.lists import Outcome, PointList, estimated_seconds, survey
+from sweeps.running.lists import (
+    Outcome,
+    PointList,
+    estimated_seconds,
+    other_code_line,
+    survey,
+)
 from sweeps.running.plan import Plan
 from tests.sweeps.fakes import counts, finish, plan_of, settings
 
@@ -102,6 +109,21 @@ def test_runs_of_a_grid_have_colours_that_can_be_told_apart() -> None:
     channels = np.array([[int(each[n : n + 2], 16) for n in (1, 3, 5)] for each in colours[:9]])
     apart = np.abs(channels[:, None] - channels[None]).sum(-1) + 999 * np.eye(9, dtype=int)
     assert apart.min() > 40
+
+
+def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
+    found = []
+    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
+        run = finish(tmp_path / name)
+        run.add_provenance({"code": digest, "diff": ""})
+        found.append(Found(name, run.path))
+    outcomes = [Outcome(Point("p", ()), "finished", found=tuple(found[:2]))] * 2
+    assert other_code_line(outcomes[:0]) == ""
+    assert other_code_line([Outcome(Point("p", ()), "finished", found=(found[1],))]) == ""
+    outcomes.append(Outcome(Point("q", ()), "finished", found=(found[2],)))
+    assert other_code_line(outcomes) == (
+        "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
+    )
 
 
 def test_a_mistake_of_all_points_is_one_of_the_call(

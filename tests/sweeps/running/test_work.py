@@ -79,6 +79,10 @@ def single() -> tuple[Plan, str]:
     return plan, plan.key
 
 
+def made_by_other_code(run: RunFolder) -> None:
+    run.add_provenance({"code": "0" * 64, "diff": ""})
+
+
 def test_a_run_is_started_followed_and_found(tmp_path: Path) -> None:
     plan, key = single()
     bench = Bench(tmp_path, plan)
@@ -111,6 +115,20 @@ def test_what_is_finished_already_needs_no_process_and_gets_the_tags(tmp_path: P
     description = RunFolder(tmp_path / plan.key).description()
     assert description is not None
     assert description.tags["rgbt.table/one"] == "row"
+
+
+def test_fresh_trains_again_what_other_code_made_and_only_that(tmp_path: Path) -> None:
+    plan, key = single()
+    made_by_other_code(finish(tmp_path / key))
+    assert Bench(tmp_path, plan).run()[0].is_of_other_code, "without fresh it is taken"
+
+    for calls in (1, 0):  # and given again, nothing is left to do
+        bench = Bench(tmp_path, plan)
+        bench.runs.fresh = True
+        (found,) = bench.run()
+        assert len(bench.executor.calls) == calls
+        assert (found.folder, found.is_of_other_code) == (tmp_path / key, False)
+    assert [path.name for path in (tmp_path / "replaced").iterdir()] == [f"{key}-1"]
 
 
 def test_every_seed_is_a_run_and_only_the_first_is_reported(tmp_path: Path) -> None:
@@ -182,7 +200,7 @@ def test_a_configuration_that_changed_meanwhile_is_told(tmp_path: Path) -> None:
         return 0
 
     plan, key = single()
-    with pytest.raises(PointError, match=f"not as {key}: its configuration .* was changed"):
+    with pytest.raises(PointError, match=f"not as {key}: its configuration, .* was changed"):
         Bench(tmp_path, plan, other_key).run()
 
 

@@ -1,0 +1,142 @@
+"""Results and the code that made them: what is said, and fresh=true."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt import source_code
+from rgbt.command import plain_command
+from rgbt.metrics.counts import Counts
+from rgbt.tracking import other_code
+from rgbt.tracking.folder import RunFolder, runs_in
+from rgbt.tracking.provenance import code
+from tests.commands import Call, Trained, only_run, short, train
+
+MADE_BY_OTHER_CODE = "This result was made by other code (commit 0000000 of"
+
+
+@pytest.fixture
+def runs(trained: Trained, tmp_path: Path) -> Path:
+    """A `runs_dir` with one finished run: crm, one step, on files equal to those of `data`."""
+    done = trained("+experiment=crm", *short(1))
+    shutil.copytree(done, tmp_path / "runs" / done.name)
+    return tmp_path / "runs"
+
+
+def pretend(folder: Path, **changes: Any) -> None:
+    """The first process of the run ran other code."""
+    path = folder / "provenance.json"
+    first, *others = json.loads(path.read_text())
+    path.write_text(json.dumps([{**first, **changes}, *others]))
+
+
+def test_fresh_trains_again_what_other_code_made_and_keeps_it(
+    call: Call, data: Path, runs: Path
+) -> None:
+    words = (data, runs, "+experiment=crm", *short(1))
+    folder = only_run(runs)
+    assert "other code" not in train(call, *words)[2]
+    pretend(folder, code="0" * 64, git_commit="0" * 40, git_dirty=False)
+    before = Counts.load(folder / "counts_test.npz")
+    _, _, err = train(call, *words)
+    assert MADE_BY_OTHER_CODE in err
+    assert "fresh=true trains again and keeps the old run" in err
+
+    code, _, err = train(call, *words, "fresh=true")
+    assert code == 0, err
+    kept = runs / "replaced" / f"{folder.name}-1"
+    assert f"run={kept} opens it" in err
+    assert (kept / "best.pt").is_file()
+    assert [run.path for run in runs_in(runs)] == [folder]
+    assert (Counts.load(folder / "counts_test.npz").counts == before.counts).all()
+    assert "fresh: false" in (folder / "config.yaml").read_text()
+    known = RunFolder(folder).description()
+    assert known is not None
+    assert "fresh" not in known.params
+    assert "fresh" not in known.tags["rgbt.group"]
+    assert "other code" not in train(call, *words)[2]
+
+
+def test_fresh_resumes_a_run_that_is_not_finished_and_says_who_began_it(
+    call: Call, data: Path, runs: Path
+) -> None:
+    folder = only_run(runs)
+    (folder / "result.json").unlink()
+    pretend(folder, code="0" * 64)
+    code, _, err = train(call, data, runs, "+experiment=crm", *short(1), "fresh=true")
+    assert code == 0, err
+    assert "warning: the first 1 steps were trained by other code" in err
+    assert not (runs / "replaced").exists()
+    assert RunFolder(folder).provenance()[-1]["from_step"] == 1
+
+
+def test_a_wrong_setting_with_fresh_moves_nothing(call: Call, data: Path, runs: Path) -> None:
+    (data / "train.txt").unlink()
+    code, _, err = train(call, data, runs, "+experiment=crm", *short(1), "fresh=true")
+    assert code == 2, err
+    assert only_run(runs).is_dir()
+    assert not (runs / "replaced").exists()
+
+
+def test_changed_tests_or_documents_are_no_other_code(
+    call: Call, data: Path, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = {**code(), "git_commit": "0" * 40, "git_dirty": True, "diff": "+a sentence\n"}
+    monkeypatch.setattr(other_code, "code", lambda: moved)
+    assert "other code" not in train(call, data, runs, "+experiment=crm", *short(1))[2]
+
+
+def test_a_run_of_before_threads_had_a_number_is_opened(call: Call, data: Path, runs: Path) -> None:
+    from rgbt import evaluate
+
+    folder = only_run(runs)
+    text = (folder / "config.yaml").read_text()
+    assert "threads: 1" in text
+    (folder / "config.yaml").write_text(text.replace("threads: 1", "threads: null"))
+    code, _, err = call(
+        plain_command(evaluate.OWN, evaluate.main), f"run={folder}", f"dataset.root={data}"
+    )
+    assert code == 0, err
+
+
+OWN_LOSS = """
+from rgbt.losses.cross_entropy import CrossEntropy
+
+
+class Scaled(CrossEntropy):
+    def __call__(self, *inputs):
+        return {name: FACTOR * loss for name, loss in super().__call__(*inputs).items()}
+"""
+
+
+def test_a_changed_loss_of_ones_own_is_another_run(
+    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "conf" / "loss").mkdir(parents=True)
+    (tmp_path / "conf" / "loss" / "scaled.yaml").write_text(
+        "_target_: my_scaled_loss.Scaled\nclass_weights: null\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    search = f"hydra.searchpath=[file://{tmp_path / 'conf'}]"
+    own = ("loss=scaled", search, "masker.patch_size=null")
+    words = (data, tmp_path / "runs", "+experiment=mfnet", *own, *short(1))
+
+    def losses(factor: float) -> list[float]:
+        """Of all runs, after the command was given with this code in a new process."""
+        (tmp_path / "my_scaled_loss.py").write_text(f"FACTOR = {factor}\n{OWN_LOSS}")
+        sys.modules.pop("my_scaled_loss", None)
+        source_code._used_by.clear()
+        code, _, err = train(call, *words)
+        assert code == 0, err
+        found = runs_in(tmp_path / "runs")
+        return sorted(run.lines()[0].values["loss"] for run in found)
+
+    (once,) = losses(1.0)
+    assert losses(3.0) == pytest.approx([once, 3 * once])
+    assert losses(1.0) == pytest.approx([once, 3 * once]), "the first run again"
