@@ -25,7 +25,8 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rgbt.checks import InputError, Seed, Text, nearest
+from rgbt.checks import InputError, nearest
+from rgbt.ranges import Seed, Text
 from rgbt.values import check_value
 
 TOP_LEVEL: dict[str, Any] = {

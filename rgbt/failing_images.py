@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from rgbt import checks
+from rgbt import budgets
 from rgbt.checks import InputError
 from rgbt.degraded import Chosen, Failure
 from rgbt.types import VIEWS, View
@@ -138,7 +138,7 @@ def _counts(
         made_file.unlink(missing_ok=True)
         counts.save(counts_file)
     if known != made:
-        write_atomic(made_file, (json.dumps(checks.sealed(made), indent=1) + "\n").encode())
+        write_atomic(made_file, (json.dumps(budgets.sealed(made), indent=1) + "\n").encode())
     return counts
 
 
@@ -198,6 +198,6 @@ def weights_digest(model: nn.Module) -> str:
 def read_json(path: Path) -> Any:
     """The mapping in a file of JSON; None where it is not there or damaged."""
     try:
-        return checks.read_json(path, dict[str, Any], "")
+        return budgets.read_json(path, dict[str, Any], "")
     except InputError:
         return None

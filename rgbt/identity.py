@@ -11,7 +11,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, nearest, read_json
+from rgbt.budgets import read_json
+from rgbt.checks import InputError, nearest
 from rgbt.config import NODES, OF_THE_RUN, check, compose, conf_dir, typed
 from rgbt.source_code import user_code
 

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from rgbt.checks import InputError, RunError, check_range, read_json, sealed
+from rgbt.budgets import read_json, sealed
+from rgbt.checks import InputError, RunError, check_range
 from rgbt.command import composing
 from rgbt.config import build, check_node, compose
 from rgbt.data.batches import Dataset

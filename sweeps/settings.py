@@ -8,9 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError, Names, Positive, Text, nearest
+from rgbt.checks import InputError, nearest
 from rgbt.config import build
 from rgbt.metrics import names as scores
+from rgbt.ranges import Names, Positive, Text
 
 SCORES = (
     *(scores.MIOU, scores.VAR, scores.MACC, scores.MPRECISION, scores.MF1),

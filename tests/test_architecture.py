@@ -14,7 +14,8 @@ SWEEPS = sorted((ROOT / "sweeps").rglob("*.py"))
 ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
 FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
-COMMON = {"rgbt.types", "rgbt.checks", "rgbt.geometry", "rgbt.randomness"}
+CHECKS = {"rgbt.checks", "rgbt.ranges", "rgbt.budgets"}
+COMMON = {"rgbt.types", *CHECKS, "rgbt.geometry", "rgbt.randomness"}
 ISLANDS = {"data", "degradations", "transforms", "maskers", "models", "losses", "metrics"}
 ALLOWED = {
     **{island: COMMON | {f"rgbt.{island}"} for island in ISLANDS},
@@ -25,18 +26,20 @@ ALLOWED = {
     "weights": COMMON | {"rgbt.weights", "rgbt.checkpoints"},
     "types.py": set(),
     "checks.py": set(),
-    "geometry": {"rgbt.types", "rgbt.checks", "rgbt.geometry"},
+    "ranges.py": set(),
+    "budgets.py": {"rgbt.checks"},
+    "geometry": {"rgbt.types", *CHECKS, "rgbt.geometry"},
     "randomness.py": set(),
-    "yaml_files.py": {"rgbt.checks"},
-    "stored_config.py": {"rgbt.checks", "rgbt.config", "rgbt.yaml_files"},
+    "yaml_files.py": CHECKS,
+    "stored_config.py": {*CHECKS, "rgbt.config", "rgbt.yaml_files"},
     "stopping.py": set(),
-    "resources.py": {"rgbt.checks"},
-    "identity.py": {"rgbt.checks", "rgbt.config", "rgbt.source_code"},
+    "resources.py": CHECKS,
+    "identity.py": {*CHECKS, "rgbt.config", "rgbt.source_code"},
     "source_code.py": set(),
-    "values.py": {"rgbt.checks"},
-    "config.py": {"rgbt.checks", "rgbt.values"},
+    "values.py": CHECKS,
+    "config.py": {*CHECKS, "rgbt.values"},
     "contracts.py": COMMON,
-    "overrides.py": {"rgbt.checks", "rgbt.config"},
+    "overrides.py": {*CHECKS, "rgbt.config"},
     "command.py": COMMON | {"rgbt.config", "rgbt.overrides", "rgbt.resources", "rgbt.stopping"},
 }
 COMMANDS = {"rgbt.command", "rgbt.config", "rgbt.values"}
@@ -81,7 +84,18 @@ def is_command(text: str) -> bool:
 
 
 SWEEPS_MAY = {
-    *("checks", "types", "config", "identity", "source_code", "command", "naming", "metrics"),
+    *(
+        "ranges",
+        "budgets",
+        "checks",
+        "types",
+        "config",
+        "identity",
+        "source_code",
+        "command",
+        "naming",
+        "metrics",
+    ),
     *("tracking", "yaml_files"),
 }
 """What of rgbt the sweeps may import: they call its commands and read what these leave."""
@@ -110,7 +124,18 @@ def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
 
 
 ANALYSIS_MAY = {
-    *("checks", "types", "config", "identity", "command", "naming", "stored_config", "yaml_files"),
+    *(
+        "ranges",
+        "budgets",
+        "checks",
+        "types",
+        "config",
+        "identity",
+        "command",
+        "naming",
+        "stored_config",
+        "yaml_files",
+    ),
     *("randomness", "metrics", "tracking", "data"),
 }
 """What of rgbt the analysis may import: data sets and what runs have left, never a network."""

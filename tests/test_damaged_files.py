@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.checks import InputError, RunError, sealed
+from rgbt.budgets import sealed
+from rgbt.checks import InputError, RunError
 from tests.commands import Call, Trained, short, train
 from tests.damage import damaged
 

@@ -13,8 +13,9 @@ from annotated_types import Gt, Interval, Len, MultipleOf, doc
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from rgbt.checks import InputError, Pixels, Share
+from rgbt.checks import InputError
 from rgbt.config import TOP_LEVEL, check_node, conf_dir, setting_types
+from rgbt.ranges import Pixels, Share
 from rgbt.values import check_value, expected
 from sweeps.settings import Settings
 
@@ -145,7 +146,7 @@ def bounded(annotation: Any) -> bool:
 def test_every_number_and_text_has_a_range(target: str) -> None:
     for key, annotation in setting_types(get_object(target)).items():
         for leaf in leaves(annotation):
-            assert bounded(leaf), f"{target}.{key}: declare a range for {leaf} (rgbt.checks)"
+            assert bounded(leaf), f"{target}.{key}: declare a range for {leaf} (rgbt.ranges)"
 
 
 def test_top_level_keys_have_a_range() -> None:

@@ -11,7 +11,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlparse
 
-from rgbt.checks import TEXT, InputError, RunError, nearest, read_bytes
+from rgbt.budgets import TEXT, read_bytes
+from rgbt.checks import InputError, RunError, nearest
 from rgbt.tracking.mlflow_client import ENVIRONMENT
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.provenance import without_passwords

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rgbt.checks import InputError, ShareBelowOne, Text
+from rgbt.checks import InputError
+from rgbt.ranges import ShareBelowOne, Text
 from rgbt.types import View
 
 GIVEN, NONE = "given", "none"

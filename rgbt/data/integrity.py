@@ -19,7 +19,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from rgbt.checks import CONTENT, PIXELS, InputError
+from rgbt.budgets import CONTENT, PIXELS
+from rgbt.checks import InputError
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 """How files of these kinds begin, whatever their names end in."""

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import Colour, InputError, Names, NumClasses, Text, check_choice, nearest
+from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
@@ -28,6 +28,7 @@ from rgbt.data.named_files import (
     root_nearby,
     with_label,
 )
+from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
 Lists = Literal["auto", "files", "sets"]

@@ -9,7 +9,8 @@ import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
 
-from rgbt.checks import Byte, InputError, Names, NumClasses, Text, nearest
+from rgbt.checks import InputError, nearest
+from rgbt.ranges import Byte, Names, NumClasses, Text
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import torch
 from annotated_types import Interval
 from torch.utils.data import DataLoader
 
-from rgbt.checks import BatchSize, InputError, RunError, Text, Workers
+from rgbt.checks import InputError, RunError
 from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
 from rgbt.data.decoded.dataset import check_cache
 from rgbt.data.reader import (
@@ -32,6 +32,7 @@ from rgbt.data.reader import (
     start_worker,
 )
 from rgbt.randomness import numpy_generator
+from rgbt.ranges import BatchSize, Text, Workers
 from rgbt.types import Batch, Loadable
 
 LOG = logging.getLogger(__name__)

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from rgbt.checks import InputError, read_json
+from rgbt.budgets import read_json
+from rgbt.checks import InputError
 from rgbt.data.batches import Dataset
 from rgbt.data.files import decode, read_label
 from rgbt.types import Sample

@@ -15,7 +15,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import Colour, InputError, Names, NumClasses, Text, nearest
+from rgbt.checks import InputError, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
@@ -27,6 +27,7 @@ from rgbt.data.named_files import (
     root_nearby,
     with_label,
 )
+from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]

@@ -9,7 +9,7 @@ import torch
 from annotated_types import Interval
 from torch import nn
 
-from rgbt.checks import Epsilon, LearningRate, NonNegative, ShareBelowOne
+from rgbt.ranges import Epsilon, LearningRate, NonNegative, ShareBelowOne
 
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table",)

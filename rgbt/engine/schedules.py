@@ -8,7 +8,8 @@ from typing import Annotated, Literal, Protocol
 
 from annotated_types import Interval
 
-from rgbt.checks import InputError, NumSteps, NumStepsOrZero, Power, Share
+from rgbt.checks import InputError
+from rgbt.ranges import NumSteps, NumStepsOrZero, Power, Share
 
 
 class Schedule(Protocol):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.checks import (
+from rgbt.ranges import (
     BaseWidth,
     BatchSize,
     LearningRate,

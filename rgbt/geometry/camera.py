@@ -9,7 +9,8 @@ import torch
 from annotated_types import Interval
 from torch import Tensor
 
-from rgbt.checks import InputError, Pixels, Positive
+from rgbt.checks import InputError
+from rgbt.ranges import Pixels, Positive
 
 Coordinate = Annotated[float, Interval(ge=-0.5, le=8192)]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, NonNegative
+from rgbt.checks import InputError
+from rgbt.ranges import NonNegative
 from rgbt.types import Batch, Loss, Output
 
 

@@ -9,7 +9,8 @@ from annotated_types import Len
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, NonNegative, check_shape
+from rgbt.checks import InputError, check_shape
+from rgbt.ranges import NonNegative
 from rgbt.types import IGNORE, Batch, Output, Predicts
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]

@@ -15,18 +15,12 @@ from annotated_types import Interval
 from torch import Tensor, distributed
 from torch.nn import functional as F
 
-from rgbt.checks import (
-    InputError,
-    NonNegative,
-    NumClasses,
-    NumPoints,
-    Share,
-    check_shape,
-)
+from rgbt.checks import InputError, check_shape
 from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
 from rgbt.losses.points import Points, PointSource
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
+from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.types import Batch, Output, Predicts
 
 

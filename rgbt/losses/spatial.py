@@ -12,9 +12,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, NonNegative, check_shape
+from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import sample
+from rgbt.ranges import NonNegative
 from rgbt.types import Batch
 
 

@@ -10,9 +10,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, NonNegative
+from rgbt.checks import InputError
 from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.dice import Form, dice, single
+from rgbt.ranges import NonNegative
 from rgbt.types import IGNORE, Frame, Loss
 
 Second = Literal["none", "dice", "con", "con_acc"]

@@ -8,8 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import NonNegative, Share
 from rgbt.losses.dice import single
+from rgbt.ranges import NonNegative, Share
 
 Normalisation = Literal["pixels", "entries"]
 

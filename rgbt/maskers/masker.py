@@ -9,10 +9,11 @@ import torch
 from annotated_types import Interval, MultipleOf, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, Pixels, Share, check_shape
+from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.maskers import pairing as pairings
 from rgbt.maskers import pattern
+from rgbt.ranges import Pixels, Share
 from rgbt.types import MaskPair
 
 Sampler = Literal["none", "uniform", "square", "gaussian_count", "gaussian_bernoulli"]

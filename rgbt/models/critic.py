@@ -5,7 +5,8 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import BaseWidth, Channels, InputError, check_shape
+from rgbt.checks import InputError, check_shape
+from rgbt.ranges import BaseWidth, Channels
 
 STRIDE = 32
 

@@ -12,8 +12,9 @@ import torch
 from annotated_types import Interval, Len
 from torch import Tensor, nn
 
-from rgbt.checks import GreyLevel, InputError, check_shape
+from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import pad_to, padded_hw
+from rgbt.ranges import GreyLevel
 from rgbt.types import MaskPair, View
 
 LUMA = (0.299, 0.587, 0.114)

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import Channels, InputError, NumClasses, Widths
+from rgbt.checks import InputError
 from rgbt.models.inputs import Inputs, only_view
+from rgbt.ranges import Channels, NumClasses, Widths
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 16

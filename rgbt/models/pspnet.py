@@ -8,15 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import (
-    BaseWidth,
-    Channels,
-    Depths,
-    NumClasses,
-)
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.models.upsampling import DropRates, UpBlock, enlarge
+from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 8

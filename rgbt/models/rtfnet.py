@@ -12,9 +12,9 @@ from annotated_types import MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import BaseWidth, NumClasses
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.resnet import basic_stage, bottleneck_stage
+from rgbt.ranges import BaseWidth, NumClasses
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 32

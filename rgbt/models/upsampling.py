@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import ShareBelowOne
 from rgbt.models.stochastic import drop_channels
+from rgbt.ranges import ShareBelowOne
 
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
 """Channel dropout before the first block, and after every block; each in [0, 1)."""

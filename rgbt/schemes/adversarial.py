@@ -9,7 +9,8 @@ import torch
 from annotated_types import Interval
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, NonNegative, check_choice
+from rgbt.checks import InputError, check_choice
+from rgbt.ranges import NonNegative
 from rgbt.schemes.domains import (
     Domains,
     Gradients,

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, NonNegative
+from rgbt.checks import InputError
+from rgbt.ranges import NonNegative
 from rgbt.types import VIEWS, Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
 
 Distillation = Callable[..., Tensor]

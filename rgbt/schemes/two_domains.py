@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, NonNegative, Share
+from rgbt.checks import InputError
+from rgbt.ranges import NonNegative, Share
 from rgbt.schemes.domains import (
     Domains,
     Gradients,

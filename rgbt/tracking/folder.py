@@ -32,7 +32,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from rgbt.checks import TEXT, InputError, one_line, parse_json, read_bytes, read_json, sealed
+from rgbt.budgets import TEXT, parse_json, read_bytes, read_json, sealed
+from rgbt.checks import InputError, one_line
 from rgbt.tracking.files import holder_of, holding, is_held, remove_left_behind, write_atomic
 from rgbt.tracking.formats import (
     Kind,

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
-from rgbt.checks import read_json
+from rgbt.budgets import read_json
 
 Kind = Literal["train", "val", "test"]
 

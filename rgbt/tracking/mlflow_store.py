@@ -14,7 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from rgbt.checks import InputError, Text
+from rgbt.checks import InputError
+from rgbt.ranges import Text
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_client import Store, locked, open_store
 from rgbt.tracking.mlflow_fill import Sent, Status, fill, read_sent, write_sent

@@ -9,7 +9,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from numpy.typing import ArrayLike, NDArray
 
-from rgbt.checks import GreyLevel, Pixels, Share, Size
+from rgbt.ranges import GreyLevel, Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from rgbt.checks import GreyLevel, Lengths, Pixels, Share, Size
+from rgbt.ranges import GreyLevel, Lengths, Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View, draw_view, short_edge_hw
 from rgbt.transforms.on_batch import Drawn, DrawnBatch

@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import Interval, Predicate, doc
 from numpy.typing import NDArray
 
-from rgbt.checks import GreyLevel, Share, rising
+from rgbt.ranges import GreyLevel, Share, rising
 
 Image = NDArray[Any]
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
-from rgbt.checks import Pixels, Share, Size
+from rgbt.ranges import Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import Part, View
 from rgbt.types import Sample

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Interval, Predicate, doc
 from numpy.typing import DTypeLike, NDArray
 
-from rgbt.checks import Pixels, Share, Size
+from rgbt.ranges import Pixels, Share, Size
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample

@@ -12,7 +12,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import TEXT, InputError, Names, nearest, one_line, read_bytes
+from rgbt.budgets import TEXT, read_bytes
+from rgbt.checks import InputError, nearest, one_line
+from rgbt.ranges import Names
 from rgbt.transforms.virtual_view import VirtualView
 
 HEADER = "yaw,pitch,roll"

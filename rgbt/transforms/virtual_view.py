@@ -15,11 +15,12 @@ import torch
 from annotated_types import Interval, Predicate, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, rising
+from rgbt.checks import InputError
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.homography import Order, homography
 from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
 from rgbt.geometry.warp import Resampling, Warp
+from rgbt.ranges import rising
 from rgbt.types import IGNORE, Batch
 
 Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]

@@ -24,7 +24,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rgbt.checks import InputError, read_json, sealed
+from rgbt.budgets import read_json, sealed
+from rgbt.checks import InputError
 from rgbt.data.decoded.file import Frame, FrameFile, FrameWriter
 from rgbt.data.decoded.stamps import Stamp
 from rgbt.types import Sample

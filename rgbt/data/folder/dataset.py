@@ -18,17 +18,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import (
-    Colour,
-    InputError,
-    Names,
-    NumClasses,
-    Seed,
-    Share,
-    Text,
-    check_choice,
-    nearest,
-)
+from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.dataset import check_lengths
 from rgbt.data.files import within
 from rgbt.data.folder.frames import Frame, check_partners, find_frames, patterns_of
@@ -46,6 +36,7 @@ from rgbt.data.folder.values import (
 from rgbt.data.images import PairPattern
 from rgbt.data.integrity import is_there
 from rgbt.data.named_files import hash_of_files, with_label
+from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]

@@ -16,8 +16,9 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import Colour, InputError, nearest
+from rgbt.checks import InputError, nearest
 from rgbt.data.files import decode, one_channel, read_array, read_colours, read_indices
+from rgbt.ranges import Colour
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]

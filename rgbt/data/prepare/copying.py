@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rgbt.checks import InputError, read_json
+from rgbt.budgets import read_json
+from rgbt.checks import InputError
 from rgbt.data.prepare.source import Entry
 
 PLAN = ".prepare.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rgbt.checks import InputError, Seed, Text
+from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.factors import (
@@ -17,6 +17,7 @@ from rgbt.data.synth.factors import (
     with_factors,
 )
 from rgbt.data.synth.writer import Plan, write
+from rgbt.ranges import Seed, Text
 
 VERSION = 2
 """Of the generator. Raise it with every change that changes a byte, so that no cache is stale."""

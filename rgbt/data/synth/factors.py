@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 from annotated_types import Interval, doc
 
-from rgbt.checks import Share
+from rgbt.ranges import Share
 
 Made = TypeVar("Made")
 

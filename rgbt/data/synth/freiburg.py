@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.checks import Names, Seed, Text
 from rgbt.data.freiburg import THERMAL_RANGE, Counts, Crop, Freiburg
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.freiburg_writer import VAL_SEQUENCE, FreiburgPlan, write
+from rgbt.ranges import Names, Seed, Text
 
 VERSION = 1
 """Of the files beside the scenes. Raise it with every change that changes a byte of them."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rgbt.checks import Seed, Text
 from rgbt.data.kp import KP
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.kp_writer import write
 from rgbt.data.synth.writer import Plan
+from rgbt.ranges import Seed, Text
 
 VERSION = 1
 """Of the files beside the scenes. Raise it with every change that changes a byte of them."""

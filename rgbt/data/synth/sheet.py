@@ -16,9 +16,10 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, Seed, nearest
+from rgbt.checks import InputError, nearest
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import Scene, render_scene
+from rgbt.ranges import Seed
 from rgbt.values import check_value
 
 COLOURS = np.array(

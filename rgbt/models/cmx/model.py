@@ -10,21 +10,13 @@ from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import (
-    Channels,
-    Depths,
-    Epsilon,
-    InputError,
-    MlpRatio,
-    NumClasses,
-    ShareBelowOne,
-    Widths,
-)
+from rgbt.checks import InputError
 from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.fusion import Fusion, Rectification
 from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.stochastic import keep_factors
+from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STREAMS = ("", "extra_")

@@ -9,12 +9,13 @@ from annotated_types import Len
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import BaseWidth, Depths, InputError, Names, NumClasses, check_choice
+from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import padded_hw
 from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
 from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid, Rates
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.upsampling import DropRates
+from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
 from rgbt.types import MaskPair, Output, Predicts, View
 
 STRIDE = 8

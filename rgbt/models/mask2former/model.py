@@ -9,23 +9,14 @@ from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import (
-    Blocks,
-    Channels,
-    Depths,
-    InputError,
-    MlpRatio,
-    NumClasses,
-    ShareBelowOne,
-    Widths,
-    check_choice,
-)
+from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
 from rgbt.models.mask2former.decoder import Predictions, Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
+from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 from rgbt.types import VIEWS, MaskPair, Output, Predicts, View
 
 FAINTEST = 1e-6

@@ -1,0 +1,91 @@
+"""Ranges of settings as types.
+
+A constructor that a configuration names declares the range of each setting in its annotations:
+``ratio: Share``, or ``block: Annotated[int, Interval(ge=1, le=480)]``. `rgbt.config` checks them.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from annotated_types import Interval, Len, Predicate, doc
+
+Text = Annotated[str, Len(1, 4096), Predicate(str.isprintable), doc("printable characters")]
+"""A name, a path or a pattern: an empty one would be read as the current folder."""
+
+Share = Annotated[float, Interval(ge=0, le=1)]
+"""A share of something, or a probability."""
+
+ShareBelowOne = Annotated[float, Interval(ge=0, lt=1)]
+"""A share that leaves something: a dropout rate, a momentum."""
+
+NonNegative = Annotated[float, Interval(ge=0, le=1e6)]
+"""A weight or a factor; 0 leaves out what it weighs."""
+
+Positive = Annotated[float, Interval(gt=0, le=1e6)]
+"""A factor, a norm or a length that cannot be 0."""
+
+Power = Annotated[float, Interval(ge=0, le=100)]
+"""Exponent of a schedule."""
+
+LearningRate = Annotated[float, Interval(gt=0, le=1000)]
+
+Epsilon = Annotated[float, Interval(ge=1e-12, le=1)]
+"""What is added to a denominator."""
+
+GreyLevel = Annotated[float, Interval(ge=0, le=255)]
+
+Seed = Annotated[int, Interval(ge=0, lt=2**32)]
+"""Of generators; 0 is a seed."""
+
+NumSteps = Annotated[int, Interval(ge=1, le=10**8), doc("more steps would take years")]
+
+NumStepsOrZero = Annotated[int, Interval(ge=0, le=10**8), doc("more steps would take years")]
+
+BatchSize = Annotated[int, Interval(ge=1, le=4096), doc("images held in memory at once")]
+
+Workers = Annotated[int, Interval(ge=0, le=1024), doc("processes on one machine")]
+
+Threads = Annotated[int, Interval(ge=1, le=1024), doc("threads of one process")]
+
+Pixels = Annotated[int, Interval(ge=1, le=8192), doc("pixels")]
+"""Side of an image or of a part of it."""
+
+Lengths = Annotated[tuple[Pixels, ...], Len(1, 1000)]
+"""Sides that one is drawn from."""
+
+Size = tuple[Pixels, Pixels]
+"""Height and width."""
+
+Channels = Annotated[int, Interval(ge=1, le=8192), doc("channels")]
+
+BaseWidth = Annotated[int, Interval(ge=1, le=1024), doc("channels; deep layers have 32 times more")]
+
+Blocks = Annotated[int, Interval(ge=1, le=1000), doc("layers")]
+
+Widths = tuple[Channels, Channels, Channels, Channels]
+"""Channels, or heads, of four stages."""
+
+Depths = tuple[Blocks, Blocks, Blocks, Blocks]
+"""Blocks of four stages."""
+
+MlpRatio = Annotated[float, Interval(gt=0, le=64)]
+"""Width of a block's feed-forward network over the block's."""
+
+Names = tuple[Text, ...]
+
+Byte = Annotated[int, Interval(ge=0, le=255)]
+
+Colour = tuple[Byte, Byte, Byte]
+"""Red, green, blue."""
+
+NumClasses = Annotated[
+    int, Interval(ge=1, le=255), doc("labels are bytes, of which 255 is ignored")
+]
+
+NumPoints = Annotated[int, Interval(ge=1, le=10**6), doc("points held in memory for every mask")]
+
+
+def rising(ends: tuple[float, ...]) -> bool:
+    """Whether no number is smaller than the one before it."""
+    return all(a <= b for a, b in zip(ends, ends[1:], strict=False))
