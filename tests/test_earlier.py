@@ -450,7 +450,7 @@ def test_whole_labels_are_not_predicted_again(
     folder = labels_folder(config, "target")
     folder.mkdir(parents=True)
 
-    def opened(*given: Any) -> None:
+    def opened(*given: Any, trust: Any) -> None:
         raise KeyError(given[0])
 
     monkeypatch.setattr(stored, "open_run", opened)
