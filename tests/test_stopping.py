@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -169,7 +171,6 @@ def test_what_the_process_ignores_stays_ignored() -> None:
 def test_a_closed_terminal_is_no_error(tmp_path: Path) -> None:
     """The other end of a pseudo-terminal closes: SIGHUP, and every write fails from then on."""
     import pty
-    import sys
 
     script = (
         "import sys, time\n"
@@ -213,3 +214,48 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     worker.terminate()
     worker.join(5)
     assert worker.exitcode == 0, "the main process ends them"
+
+
+SERVED = """
+import multiprocessing, os, sys
+from torch.utils.data import DataLoader
+from rgbt.data.reader import start_worker
+
+if __name__ == "__main__":
+    loader = DataLoader(
+        range(9),
+        batch_size=None,
+        num_workers=1,
+        worker_init_fn=start_worker,
+        multiprocessing_context="forkserver",
+    )
+    found = iter(loader)
+    next(found)
+    (worker,) = found._workers
+    print(worker.pid, flush=True)
+    if sys.argv[1] == "die":
+        os.kill(os.getpid(), 9)
+    worker.terminate()
+    worker.join(10)
+    print(worker.exitcode, flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["die", "terminate"])
+def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end: str) -> None:
+    """As inside a sweep: the parent of such a worker is the server, which lives on."""
+    script = tmp_path / "served.py"
+    script.write_text(SERVED)
+    process = subprocess.Popen(
+        [sys.executable, str(script), end], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
+    )
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    if end == "terminate":
+        assert process.stdout.readline() == "0\n"
+    process.wait(60)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{worker}").exists()

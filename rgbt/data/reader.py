@@ -5,6 +5,7 @@ Part of `rgbt.data.loaders`, which decides what each batch holds.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import threading
@@ -31,6 +32,9 @@ Stack = Callable[[list[Any]], Loadable]
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end a command (`rgbt.stopping`)."""
+
+LOOK_S = 2.0
+"""How often a worker looks whether its main process is still there."""
 
 
 @dataclass(frozen=True)
@@ -162,11 +166,15 @@ def start_worker(_: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """Leave when the main process says so."""
-    while True:
-        told = signal.sigwaitinfo(ENDING)
-        if told.si_signo == signal.SIGTERM and told.si_pid == os.getppid():
-            os._exit(0)
+    """Leave when the main process says so, or is gone."""
+    # Not os.getppid: inside a sweep a server forks the workers, and outlives the main process.
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker has a main process"
+    while parent.is_alive():
+        told = signal.sigtimedwait(ENDING, LOOK_S)
+        if told and told.si_signo == signal.SIGTERM and told.si_pid == parent.pid:
+            break
+    os._exit(0)
 
 
 def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:
