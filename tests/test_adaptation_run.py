@@ -179,6 +179,7 @@ def only_road(counts: np.ndarray) -> bool:
     return not counts[..., 1:].any()
 
 
+@pytest.mark.slow
 def test_night_images_are_predicted_by_the_targets_head(
     run: Runs, evaluated: Callable[..., Counts], tmp_path: Path
 ) -> None:
@@ -232,6 +233,7 @@ def test_thermal_images_are_predicted_by_the_targets_head(
     assert values["thermal/mIoU"] == pytest.approx(mean_of_twelve(thermal.sum((0, 1))))
 
 
+@pytest.mark.slow
 def test_the_targets_counts_are_stored(run: Runs, evaluated: Callable[..., Counts]) -> None:
     """Its scores in every line follow from them."""
     folder = run("multi_head_thermal")

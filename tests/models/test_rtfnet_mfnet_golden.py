@@ -111,7 +111,7 @@ def test_trained_mfnet_on_two_frames() -> None:
     pixel = [7.3818, 0.3724, 2.1691, -0.0677, -0.0565, -0.1236, 0.3181, -0.2634, -0.2349]
     for name, expected in counts.items():
         with torch.inference_mode():
-            logits = net(*images(*read_packed(folder / f"{name}.png"))).logits
+            logits = net(*images(*read_packed(folder / f"{name}.png", ""))).logits
         assert torch.bincount(logits[0].argmax(0).flatten(), minlength=9).tolist() == expected
         if name == "01477D":
             assert logits[0, :, 240, 320].tolist() == pytest.approx(pixel, abs=6e-5)

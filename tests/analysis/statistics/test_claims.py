@@ -223,6 +223,7 @@ def test_blocks_are_neighbours_in_name_within_day_and_night() -> None:
     np.testing.assert_allclose(blocks.mean(np.arange(10.0))[0], 4.5)
 
 
+@pytest.mark.slow
 def test_draws_depend_on_the_seed_alone() -> None:
     stats = made(images=IMAGES, **as_the_paper_says())
     assert claims(stats, seed=3) == claims(stats, seed=3)

@@ -110,6 +110,7 @@ def test_starting_and_asking_do_not_wait_for_the_command(place: Place) -> None:
     assert code(job) == 0
 
 
+@pytest.mark.slow
 def test_a_loop_with_two_slots_never_has_three_unfinished_jobs(place: Place) -> None:
     left = [f"job{index}" for index in range(6)]
     running: dict[str, SubmititJob] = {}
