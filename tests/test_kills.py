@@ -16,6 +16,7 @@ import pytest
 
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
+from rgbt.tracking.folder import RunFolder
 from sweeps.running.executors import LocalExecutor, LocalJob
 from tests.commands import only_run
 from tests.conftest import write_data
@@ -128,7 +129,9 @@ def files(folder: Path) -> set[Path]:
 def check(bench: Bench, place: Path) -> None:
     """The run in `place` is as the undisturbed one, and nothing else is left."""
     folder, straight = only_run(place), bench.undisturbed
-    result, expected = (json.loads((f / "result.json").read_text()) for f in (folder, straight))
+    result, expected = (RunFolder(each).result() for each in (folder, straight))
+    assert result is not None
+    assert expected is not None
     for one in (result, expected):
         del one["seconds_of_last_process"], one["name"]  # the name says how many workers
     assert result == expected
