@@ -37,6 +37,7 @@ from rgbt.session import (
     result_tables,
     view_of,
 )
+from rgbt.stopping import deferred
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
@@ -154,8 +155,8 @@ class Run:
         self._claim(session)
         shown = self.description
         tags = {**shown.tags, "rgbt.key": self.folder.path.name}
-        self.tracking.start(self.folder, shown.name, tags, shown.params)
         try:
+            self.tracking.start(self.folder, shown.name, tags, shown.params)
             state = self._train(session)
             checkpoints = Checkpoints(self.folder.path)
             best = checkpoints.load_best(state.best_step)
@@ -171,7 +172,8 @@ class Run:
             # A run that stops on an error is shown as failed, not as running for ever.
             self.tracking.finish("FAILED")
             raise
-        self.tracking.finish("FINISHED")
+        with deferred():  # a signal must not leave a finished run as running in the store
+            self.tracking.finish("FINISHED")
 
     def _finish(
         self, session: Session, state: State, seconds: float, pairs: Mapping[str, ConsistencyTable]

@@ -8,7 +8,7 @@ from typing import Any
 
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_client import Store
-from rgbt.tracking.replaced import description_of
+from rgbt.tracking.replaced import description_of, key_of
 
 NAME_LENGTH = 250
 """Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
@@ -59,7 +59,7 @@ def new_run(store: Store, folder: RunFolder) -> Any:
 
 def identity(folder: RunFolder) -> dict[str, str]:
     """Tags by which a run is found again, set in the call that makes it."""
-    return {"rgbt.key": folder.path.name, "rgbt.folder": str(folder.path)}
+    return {"rgbt.key": key_of(folder), "rgbt.folder": str(folder.path)}
 
 
 def short_name(name: str) -> str:
