@@ -167,7 +167,7 @@ BAD_OVERRIDES = {
     "no override": (["learning rate 3"], "expected key=value"),
     "unknown selection split": (["trainer.selection_split=vall"], "no split 'vall'"),
     "not a number": (["trainer.clip_norm=nan"], "'trainer.clip_norm' must be a number above 0"),
-    "picture of a run": (["out=x.png"], "leave `out` away"),
+    "picture of a run": (["out=x.png"], "omit out=..."),
     "missing root": (["dataset=mfnet", "~dataset.root"], "'dataset.root'"),
     "root without value": (["dataset=mfnet", "dataset.root=???"], "'dataset.root' has no value"),
     "no such folder": (["dataset.root=/no/such"], "dataset.root: there is no folder '/no/such'"),
@@ -285,7 +285,7 @@ def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, runs:
     (data / "train.txt").write_text("\n".join(SPLITS["train"][:-1]) + "\n")
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
     assert code == 2
-    assert_one_sentence(err, "was begun on other images")
+    assert_one_sentence(err, "was started on other images")
 
 
 def test_a_replaced_file_is_mentioned_and_the_run_goes_on(

@@ -1,6 +1,6 @@
 """Finished runs that were replaced by another training of the same key (``fresh=true``).
 
-They lie in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
+They are in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
 no second seed for what looks at the runs of a folder.
 """
 

@@ -97,14 +97,16 @@ def sync_all(options: dict[str, str]) -> int:
     """
     stores: dict[tuple[str, str], MlflowTracking] = {}
     failed = 0
+    # What is wrong with one of many folders must not keep the others from being sent.
+    raised: tuple[type[InputError], ...] = (InputError,) if "run" in options else ()
     for folder in folders_of(options):
         try:
             named = tracking_of(folder, options)
             tracking = stores.setdefault((named.uri, named.experiment), named)
             run_id = tracking.sync(folder, status_of(folder))
-        except Exception as error:  # A store may fail in any way; the other folders are still sent.
-            if isinstance(error, InputError) and "run" in options:
-                raise
+        except raised:
+            raise
+        except Exception as error:  # A store may fail in any way; the next folder may be sent.
             failed += 1
             reason = without_passwords((str(error).splitlines() or [""])[0]).rstrip(".")
             sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
