@@ -536,7 +536,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "found before earlier runs are trained": (
         ["multi_head_night", "scheme.weight=-1"],
-        "scheme.weight must lie in",
+        "'scheme.weight' must be a number from 0",
     ),
     "found before a teacher is trained": (
         ["multi_head_night_stage1", "masker=square"],

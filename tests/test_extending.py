@@ -130,16 +130,16 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     code, _, err = call(main, *words_of(lab))
     assert code == 0, err
     run = only_run(lab / "runs")
-    assert json.loads((run / "result.json").read_text())["name"].startswith("mine ")
+    assert json.loads((run / "result.json").read_text())["name"].endswith(" · mine")
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert {"loss/clean_focal", "loss/masked_focal"} <= lines[0]["values"].keys()
     code, _, err = call(sketch.main, *words_of(lab), f"out={lab / 'masks.png'}")
     assert code == 0, err
     assert (lab / "masks.png").is_file()
-    words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5")
+    words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
     code, _, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
     assert code == 0, err
-    words = (f"run={run}", "input=test", f"out={lab / 'out'}")
+    words = (f"run={run}", "input=test", f"out={lab / 'out'}", "trust=my_lab")
     code, _, err = call(plain_command(predict.OWN, predict.main), *words)
     assert code == 0, err
     code, _, err = call(plain_command(predict.OWN, predict.main), *words, f"input={lab}")

@@ -421,7 +421,7 @@ def test_images_that_cannot_be_read(root: Path, tmp_path: Path) -> None:
 
 def test_predictions_that_are_not_finite_are_refused(session: Session, tmp_path: Path) -> None:
     session.model.shift.data.fill_(float("nan"))
-    with pytest.raises(RunError, match="'00001D' are not finite"):
+    with pytest.raises(RunError, match="'00001D': the network's class scores are NaN"):
         written(session, tmp_path / "out")
 
 

@@ -364,7 +364,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
         (f"run={folder}", "data.batch_siz=1"): "did you mean 'data.batch_size'?",
         (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",
         (f"run={folder}", "model=mask2former_swin_t"): "'model' cannot be changed",
-        (f"run={folder}", "data.eval_batch_size=[1"): "cannot be read as a value",
+        (f"run={folder}", "data.eval_batch_size=[1"): "data.eval_batch_size cannot be read as YAML",
         (): "'run' has no value",
     }
     for arguments, sentence in cases.items():

@@ -211,5 +211,6 @@ def test_a_degradation_file_of_others_runs_nothing(tmp_path: Path, lab: Path) ->
     path.write_text("_target_: my_lab.Plain\nwidth: 2\n")
     with pytest.raises(InputError, match="add trust=my_lab"):
         choose(str(path))
-    assert choose(str(path), trust=("my_lab",)).degradation.width == 2
+    with pytest.raises(InputError, match="Plain has no attribute"):  # it was built
+        choose(str(path), trust=("my_lab",))
     assert not (tmp_path / "marker").exists()

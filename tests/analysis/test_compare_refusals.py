@@ -73,7 +73,7 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
     ("argument", "sentence"),
     [
         ("metrics=mIuo", "'mIuo' is not a metric; did you mean 'mIoU'?"),
-        ("metrics=", "'' is not a metric"),
+        ("metrics=", "'': expected metrics, with commas between them."),
         ("metrics=region/9", "the counts have the regions 1 to 2"),
         ("metrics=class/cat", "did you mean 'car'?"),
         ("metrics=night/mIoU", "does not hold images of day and of night"),

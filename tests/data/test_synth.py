@@ -436,6 +436,7 @@ def test_the_yaml_names_every_setting_with_its_default() -> None:
     from rgbt.config import compose
 
     node = dict(compose(["dataset=synth"]).dataset)
+    assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.dataset.synth"
     parameters = inspect.signature(synth).parameters
     assert node == {name: parameter.default for name, parameter in parameters.items()}

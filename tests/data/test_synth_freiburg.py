@@ -239,6 +239,7 @@ def test_settings_of_the_reader_are_passed_on(data: Freiburg) -> None:
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_freiburg"]).dataset, resolve=True)
+    assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.freiburg.synth_freiburg"
     parameters = inspect.signature(synth_freiburg).parameters
     defaults = {name: parameter.default for name, parameter in parameters.items()}

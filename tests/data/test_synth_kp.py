@@ -207,6 +207,7 @@ def test_every_class_that_there_is_is_often_seen(scenes: list[Scene]) -> None:
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_kp"]).dataset, resolve=True)
+    assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.kp.synth_kp"
     parameters = inspect.signature(synth_kp).parameters
     assert node == {name: parameter.default for name, parameter in parameters.items()}

@@ -140,6 +140,7 @@ def test_a_bag_that_is_not_there_is_named(data: PST900) -> None:
 
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_pst900"]).dataset, resolve=True)
+    assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.pst900.synth_pst900"
     parameters = inspect.signature(synth_pst900).parameters
     defaults = {name: parameter.default for name, parameter in parameters.items()}

@@ -359,9 +359,7 @@ def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
     said = capsys.readouterr().err
     assert said.count("waiting for process") == 2, "at the start and at the end"
     assert said.count("cannot be used") == 1
-    assert re.search(
-        r"StoreBusyError: process \d+ on .* has held .*mlflow\.db\.lock for 0.3 s", said
-    )
+    assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
     assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
     assert sync.main([f"run={folder.path}"]) == 0
     assert run_id(folder)
