@@ -94,9 +94,12 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         folder = RunFolder(path)
         with folder.lock():
             Run(prepared, folder, tracking, asked).complete()
+    _show_result(folder, tracking, build(config.domains))
+
+
+def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
-    domains: Domains = build(config.domains)
     heads = domains.told(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
     show(result_view(ResultTables.from_json(tables), folder.path, links))
