@@ -298,7 +298,7 @@ def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
     assert cv2.imwrite(str(corrupted_and_repaired), image)
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
     assert code == 0, err
-    assert "have changed since this run was begun" in err
+    assert "have changed since this run was started" in err
 
 
 def test_evaluate_and_predict_a_stored_run(
@@ -398,10 +398,10 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
 
     monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
     code, _, err = train(
-        call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
+        call, data, tmp_path, "-m", "+experiment=grbm", "masker.patch_size=40,32,64", *short(1)
     )
     assert code == 1
-    assert "1 of 3 points failed, first sigma_div=0: 'masker.sigma_div' must be" in err
+    assert "1 of 3 points failed, first patch_size=40: " in err
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 
