@@ -23,13 +23,18 @@ class InputError(ValueError):
 
 
 class RunError(RuntimeError):
-    """A run that cannot go on (a loss that is no longer finite): one sentence, exit code 1."""
+    """A run that cannot continue (a loss that is no longer finite): one sentence, exit code 1."""
+
+
+def without_controls(text: str) -> str:
+    """`text` with "?" for control characters, such as codes of a terminal; new lines are kept."""
+    return "".join(each if each.isprintable() or each == "\n" else "?" for each in text)
 
 
 def one_line(text: object) -> str:
     """`text` in one line without control characters, at most 200 characters long."""
     words = " ".join(str(text).split())
-    plain = "".join(each if each.isprintable() else "?" for each in words).rstrip(".")
+    plain = without_controls(words).rstrip(".")
     return plain if len(plain) <= 200 else f"{plain[:197]}..."
 
 
@@ -115,7 +120,7 @@ def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[s
 def check_members(
     key: str, part: object, attributes: Iterable[str], calls: Mapping[str, Sequence[str]]
 ) -> None:
-    """Refuse a part of somebody's own that lacks what the lab uses of it.
+    """Refuse a user's part that lacks what the lab uses of it.
 
     Args:
         key: node of the configuration that names it, for the message.

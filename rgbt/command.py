@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from rgbt.checks import InputError, RunError, nearest
+from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config import build, check, check_node, compose, conf_dir, register_resolvers
 from rgbt.overrides import check_words, hydra_sentence
 from rgbt.resources import reporting_exhaustion
@@ -143,9 +143,8 @@ def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> 
 def _say(sentence: str, code: int) -> int:
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
-    # Names of files and words of damaged files may hold anything, such as codes of a terminal.
-    plain = "".join(each if each.isprintable() or each == "\n" else "?" for each in sentence)
-    sys.stderr.write(f"rgbt: {plain}\n")
+    # Names of files and words of damaged files may hold anything.
+    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
     return code
 
 

@@ -3,7 +3,7 @@
 The schema of a node is the constructor that its ``_target_`` names: keys and values are checked
 against the constructor's signature and annotations before anything is built, so that a misspelt
 key in an experiment file or after ``+`` is refused as well (Hydra lets both through). Ranges are
-part of the annotations (`rgbt.checks`).
+part of the annotations (`rgbt.ranges`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What objects of one's own must be: checked where they enter the lab, one sentence each.
+"""What a user's own parts must be: checked where they enter the lab, one sentence each.
 
 Classes of this package are tested, and pass unchecked; others are compared with `rgbt.types` and
 with `rgbt.data.dataset` before a training starts, and what they return the first time they are
@@ -33,7 +33,7 @@ EXAMPLE = ("rgb", "thermal", "label", "centre_yx", "position", "original_hw", "n
 
 
 def is_own(part: object) -> bool:
-    """Whether a part is somebody's own, not of this package."""
+    """Whether a part is the user's own, not of this package."""
     return type(part).__module__.partition(".")[0] != "rgbt"
 
 
@@ -160,7 +160,7 @@ def check_degradation(kind: Any) -> None:
 
 
 def watch_model(model: nn.Module, num_classes: int) -> None:
-    """Compare what a network of one's own returns, in its first training and evaluation pass.
+    """Compare what a user's network returns, in its first training and evaluation pass.
 
     Raises:
         InputError: its `forward` does not take what it is called with; later, from the pass: it
@@ -199,7 +199,7 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
 
 
 class CheckedLoss:
-    """A loss of one's own; what it returns the first time is compared with `rgbt.types.Loss`.
+    """A user's loss; what it returns the first time is compared with `rgbt.types.Loss`.
 
     Args:
         loss: what is called; all its attributes are those of this object.
@@ -228,7 +228,7 @@ class CheckedLoss:
 
 
 class CheckedScheme:
-    """A scheme of one's own, whose phases are compared with `rgbt.types.Phase`.
+    """A user's scheme, whose phases are compared with `rgbt.types.Phase`.
 
     Args:
         scheme: what yields them; all its attributes are those of this object.

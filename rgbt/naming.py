@@ -41,7 +41,7 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
     """How the run is shown: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
 
     Only what differs from the experiment is named. Of a point of a sweep, what is common to all
-    points stands behind the experiment: "sigma_div=2 seed=1 · grbm max_steps=9". Keys are cut to
+    points follows the experiment: "sigma_div=2 seed=1 · grbm max_steps=9". Keys are cut to
     their last part where only one key of the configuration ends with it.
 
     Args:
@@ -121,7 +121,7 @@ def _ending(end: str, params: Mapping[str, str]) -> set[str]:
 
 
 def _resolved(value: str, key: str, params: Mapping[str, str]) -> str:
-    """A value as typed, but for references, which are shown as what they stand for."""
+    """A value as typed, but for references, which are shown as their values."""
     factor = params.get("scale.pixel_factor")
     if factor is not None:
         value = with_pixels(value, float(factor))
@@ -140,7 +140,7 @@ def _name(config: DictConfig, words: Mapping[str, tuple[str, str]], varied: Sequ
 
 
 def _short(value: str) -> str:
-    """A value without quotes; a long one cut in the middle, and told apart by a digest."""
+    """A value without quotes; a long one cut in the middle, and kept distinct by a digest."""
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         value = value[1:-1]
     if len(value) <= VALUE_LENGTH:

@@ -32,7 +32,7 @@ def start(model: nn.Module, config: DictConfig) -> Report | None:
         if fresh:
             raise InputError(
                 f"model.fresh=[{','.join(fresh)}] keeps parts of a network whose weights come from "
-                "a file; name that with model.weights=..., or leave model.fresh away."
+                "a file; name that with model.weights=..., or omit model.fresh."
             )
         return None
     report = load_weights(model, source, fresh)

@@ -1,4 +1,4 @@
-"""What is found by reading one sample, or drawing one mask, before a run is begun."""
+"""Problems that one sample or one mask shows, checked before a run starts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def example_hw(session: Session) -> tuple[int, int]:
 
 
 def check_own_parts(session: Session) -> None:
-    """Refuse a data set, transform or partition of one's own that does not do what it must.
+    """Refuse a user's data set, transform or partition that does not do what it must.
 
     Raises:
         InputError: in the words of `rgbt.contracts`.
@@ -53,10 +53,10 @@ def check_own_parts(session: Session) -> None:
 
 
 def check_cells(session: Session, masker: Masker) -> None:
-    """Draw one mask, so that cells that do not fit the crop are told before the run is begun.
+    """Draw one mask, so that cells that do not fit the crop are reported before the run starts.
 
     Raises:
-        InputError: they do not, or a masker of one's own is none.
+        InputError: they do not, or a user's masker is none.
     """
     crop_hw = getattr(session.transform, "crop_hw", None)
     if crop_hw is None and is_own(masker):

@@ -28,7 +28,7 @@ Used = tuple[str, str]
 
 
 _used_by: dict[str, tuple[Used, ...]] = {}
-"""What each module used when this process first asked."""
+"""What each module used when this process first read it."""
 
 
 def user_code(targets: Iterable[str]) -> tuple[Used, ...]:

@@ -163,10 +163,10 @@ def _tell_other_splits(folder: Path, trained_on: str | None, session: Session) -
     if trained_on is None or session.config.dataset.get("name") != trained_on:
         return
     try:
-        now, begun = names_key(session), read_marker(folder)
+        now, before = names_key(session), read_marker(folder)
     except (InputError, OSError):
         return  # nothing to compare with
-    if begun is not None and now != begun["names"]:
+    if before is not None and now != before["names"]:
         tell(
             f"the splits of {session.dataset.name} ({session.dataset.root}) are not those that "
             f"{folder.name} was trained with: what is measured now may hold images of its training."

@@ -19,7 +19,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, split_list
 from rgbt.config import NODES, conf_dir, constructor
 from rgbt.yaml_files import read_yaml
 
@@ -113,7 +113,7 @@ def parse_trust(text: str) -> tuple[str, ...]:
     Raises:
         InputError: a word is not a dotted name.
     """
-    words = [word.strip() for word in text.strip("[]").split(",") if word.strip()]
+    words = split_list(text, "modules") if text else []
     for word in words:
         if not DOTTED.fullmatch(word):
             raise InputError(

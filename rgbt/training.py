@@ -37,6 +37,7 @@ from rgbt.session import (
     result_tables,
     view_of,
 )
+from rgbt.stopping import deferred
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
@@ -50,7 +51,7 @@ from rgbt.transforms.view_sets import ViewSets
 from rgbt.two_frames import consistency_table, consistency_values, count_pairs
 
 MUCH_WAITING = 0.3
-"""Share of a step spent waiting for images above which the user is told."""
+"""Share of a step spent waiting for images above which a sentence says so."""
 
 
 def is_finished(config: DictConfig) -> bool:
@@ -70,9 +71,9 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         RunError: the run cannot go on.
     """
     if config.out is not None:
-        raise InputError(f"out={config.out}: a run is written to runs_dir=...; leave `out` away.")
+        raise InputError(f"out={config.out}: a run is written to runs_dir=...; omit out=...")
     fresh, config = config.fresh, config.copy()
-    config.fresh = False  # it is asked of this command, and no property of the run
+    config.fresh = False  # a request to this command, no property of the run
     path = Path(config.runs_dir) / run_key(config)
     asked = describe(config, overrides)
     tracking: Tracking = build(config.tracking)
@@ -93,9 +94,12 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         folder = RunFolder(path)
         with folder.lock():
             Run(prepared, folder, tracking, asked).complete()
+    _show_result(folder, tracking, build(config.domains))
+
+
+def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
-    domains: Domains = build(config.domains)
     heads = domains.told(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
     show(result_view(ResultTables.from_json(tables), folder.path, links))
@@ -154,8 +158,8 @@ class Run:
         self._claim(session)
         shown = self.description
         tags = {**shown.tags, "rgbt.key": self.folder.path.name}
-        self.tracking.start(self.folder, shown.name, tags, shown.params)
         try:
+            self.tracking.start(self.folder, shown.name, tags, shown.params)
             state = self._train(session)
             checkpoints = Checkpoints(self.folder.path)
             best = checkpoints.load_best(state.best_step)
@@ -171,7 +175,8 @@ class Run:
             # A run that stops on an error is shown as failed, not as running for ever.
             self.tracking.finish("FAILED")
             raise
-        self.tracking.finish("FINISHED")
+        with deferred():  # a signal must not leave a finished run as running in the store
+            self.tracking.finish("FINISHED")
 
     def _finish(
         self, session: Session, state: State, seconds: float, pairs: Mapping[str, ConsistencyTable]
@@ -210,18 +215,18 @@ class Run:
         return scores.summary(Counts.load(path), session.regions.absent)
 
     def _claim(self, session: Session) -> None:
-        """Write what identifies the run; refuse a folder that was begun on other images."""
+        """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
         found = {"names": names_key(session), "files": dataset.fingerprint()}
-        begun = self.folder.marker() or found
-        if begun["names"] != found["names"]:
+        before = self.folder.marker() or found
+        if before["names"] != found["names"]:
             raise InputError(
-                f"{self.folder.path} was begun on other images than the lists of {dataset.root} "
-                "name; give the runs another folder (runs_dir=...), or the data set another name "
-                "(dataset.name=...)."
+                f"{self.folder.path} was started on other images than the lists of "
+                f"{dataset.root} name; give the runs another folder (runs_dir=...), or the data "
+                "set another name (dataset.name=...)."
             )
-        if begun["files"] != found["files"]:
-            tell(f"files of {dataset.root} have changed since this run was begun.")
+        if before["files"] != found["files"]:
+            tell(f"files of {dataset.root} have changed since this run was started.")
         self.folder.mark(**found)
         config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
         self.folder.write_config(config)
@@ -313,7 +318,7 @@ class Run:
         return trainer
 
     def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
-        """TC and CA of the best checkpoint under "val" and "test", as far as asked for."""
+        """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
         tables: dict[str, ConsistencyTable] = {}
         for kind in session.consistency.splits if session.consistency.sets else ():
             split = session.trainer.selection_split if kind == "val" else kind

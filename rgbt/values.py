@@ -1,7 +1,7 @@
 """One value of a configuration against its annotation: type and range, refused in one sentence.
 
 The range of a setting is declared once, in the annotations of the constructor that takes it
-(aliases in `rgbt.checks`); sentences are made of these annotations. Part of `rgbt.config`.
+(aliases in `rgbt.ranges`); sentences are made of these annotations. Part of `rgbt.config`.
 """
 
 from __future__ import annotations

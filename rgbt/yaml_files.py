@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 from omegaconf._utils import get_yaml_loader  # private: its rules for numbers are those of Hydra
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, one_line
 
 MOST_BYTES = 1_000_000
 MOST_NODES = 10_000
@@ -87,8 +87,7 @@ def parse_yaml(text: str, source: str) -> Any:
             f"{source} cannot be read as YAML: line {mark.line + 1}: {reason}."
         ) from error
     except (yaml.YAMLError, ValueError) as error:  # ValueError: an integer of 5,000 digits
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"{source} cannot be read as YAML: {reason}.") from error
+        raise InputError(f"{source} cannot be read as YAML: {one_line(error)}.") from error
 
 
 def _error(reason: str, node: yaml.Node) -> yaml.YAMLError:

@@ -93,7 +93,7 @@ def _refuse_what_is_for_searches(settings: Settings) -> None:
     for key in (key for key, is_given in given.items() if is_given):
         raise InputError(
             f"hydra.sweeper.{key} is for searches, and nothing is searched here; give a range "
-            "(optimizer.lr=interval(0.001,0.01) or +search=...), or leave it away."
+            "(optimizer.lr=interval(0.001,0.01) or +search=...), or omit it."
         )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rgbt.budgets import read_json
 from rgbt.config import compose
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
@@ -24,7 +25,7 @@ UNMEASURED = (*TEMPORAL, "consistency=none")
 
 
 def read(folder: Path, name: str) -> Any:
-    return json.loads((folder / name).read_text())
+    return read_json(folder / name, dict[str, Any], "")
 
 
 def counts_of(path: Path) -> np.ndarray:

@@ -9,7 +9,7 @@ import resource
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +254,22 @@ def run_folder(folder: Path) -> Any:
     return run
 
 
+def sent(folder: Path) -> Path:
+    from rgbt.tracking.mlflow_fill import Sent, write_sent
+
+    run = run_folder(folder)
+    noted = Sent("sqlite:///runs/mlflow.db", "rgbt", experiment_id="1", run_id="0f3a" * 8)
+    write_sent(run, replace(noted, steps={"train": 50}, files={"config.yaml": "ab" * 32}))
+    return Path(run.path / "mlflow.json")
+
+
+def read_sent(path: Path) -> Any:
+    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.mlflow_fill import read_sent as read
+
+    return plain(read(RunFolder(path.parent)))
+
+
 def in_run(name: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         return Path(run_folder(folder).path / name)
@@ -496,6 +512,7 @@ KINDS = {
         Kind("run.json", in_run("run.json"), of_run("description")),
         Kind("tables.json", in_run("tables.json"), of_run("tables")),
         Kind("provenance.json", in_run("provenance.json"), of_run("provenance")),
+        Kind("mlflow.json", sent, read_sent),
         Kind("dataset.json", marker, read_marker),
         Kind("pseudo_labels.json", pseudo, read_pseudo),
         Kind("pseudo-label", lambda f: pseudo(f).parent / "labels" / "a.png", read_pseudo),

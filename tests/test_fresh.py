@@ -1,4 +1,4 @@
-"""Results and the code that made them: what is said, and fresh=true."""
+"""Results and the code that made them: the warnings, and fresh=true."""
 
 from __future__ import annotations
 
@@ -31,9 +31,8 @@ def runs(trained: Trained, tmp_path: Path) -> Path:
 
 def pretend(folder: Path, **changes: Any) -> None:
     """The first process of the run ran other code."""
-    path = folder / "provenance.json"
-    first, *others = json.loads(path.read_text())
-    path.write_text(json.dumps([{**first, **changes}, *others]))
+    first, *others = RunFolder(folder).provenance()
+    (folder / "provenance.json").write_text(json.dumps([{**first, **changes}, *others]))
 
 
 def test_fresh_trains_again_what_other_code_made_and_keeps_it(

@@ -167,7 +167,7 @@ BAD_OVERRIDES = {
     "no override": (["learning rate 3"], "expected key=value"),
     "unknown selection split": (["trainer.selection_split=vall"], "no split 'vall'"),
     "not a number": (["trainer.clip_norm=nan"], "'trainer.clip_norm' must be a number above 0"),
-    "picture of a run": (["out=x.png"], "leave `out` away"),
+    "picture of a run": (["out=x.png"], "omit out=..."),
     "missing root": (["dataset=mfnet", "~dataset.root"], "'dataset.root'"),
     "root without value": (["dataset=mfnet", "dataset.root=???"], "'dataset.root' has no value"),
     "no such folder": (["dataset.root=/no/such"], "dataset.root: there is no folder '/no/such'"),
@@ -285,7 +285,7 @@ def test_runs_on_other_files_do_not_share_a_folder(call: Call, data: Path, runs:
     (data / "train.txt").write_text("\n".join(SPLITS["train"][:-1]) + "\n")
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
     assert code == 2
-    assert_one_sentence(err, "was begun on other images")
+    assert_one_sentence(err, "was started on other images")
 
 
 def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
@@ -298,7 +298,7 @@ def test_a_replaced_file_is_mentioned_and_the_run_goes_on(
     assert cv2.imwrite(str(corrupted_and_repaired), image)
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
     assert code == 0, err
-    assert "have changed since this run was begun" in err
+    assert "have changed since this run was started" in err
 
 
 def test_evaluate_and_predict_a_stored_run(
@@ -398,10 +398,10 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
 
     monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
     code, _, err = train(
-        call, data, tmp_path, "-m", "+experiment=grbm", "masker.sigma_div=0,1,2", *short(1)
+        call, data, tmp_path, "-m", "+experiment=grbm", "masker.patch_size=40,32,64", *short(1)
     )
     assert code == 1
-    assert "1 of 3 points failed, first sigma_div=0: 'masker.sigma_div' must be" in err
+    assert "1 of 3 points failed, first patch_size=40: " in err
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 

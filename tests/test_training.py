@@ -74,6 +74,31 @@ def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
     assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
 
 
+def test_a_run_that_is_stopped_while_its_tracking_begins_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow(NoTracking):
+        """A store that a signal comes before."""
+
+        ended = ""
+
+        def update(self) -> None:
+            raise KeyboardInterrupt
+
+        def start(self, *arguments: Any) -> None:
+            super().start(*arguments)
+            self.update()
+
+        def finish(self, status: str) -> None:
+            self.ended = status
+
+    tracking, prepared = Slow(), cast(Any, SimpleNamespace(session=None))
+    monkeypatch.setattr(Run, "_claim", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        Run(prepared, RunFolder(tmp_path), tracking, Description("a", {}, {})).complete()
+    assert tracking.ended == "KILLED"
+
+
 @pytest.mark.parametrize(
     ("saved", "said"),
     [

@@ -127,7 +127,7 @@ def test_networks_with_random_parts_are_not_scored(
     assert_one_sentence(err, "checkpoint=last is one of a run")
     code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.fresh=[decode1]")
     assert code == 2
-    assert_one_sentence(err, "or leave model.fresh away")
+    assert_one_sentence(err, "or omit model.fresh")
 
 
 def test_a_network_of_one_image_is_scored_from_it(call: Call, data: Path, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def verified(
     found = {name: _place(buffer, entry) for name, entry in listed.items()}
     if sum(end - start for start, end in found.values()) > len(buffer):
         raise RefusedError.greedy()
-    # torch writes no checksums at all where it was told so (set_crc32_options).
+    # torch writes no checksums where they are disabled (set_crc32_options).
     if not _check_digest(buffer) and any(entry.CRC for entry in listed.values()):
         for name, entry in listed.items():
             _check_sum(buffer, found[name], entry.CRC)

@@ -55,7 +55,7 @@ def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
     """
     try:
         yield
-    except InputError:  # a ValueError too, and said already
+    except InputError:  # a ValueError too, with its own sentence
         raise
     except RefusedError as refusal:
         raise InputError(f"{path} {refusal}") from refusal
@@ -72,7 +72,7 @@ def read_stored(path: Path) -> tuple[Any, str]:
     Tensors are `Strided` or `Array`, objects of known classes `Inert`.
 
     Raises:
-        RefusedError: it asks for code, for far more memory than it has bytes, or is another kind of
+        RefusedError: it requests code, for far more memory than it has bytes, or is another kind of
             file.
         DamagedError: one of `DAMAGE`: it is cut short or overwritten.
     """

@@ -151,7 +151,7 @@ class Domains:
             if asked != "own":
                 raise InputError(
                     f"head={asked} chooses between the heads of two domains, but this run has one "
-                    "for all images; leave it away."
+                    "for all images; omit it."
                 )
             return heads[0] if heads else None
         if asked == "own":

@@ -239,7 +239,7 @@ def _decode(path: Path) -> Array:
 def _decoded(data: bytes, path: Path) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:  # a header that asks for more pixels than there can be
+    except cv2.error as error:  # a header that announces more pixels than there can be
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError(f"{path} cannot be decoded, its pixels do not fit") from error
         image = None

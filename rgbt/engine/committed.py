@@ -161,7 +161,7 @@ class Checkpoints:
         return f"remove {self.folder} and rerun the command to train the run from its start."
 
     def _publish(self, step: int) -> None:
-        """Let the names that others read stand for the files of the best step."""
+        """Let the names that others read refer to the files of the best step."""
         for source in (self._by_step / str(step)).glob("*"):
             _link(source, self.folder / source.name)
 

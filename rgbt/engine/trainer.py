@@ -164,7 +164,7 @@ class Trainer:
                 self._save_when_due(state)
 
     def _save_when_due(self, state: State) -> None:
-        """Evaluate and save where this step asks for it; save and stop where a signal came."""
+        """Evaluate and save where this step is due; save and stop where a signal came."""
         is_last = state.step == self.settings.max_steps
         due = is_last or state.step % self.settings.eval_every == 0
         due = due and state.evaluated_step < state.step

@@ -1,4 +1,4 @@
-"""What a masker must be, and what it must return: for maskers of one's own."""
+"""What a masker must be, and what it must return: for a user's own maskers."""
 
 from __future__ import annotations
 

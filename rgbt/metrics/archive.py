@@ -57,7 +57,7 @@ class Archive:
         advice: how such a file is made.
         members: name -> kinds of numbers (`numpy.dtype.kind`) and sizes by letter: "iu N R K K".
             Equal letters are equal sizes, digits are sizes themselves; a name that ends in "/"
-            stands for all that begin so.
+            means all that begin so.
         optional: names of members that files of earlier versions lack.
     """
 

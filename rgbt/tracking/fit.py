@@ -10,7 +10,7 @@ SHORTEST = 16
 """Characters that a label keeps at least; columns are folded before it gets shorter."""
 
 SHARES = (0.5, 0.75, 0.25, 1.0, 0.0)
-"""Parts of what is kept of a label that stand before its cut, the preferred one first."""
+"""Parts of what is kept of a label that precede its cut, the preferred one first."""
 
 LETTERS = re.compile(r"[^\W\d]{3,}")
 KEYS = re.compile(r"[0-9a-f]{12}( [0-9a-f]{12})*")
@@ -33,7 +33,7 @@ def shortened(labels: Sequence[str], widths: Sequence[int]) -> tuple[str, ...]:
     """Labels of at most so many characters, cut inside; those that differ still do.
 
     Cut in the middle, or where that would make two labels equal nearer to an end. Where every cut
-    does, a number in its place tells them apart.
+    does, a number in its place distinguishes them.
 
     Args:
         labels: of any length.

@@ -26,7 +26,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,13 +140,13 @@ class RunFolder:
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
-        earlier = [sealed(each) for each in self.provenance()]
+        earlier = self.provenance()
         diff = entry.get("diff") or ""
         name = f"diff_{len(earlier) + 1}.patch" if earlier else "diff.patch"
         if diff:
             write_atomic(self.path / name, diff.encode())
         plain = {**entry, "diff": name if diff else None}
-        self._write_json("provenance.json", [*earlier, sealed(plain)])
+        self._write_provenance([*earlier, plain])
 
     def provenance(self) -> list[dict[str, Any]]:
         """Entries of all processes that worked on this run, first one first."""
@@ -155,7 +155,10 @@ class RunFolder:
     def begin_at(self, step: int) -> None:
         """Note the step at which the last process of `provenance` began."""
         entries = self.provenance()
-        self._write_json("provenance.json", [*entries[:-1], {**entries[-1], "from_step": step}])
+        self._write_provenance([*entries[:-1], {**entries[-1], "from_step": step}])
+
+    def _write_provenance(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        self._write_json("provenance.json", [sealed(each) for each in entries])
 
     def describe(self, description: Description) -> None:
         """Write how a tracker shall show this run."""

@@ -1,13 +1,13 @@
 """The JSON files of a run folder: which keys of which types each of them holds, and their readers.
 
-A mapping is written with a check sum (`rgbt.checks.sealed`), so that a damaged file is refused and
+A mapping is written with a check sum (`rgbt.budgets.sealed`), so that a damaged file is refused and
 gives no other value. Files of before there was one are read by their types alone.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Required
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
@@ -55,6 +55,20 @@ class ResultForm(TypedDict, total=False):
     skipped: list[str]
     val: dict[str, float | None]
     test: dict[str, float | None]
+
+
+class SentForm(TypedDict, total=False):
+    """``mlflow.json`` (`rgbt.tracking.mlflow_fill.Sent`)."""
+
+    uri: Required[str]
+    experiment: Required[str]
+    artifact_uri: str | None
+    experiment_id: str
+    run_id: str
+    steps: dict[str, int]
+    files: dict[str, str]
+    profile: bool
+    later: list[str]
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:

@@ -16,10 +16,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from rgbt.checks import InputError
+from rgbt.budgets import read_json, sealed
 from rgbt.metrics import names
 from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import MetricLine, RunFolder
+from rgbt.tracking.formats import SentForm
 from rgbt.tracking.mlflow_client import Store
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
 from rgbt.tracking.replaced import description_of
@@ -81,23 +82,15 @@ def read_sent(folder: RunFolder) -> Sent | None:
     Raises:
         InputError: the file is damaged.
     """
-    from pydantic import TypeAdapter, ValidationError
-
     path = folder.path / "mlflow.json"
-    if not path.exists():
-        return None
-    try:
-        return TypeAdapter(Sent).validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise InputError(
-            f"{path} is damaged ({error.errors()[0]['msg']}). Remove it: the MLflow run is then "
-            "found by its key."
-        ) from error
+    advice = "remove it: the MLflow run is then found by its key"
+    return Sent(**read_json(path, SentForm, advice)) if path.exists() else None
 
 
 def write_sent(folder: RunFolder, sent: Sent) -> None:
     """Remember what was sent."""
-    write_atomic(folder.path / "mlflow.json", json.dumps(asdict(sent), indent=1).encode())
+    text = json.dumps(sealed(asdict(sent)), indent=1)
+    write_atomic(folder.path / "mlflow.json", text.encode())
 
 
 def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:

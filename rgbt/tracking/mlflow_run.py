@@ -8,7 +8,7 @@ from typing import Any
 
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_client import Store
-from rgbt.tracking.replaced import description_of
+from rgbt.tracking.replaced import description_of, key_of
 
 NAME_LENGTH = 250
 """Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
@@ -36,7 +36,7 @@ def unnoted_run(store: Store, folder: RunFolder) -> Any:
     """A run made for this folder by a process that was killed before it noted the run's id.
 
     Without this look it would stay in the pages as running for ever. The time of the first start
-    keeps runs apart that are trained anew under one key.
+    keeps runs of one key apart that were trained from their start again.
     """
     started = f"attributes.start_time = {_start_time(folder)}"
     # Compared here: MLflow's search cannot quote every path.
@@ -46,7 +46,7 @@ def unnoted_run(store: Store, folder: RunFolder) -> Any:
 
 
 def new_run(store: Store, folder: RunFolder) -> Any:
-    """A run made for this folder, found again by `unnoted_run`."""
+    """A new run for this folder; `unnoted_run` finds it."""
     description = description_of(folder)
     assert description is not None, f"{folder.path}: describe() comes before fill()"
     return store.client.create_run(
@@ -58,8 +58,8 @@ def new_run(store: Store, folder: RunFolder) -> Any:
 
 
 def identity(folder: RunFolder) -> dict[str, str]:
-    """Tags by which a run is found again, set in the call that makes it."""
-    return {"rgbt.key": folder.path.name, "rgbt.folder": str(folder.path)}
+    """Tags by which `unnoted_run` finds a run, set in the call that makes it."""
+    return {"rgbt.key": key_of(folder), "rgbt.folder": str(folder.path)}
 
 
 def short_name(name: str) -> str:

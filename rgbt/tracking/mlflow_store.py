@@ -114,9 +114,9 @@ class MlflowTracking:
         params: Mapping[str, object],
     ) -> None:
         """Begin the MLflow run of `folder`, or continue the one it already has."""
+        self._folder = folder
         folder.describe(described(run_name, tags, params))
         write_sent(folder, self._sent(folder))
-        self._folder = folder
         self.update()
 
     def update(self) -> None:
@@ -181,6 +181,9 @@ class MlflowTracking:
         assert self._folder is not None, "start() comes first"
         try:
             self.sync(self._folder, status)
+        except InputError as error:
+            # A damaged file of the run: the store works, and the run repairs its log on resuming.
+            sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
         except Exception as error:  # The one border: a dead tracker never stops a training.
             self._quiet_until = time.monotonic() + PAUSE_S
             self._warn(error)

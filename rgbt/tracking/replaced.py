@@ -1,6 +1,6 @@
 """Finished runs that were replaced by another training of the same key (``fresh=true``).
 
-They lie in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
+They are in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
 no second seed for what looks at the runs of a folder.
 """
 
@@ -57,6 +57,12 @@ def runs_dir_of(folder: RunFolder) -> Path:
     return folder.path.parents[1 if _is_replaced(folder) else 0]
 
 
+def key_of(folder: RunFolder) -> str:
+    """The key of a run as a tracker shows it: `<key>`, or `replaced/<key>-<n>`."""
+    name = folder.path.name
+    return f"{REPLACED}/{name}" if _is_replaced(folder) else name
+
+
 def description_of(folder: RunFolder) -> Description | None:
     """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
     known = folder.description()
@@ -66,7 +72,7 @@ def description_of(folder: RunFolder) -> Description | None:
         **known.tags,
         TAG: "true",
         GROUP: f"{known.tags.get(GROUP, known.name)} (replaced)",
-        "rgbt.key": f"{REPLACED}/{folder.path.name}",
+        "rgbt.key": key_of(folder),
     }
     return replace(known, name=f"{known.name} (replaced)", tags=tags)
 

@@ -42,7 +42,7 @@ def parse(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def folders_of(options: dict[str, str]) -> list[RunFolder]:
-    """The run folders that were asked for.
+    """The run folders that are requested.
 
     Raises:
         InputError: the folder is missing or is no run folder.
@@ -57,7 +57,7 @@ def folders_of(options: dict[str, str]) -> list[RunFolder]:
 
 
 def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
-    """The store of one folder: as asked for, else the one it was started with, else the default.
+    """The store of one folder: as requested, else the one it was started with, else the default.
 
     Raises:
         InputError: the store needs a password, which is not kept in the folder.
@@ -90,19 +90,25 @@ def status_of(folder: RunFolder) -> Status:
 
 
 def sync_all(options: dict[str, str]) -> int:
-    """Send every folder; 1 if a store could not take one of them."""
+    """Send every folder; 1 if one of them could not be sent.
+
+    Raises:
+        InputError: see `folders_of`; of ``run=...`` also `tracking_of`, and a damaged file.
+    """
     stores: dict[tuple[str, str], MlflowTracking] = {}
     failed = 0
+    # What is wrong with one of many folders must not keep the others from being sent.
+    raised: tuple[type[InputError], ...] = (InputError,) if "run" in options else ()
     for folder in folders_of(options):
-        asked = tracking_of(folder, options)
-        tracking = stores.setdefault((asked.uri, asked.experiment), asked)
         try:
+            named = tracking_of(folder, options)
+            tracking = stores.setdefault((named.uri, named.experiment), named)
             run_id = tracking.sync(folder, status_of(folder))
-        except InputError:
+        except raised:
             raise
-        except Exception as error:  # Any store may fail in its own way; the next folder may do.
+        except Exception as error:  # A store may fail in any way; the next folder may be sent.
             failed += 1
-            reason = (str(error).splitlines() or [""])[0]
+            reason = without_passwords((str(error).splitlines() or [""])[0]).rstrip(".")
             sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
         else:
             sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")

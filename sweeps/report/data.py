@@ -141,7 +141,7 @@ def short_names(names: Collection[str]) -> dict[str, str]:
 
 
 def shown(value: object, pixel_factor: float | None = None) -> str:
-    """A parameter's value for people: four significant digits; ``${px:64}`` as what it stands for.
+    """A parameter's value for people: four significant digits; ``${px:64}`` as its value.
 
     Args:
         value: of a trial.

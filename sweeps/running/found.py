@@ -50,7 +50,7 @@ class Found:
         result = read_result(self.folder)
         if result is None or "dataset" not in result:
             raise InputError(
-                f"{self.folder / 'result.json'} is missing or says no data set; {ADVICE}."
+                f"{self.folder / 'result.json'} is missing or names no data set; {ADVICE}."
             )
         return result
 

@@ -178,7 +178,7 @@ class _Prepared:
     def _share_tags(self, study: str) -> None:
         """Points that are the same run in other words (1 and 1.0) get the tags of all of them.
 
-        Every run gets a colour of its own, and is told what its name begins with.
+        Every run gets its own colour, and the beginning of its name.
         """
         varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}

@@ -69,7 +69,7 @@ def _replayed(path: Path) -> optuna.storages.JournalStorage:
     except Exception as error:  # The border to Optuna, which assumes that a journal is whole.
         raise InputError(
             f"storage={path} is damaged ({type(error).__name__}: {one_line(error)}); restore it "
-            "from a copy, or remove it: finished runs are reused, other trials are begun anew."
+            "from a copy, or remove it: finished runs are reused, other trials start again."
         ) from error
 
 

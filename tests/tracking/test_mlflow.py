@@ -249,6 +249,17 @@ def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Pa
     assert [new.data.tags.get(key) for key in keys] == ["again", "grbm", None]
 
 
+def test_a_replaced_run_whose_id_was_not_noted_is_not_doubled(runs_dir: Path) -> None:
+    folder = unnoted(runs_dir, "replaced_unnoted")
+    conclude(folder)
+    replace_finished(folder, tracking(runs_dir))
+    kept = RunFolder(runs_dir / "replaced" / "replaced_unnoted-1")
+    first = run_id(kept)
+    (kept.path / "mlflow.json").unlink()
+    begin(kept, tracking(runs_dir))
+    assert run_id(kept) == first
+
+
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "deleted")
     NoTracking().start(folder, "grbm", TAGS, PARAMS)
@@ -306,6 +317,34 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     sent = read_sent(folder)
     assert sent is not None
     assert client(runs_dir).get_run(sent.run_id).info.status == "KILLED"
+
+
+@pytest.mark.parametrize("name", ["result.json", "mlflow.json", "metrics.jsonl"])
+def test_sync_of_all_folders_goes_on_behind_a_damaged_one(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for key in ("a", "b"):
+        begin(RunFolder(tmp_path / key), NoTracking())
+    (tmp_path / "a" / name).write_text("{\n")
+    assert sync.main([f"runs_dir={tmp_path}"]) == 1
+    output = capsys.readouterr()
+    assert f"rgbt: {tmp_path / 'a'} was not sent ({tmp_path / 'a' / name} is damaged" in output.err
+    assert f"{tmp_path / 'b'}  ->  MLflow run " in output.out
+    assert sync.main([f"run={tmp_path / 'a'}"]) == 2
+
+
+def test_a_damaged_log_is_no_failure_of_the_store(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, tracker = RunFolder(tmp_path / "key"), tracking(tmp_path)
+    (folder.path / "metrics.jsonl").write_text("{\n")
+    begin(folder, tracker)
+    assert "not sent to MLflow:" in capsys.readouterr().err
+    folder.truncate_after(0)
+    folder.append(5, "train", {"loss": 3.0})
+    tracker.update()
+    assert points(client(tmp_path), run_id(folder), "train/loss") == [(5, 3.0)]
+    assert capsys.readouterr().err == ""
 
 
 def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(

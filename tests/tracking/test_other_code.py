@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rgbt.budgets import SEAL
 from rgbt.tracking import other_code as module
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code, warn_of_result, warn_of_steps
@@ -73,6 +75,8 @@ def test_other_code_counts_for_processes_that_left_something(
     for number, step in enumerate(steps):
         folder.add_provenance({**(NOW if number else OTHER), "diff": ""})
         folder.begin_at(step)
+    entries = json.loads((folder.path / "provenance.json").read_text())
+    assert all(SEAL in entry for entry in entries), "the note keeps the check sums"
     assert (other_code(folder) is not None) == is_other
 
 

@@ -72,7 +72,7 @@ def check_cache(key: str, cache: object) -> None:
     if not isinstance(cache, str) or cache.strip().lower() in NO_FOLDERS:
         raise InputError(
             f"{key}: {cache!r} names no folder; expected auto or a folder (./NAME where it is "
-            f"called so), or leave {key} away."
+            f"called so), or omit {key}."
         )
 
 

@@ -285,7 +285,7 @@ class Folder:
         if shares is None and draw != (0, None):
             raise InputError(
                 "dataset.shares_seed and dataset.block are for dataset.shares, which is null; give "
-                "shares, or leave both away."
+                "shares, or omit both."
             )
         if shares is not None:
             return ByShare(self.frames, shares, *draw)
