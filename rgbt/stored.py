@@ -126,7 +126,7 @@ def open_run(
     if config.trainer.threads is None:  # of before it had a number: one thread per core
         config.trainer.threads = defaults.trainer.threads
     if "absent" not in config.dataset:  # a run from before data sets had a convention
-        config.dataset.absent = config.metric.absent
+        config.dataset.absent = config.metric.get("absent", "exclude")
     trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
@@ -184,10 +184,10 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values.
 
     Absent classes count by the convention of the data set that is measured, unless the run or
-    `pairs` set ``metric.absent`` by hand.
+    `pairs` set ``metric.absent`` by hand. A partition of a user's own class may lack the setting.
     """
-    by_hand = config.metric.absent != config.dataset.absent
-    absent = config.metric.absent
+    absent = config.metric.get("absent")
+    by_hand = absent not in (None, config.dataset.absent)
     search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
     pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]
     for key, _ in pairs:
@@ -215,7 +215,7 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
                 f"'{key}' is not a key of this run; {nearest(key, near or open_ones)}."
             )
         OmegaConf.update(config, key, parse_yaml(value, key))
-    if "metric.absent" not in [_place(key) for key, _ in pairs]:
+    if "absent" in config.metric and "metric.absent" not in [_place(key) for key, _ in pairs]:
         config.metric.absent = absent if by_hand else config.dataset.get("absent", "exclude")
 
 
