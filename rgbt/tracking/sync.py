@@ -102,7 +102,7 @@ def sync_all(options: dict[str, str]) -> int:
             raise
         except Exception as error:  # Any store may fail in its own way; the next folder may do.
             failed += 1
-            reason = (str(error).splitlines() or [""])[0]
+            reason = without_passwords((str(error).splitlines() or [""])[0])
             sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
         else:
             sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")
