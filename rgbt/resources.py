@@ -57,7 +57,8 @@ def _sentence(error: BaseException) -> str | None:
             return _disk_sentence(error, cause)
         if _is_memory(cause):
             return _memory_sentence(cause)
-        cause = cause.__cause__ or cause.__context__
+        hidden = cause.__suppress_context__  # raised "from None": the sentence says it all
+        cause = cause.__cause__ or (None if hidden else cause.__context__)
     return None
 
 

@@ -2,13 +2,15 @@
 
 Ctrl-C and SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away)
 raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file is left half
-done; inside `at_once` within it they are answered again.
+done; inside `at_once` within it they are answered again. Python drops what is raised while it frees
+an object (``__del__``, a callback of a weak reference): `Stopped` is then raised again soon after.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +21,10 @@ WORDS = {
     signal.SIGTERM: "stopped by SIGTERM",
     signal.SIGHUP: "stopped by SIGHUP",
 }
+
+
+SOON = 0.05
+"""Seconds until a `Stopped` that Python dropped is raised again."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -85,11 +91,38 @@ def answered() -> Iterator[None]:
         if handler is not signal.SIG_IGN:
             signal.signal(number, answer)
     try:
-        yield
+        with _raised_again():
+            yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         _signals = outer
+
+
+@contextmanager
+def _raised_again() -> Iterator[None]:
+    """Raise a `Stopped` that Python dropped again, by a timer: no thread may start just there."""
+
+    def note(dropped: sys.UnraisableHookArgs) -> None:
+        if isinstance(dropped.exc_value, Stopped):
+            _signals.is_raised = False
+            signal.setitimer(signal.ITIMER_REAL, SOON)
+        else:
+            hook(dropped)
+
+    def again(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if not _signals.is_deferred:
+            _raise_noted()
+
+    hook, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, again)
+    sys.unraisablehook = note
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, alarm)
 
 
 @contextmanager

@@ -184,9 +184,9 @@ def _override(config: DictConfig, pairs: list[tuple[str, str]]) -> None:
     """Apply overrides in place: groups first, then single values.
 
     Absent classes count by the convention of the data set that is measured, unless the run or
-    `pairs` set ``metric.absent`` by hand.
+    `pairs` set ``metric.absent`` by hand. A partition of a user's own class may lack the setting.
     """
-    absent = config.metric.get("absent")  # a user's own partition may have none
+    absent = config.metric.get("absent")
     by_hand = absent not in (None, config.dataset.absent)
     search = [f"{key}={value}" for key, value in pairs if key == "hydra.searchpath"]
     pairs = [pair for pair in pairs if pair[0] != "hydra.searchpath"]

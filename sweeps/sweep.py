@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
@@ -13,6 +15,7 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names
+from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.points import Point
@@ -130,6 +133,14 @@ def _label(point: GridPoint) -> str:
     return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
+def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
+    """The command that draws a study, without passwords; what is the default is left out."""
+    words = ["python", "-m", "sweeps.study", f"name={study}"]
+    words += [f"runs_dir={runs_dir}"] if runs_dir != Path("runs") else []
+    words += [f"storage={without_passwords(storage)}"] if storage else []
+    return shlex.join(words)
+
+
 def _grid(wanted: PointList, settings: Settings) -> None:
     if settings.dry_run:
         outcomes = survey(wanted, settings)
@@ -151,7 +162,8 @@ def _grid(wanted: PointList, settings: Settings) -> None:
     if unfinished.rows:
         show(rich_table(unfinished))
     _tell_other_code(outcomes)
-    tell(f"study {wanted.study}; its figures: python -m sweeps.study name={wanted.study}")
+    command = study_command(wanted.study, wanted.runs.runs_dir, settings.storage)
+    tell(f"study {wanted.study}; its figures: {command}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(

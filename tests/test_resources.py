@@ -80,6 +80,17 @@ def test_a_reader_that_names_the_setting_keeps_its_sentence(call: Call) -> None:
     assert_one_sentence(err, "data.cache: the disk of /a filled up; the disk of ")
 
 
+def test_a_sentence_that_hides_its_cause_stays_as_it_is(call: Call) -> None:
+    def refused() -> None:
+        try:
+            raise full()
+        except OSError:
+            raise InputError("no shared memory in /dev/shm.") from None
+
+    code, _, err = call(plain_command({}, lambda _, __: refused()))
+    assert (code, err) == (2, "rgbt: no shared memory in /dev/shm.\n")
+
+
 def of_torch() -> BaseException:
     with pytest.raises(RuntimeError) as told:
         torch.empty(2**52, dtype=torch.uint8)

@@ -21,7 +21,6 @@ is added gets its line here; a line that changes means that runs on users' disks
 TYPED = {
     "demo": [],
     "smoke": ["+debug=smoke"],
-    "smoke_freiburg": ["+debug=smoke_freiburg"],
     "paper": ["scale=paper", "dataset.root=x"],
 }
 QUICK = {

@@ -72,6 +72,48 @@ def test_the_step_in_progress_is_finished_and_saved(
     assert losses[0] == losses[1]
 
 
+class Freed:
+    """Gets a signal while it is freed, where Python drops exceptions."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        send(self.number)
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_that_comes_while_an_object_is_freed_is_not_lost(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def work() -> None:
+        freed = Freed(number)
+        del freed
+        time.sleep(5)
+        raise AssertionError("the signal was lost")
+
+    with pytest.raises(Stopped) as stop:
+        work()
+    assert stop.value.number == number
+    assert capfd.readouterr().err == ""
+
+
+def test_one_that_was_dropped_waits_where_signals_wait() -> None:
+    reached = []
+
+    def work() -> None:
+        with deferred():
+            with at_once():
+                Freed(signal.SIGTERM)
+            time.sleep(0.1)
+            reached.append(True)
+
+    with pytest.raises(Stopped):
+        work()
+    assert reached
+
+
 def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> None:
     def stopped(step: int) -> float:
         (trainer.checkpoints.begin_evaluation(step) / "counts_val.npz").touch()

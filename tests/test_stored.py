@@ -87,6 +87,15 @@ def test_absent_classes_of_a_stored_run_count_as_the_measured_data_set_says(
     assert config.metric.absent == expected
 
 
+def test_a_stored_partition_of_a_class_without_the_setting_is_opened() -> None:
+    config = resolved()
+    config.metric = {"_target_": "my_lab.Halved"}
+    stored._override(config, [("data.eval_batch_size", "1")])
+    assert config.metric == {"_target_": "my_lab.Halved"}
+    stored._override(config, [("metric", "ring9")])
+    assert config.metric.absent == "released", "that of the data set"
+
+
 def test_a_data_set_of_its_own_class_leaves_absent_classes_out() -> None:
     config = composed(())
     assert config.metric.absent == "released"

@@ -165,7 +165,7 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        raise InputError(no_shared_memory(str(error.strerror))) from error
+        raise InputError(no_shared_memory(str(error.strerror))) from None  # no disk is full
 
 
 def train_batches(

@@ -197,7 +197,7 @@ def _shared(tensor: Tensor) -> Tensor:
     try:
         tensor.share_memory_()  # type: ignore[no-untyped-call]
     except RuntimeError as error:
-        raise InputError(no_shared_memory(str(error).splitlines()[0])) from error
+        raise InputError(no_shared_memory(str(error).splitlines()[0])) from None
     return tensor
 
 

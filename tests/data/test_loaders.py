@@ -375,8 +375,9 @@ def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(loaders.multiprocessing, "Lock", refuse)
-    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0"):
+    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0") as told:
         train_batches(dataset, "train", crm(), settings(num_workers=2), 0, range(2))
+    assert told.value.__suppress_context__, "told once, not as a full disk as well"
 
 
 def test_a_killed_worker_is_reported_in_one_sentence(

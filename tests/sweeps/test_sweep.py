@@ -16,7 +16,7 @@ from rgbt.config import conf_dir, register_resolvers
 from sweeps.running.lists import Outcome, PointList
 from sweeps.search import Search
 from sweeps.settings import Settings
-from sweeps.sweep import sweep
+from sweeps.sweep import study_command, sweep
 
 
 class Asked:
@@ -209,3 +209,18 @@ def test_a_preview_runs_nothing(
     call(tmp_path, "+experiment=grbm", "seed=0,1,2", dry_run=True)
     assert asked.lists == []
     assert "3 of 3 points would be run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("runs_dir", "storage", "rest"),
+    [
+        ("runs", None, ""),
+        ("/data/my runs", None, " 'runs_dir=/data/my runs'"),
+        ("runs", "postgresql://me:Secret@host/db", " 'storage=postgresql://me:***@host/db'"),
+    ],
+)
+def test_the_command_that_draws_a_study_finds_it(
+    runs_dir: str, storage: str | None, rest: str
+) -> None:
+    command = study_command("grbm-1", Path(runs_dir), storage)
+    assert command == f"python -m sweeps.study name=grbm-1{rest}"

@@ -445,6 +445,23 @@ def test_sync_asks_for_a_password_that_is_not_kept(tmp_path: Path) -> None:
         sync.tracking_of(folder, {})
 
 
+def test_sync_hides_the_password_of_a_store_that_refuses(
+    runs_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = RunFolder(runs_dir / "key")
+    begin(folder, NoTracking())
+    address = "http://me:Secret@127.0.0.1:9"
+
+    def refuse(*_: object) -> str:
+        raise ConnectionError(f"API request to {address}/api failed")
+
+    monkeypatch.setattr(MlflowTracking, "sync", refuse)
+    assert sync.main([f"run={folder.path}", f"uri={address}"]) == 1
+    error = capsys.readouterr().err
+    assert "was not sent (API request to http://me:***@127.0.0.1:9/api failed)" in error
+    assert "Secret" not in error
+
+
 @pytest.mark.parametrize(("name", "kind"), [("mlflow", MlflowTracking), ("none", NoTracking)])
 def test_configuration_builds(name: str, kind: type) -> None:
     loaded = OmegaConf.load(CONF / f"{name}.yaml")
