@@ -86,6 +86,14 @@ def run_key(config: DictConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
+def own_code(config: DictConfig) -> dict[str, str]:
+    """Digest or version of what `config` uses of the user's own code, by module.
+
+    See `rgbt.source_code.user_code`.
+    """
+    return dict(user_code(_targets(OmegaConf.to_container(config, resolve=True))))
+
+
 def _targets(value: Any) -> Iterator[str]:
     """Every `_target_` inside plain values."""
     if isinstance(value, dict) and "_target_" in value:

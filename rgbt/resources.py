@@ -65,7 +65,8 @@ def _sentence(error: BaseException) -> str | None:
 def _disk_sentence(error: BaseException, cause: OSError) -> str:
     file = cause.filename
     place = _existing(Path(file)) if isinstance(file, str) else _fullest()
-    left = f"the disk of {place} {DISK[cause.errno or 0]} ({_free(place) / 1e6:.1f} MB free)"
+    free = f"{_free(place) / 1e6:.1f} MB free, after the unfinished file was removed"
+    left = f"the disk of {place} {DISK[cause.errno or 0]} ({free})"
     if isinstance(error, InputError):  # says itself what cannot be written, and what to set
         return f"{str(error).rstrip('.')}; {left}."
     return f"{left}; free some space, or name a folder on another disk; {RESUME}."

@@ -13,11 +13,11 @@ from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config import check, compose, flatten, register_resolvers
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
-from rgbt.identity import run_key, weights_file
+from rgbt.identity import own_code, run_key, weights_file
 from rgbt.metrics.counts import Counts
 from rgbt.session import Session, names_key, open_session
 from rgbt.stored_config import load_config
-from rgbt.tracking.folder import find_run
+from rgbt.tracking.folder import RunFolder, find_run
 from rgbt.tracking.formats import read_marker
 from rgbt.tracking.terminal import tell
 from rgbt.yaml_files import parse_yaml
@@ -127,6 +127,7 @@ def open_run(
         config.trainer.threads = defaults.trainer.threads
     if "absent" not in config.dataset:  # a run from before data sets had a convention
         config.dataset.absent = config.metric.get("absent", "exclude")
+    _warn_of_other_code(folder, config)
     trained_on = config.dataset.get("name")
     _override(config, [_pair(item) for item in overrides])
     config.model.weights = None  # the checkpoint holds them all
@@ -152,6 +153,19 @@ def open_run(
     restore_weights(session.model, payload["model"], weights)
     _tell_other_splits(folder, trained_on, session)
     return Stored(session, step_of(payload, weights), folder / "evaluations", config.name)
+
+
+def _warn_of_other_code(folder: Path, config: DictConfig) -> None:
+    """Say so where the user's own code is not what the run was trained with."""
+    now = own_code(config)
+    entries = RunFolder(folder).provenance() if now else []
+    before = entries[-1].get("own_code") if entries else None
+    if before is not None and before != now:
+        modules = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+        tell(
+            f"warning: {', '.join(modules)} changed after {folder.name} was trained; what is "
+            "computed now is not what this run made. Restore the code, or train again."
+        )
 
 
 def _tell_other_splits(folder: Path, trained_on: str | None, session: Session) -> None:

@@ -20,7 +20,7 @@ from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, restore_weights
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
-from rgbt.identity import run_key
+from rgbt.identity import own_code, run_key
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
@@ -230,7 +230,7 @@ class Run:
         self.folder.mark(**found)
         config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
         self.folder.write_config(config)
-        self.folder.add_provenance(provenance())
+        self.folder.add_provenance({**provenance(), "own_code": own_code(session.config)})
 
     def _train(self, session: Session) -> State:
         state = State(seed=session.config.seed)

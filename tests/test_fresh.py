@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rgbt import source_code
+from rgbt import evaluate, source_code
 from rgbt.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.tracking import other_code
@@ -139,3 +139,11 @@ def test_a_changed_loss_of_ones_own_is_another_run(
     (once,) = losses(1.0)
     assert losses(3.0) == pytest.approx([once, 3 * once])
     assert losses(1.0) == pytest.approx([once, 3 * once]), "the first run again"
+
+    entry = plain_command(evaluate.OWN, evaluate.main)
+    for run in runs_in(tmp_path / "runs"):
+        code, _, err = call(entry, f"run={run.path}", "trust=my_scaled_loss")
+        assert code == 0, err
+        is_other = run.lines()[0].values["loss"] > 2 * once
+        said = f"warning: my_scaled_loss changed after {run.path.name} was trained"
+        assert (said in err) == is_other

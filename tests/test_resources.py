@@ -65,7 +65,7 @@ def test_a_full_disk_is_one_sentence(call: Call, tmp_path: Path, error, words: s
     code, _, err = call(raising(error), f"out={tmp_path / 'none'}")
     assert code == 1
     assert_one_sentence(err, words)
-    assert " MB free); free some space, or name a folder on another disk; " in err
+    assert " MB free, after the unfinished file was removed); free some space, or name a" in err
     assert err.endswith(f"{RESUME}\n")
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import socket
 import sys
 import time
 from collections.abc import Iterator
@@ -27,6 +29,10 @@ ENVIRONMENT = {
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
 """Set before the first import of mlflow, unless the user set them."""
+
+DATABASE_PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
+CONNECT_S = 10.0
+"""Seconds until a database server must have answered."""
 
 LOCK_WAIT_S = 60.0
 """Seconds to wait for another process: several that create the tables take seconds each."""
@@ -69,6 +75,7 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    check_reachable(uri)
     # Takes seconds, hence not at the top.
     from mlflow import MlflowClient
 
@@ -82,6 +89,22 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
         if found.tags.get(name) != value:
             client.set_experiment_tag(found.experiment_id, name, value)
     return Store(client, str(found.experiment_id))
+
+
+def check_reachable(uri: str) -> None:
+    """Raise OSError where nobody listens at the address of a database server.
+
+    MLflow itself would try again for minutes, with a page of errors each time.
+    """
+    port = DATABASE_PORTS.get(re.split(r"[+:]", uri)[0])
+    if port is None:
+        return
+    from sqlalchemy.engine import make_url  # as MLflow reads it: a password may hold anything
+
+    address = make_url(uri)
+    if address.host:  # else a socket of this machine
+        with socket.create_connection((address.host, address.port or port), timeout=CONNECT_S):
+            pass
 
 
 class StoreBusyError(Exception):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rgbt.checks import InputError, nearest
 from rgbt.tracking.folder import RunFolder, runs_in
+from rgbt.tracking.mlflow_client import StoreBusyError
 from rgbt.tracking.mlflow_fill import Status, read_sent
 from rgbt.tracking.mlflow_server import ui_command
 from rgbt.tracking.mlflow_store import MlflowTracking
@@ -97,15 +98,22 @@ def sync_all(options: dict[str, str]) -> int:
     """
     stores: dict[tuple[str, str], MlflowTracking] = {}
     failed = 0
+    busy: dict[str, StoreBusyError] = {}
     # What is wrong with one of many folders must not keep the others from being sent.
     raised: tuple[type[InputError], ...] = (InputError,) if "run" in options else ()
     for folder in folders_of(options):
         try:
             named = tracking_of(folder, options)
             tracking = stores.setdefault((named.uri, named.experiment), named)
+            if named.uri in busy:  # waited for once, not for every run
+                raise busy[named.uri]
             run_id = tracking.sync(folder, status_of(folder))
         except raised:
             raise
+        except StoreBusyError as error:
+            busy[named.uri] = error
+            failed += 1
+            sys.stderr.write(f"rgbt: {folder.path} was not sent ({error}).\n")
         except Exception as error:  # A store may fail in any way; the next folder may be sent.
             failed += 1
             reason = without_passwords((str(error).splitlines() or [""])[0]).rstrip(".")

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -508,3 +509,31 @@ def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> 
     with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
         sync.tracking_of(folder, {})
     assert sync.tracking_of(folder, {"artifact_uri": "sftp://u:pw@h/files"}).uri == "http://h:5000"
+
+
+@pytest.mark.parametrize(
+    "uri", ["postgresql://u:123/abc@127.0.0.1:9/db", "mysql+pymysql://127.0.0.1:9/db"]
+)
+def test_a_database_that_nobody_serves_is_reported_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], uri: str
+) -> None:
+    started = time.monotonic()
+    begin(RunFolder(tmp_path / "away"), tracking(tmp_path, uri))
+    assert time.monotonic() - started < 10, "MLflow itself tries for minutes"
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "(ConnectionRefusedError: " in said
+
+
+def test_many_runs_wait_once_for_a_store_that_is_busy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in "abc":
+        begin(RunFolder(tmp_path / name), NoTracking())
+    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
+    with holding(tmp_path / ".mlflow.db.lock"):
+        assert sync.main([f"runs_dir={tmp_path}"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("waiting for process") == 1
+    assert said.count("was not sent") == 3
