@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 # One thread a process: two tests that share two cores otherwise wait for each other's threads.
@@ -22,6 +23,11 @@ from rgbt.randomness import numpy_generator
 from tests.commands import SPLITS, Call, Trained, only_run, without_pictures, words_of
 
 WriteMFNet = Callable[..., Path]
+
+# A suite started by nohup, or in the background of a script, inherits that these are ignored, and
+# so would the commands that tests send them to.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
