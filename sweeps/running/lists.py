@@ -210,7 +210,7 @@ def make_executor(settings: Settings, runs_dir: Path) -> Executor:
     """What `executor` and its options name."""
     if settings.executor == "local":
         check_gpus(settings.gpus)
-        return LocalExecutor()
+        return LocalExecutor(settings.workers)
     from sweeps.running.submitit_executor import SubmititExecutor
 
     return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
