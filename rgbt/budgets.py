@@ -65,8 +65,13 @@ TEXT = Budget("RGBT_MAX_JSON_MB", 32, "bytes")
 """Of a JSON file. 50,000 lines of metrics take 25 MB; the objects of 32 MB take up to 800 MB."""
 
 
-def read_bytes(path: Path, budget: Budget) -> bytes:
+def read_bytes(path: Path, budget: Budget, advice: str = "") -> bytes:
     """Every byte of a regular file of at most the size that `budget` allows.
+
+    Args:
+        path: of the file.
+        budget: limit on its size.
+        advice: what to do where `path` is no regular file.
 
     Raises:
         InputError: no regular file, or a larger one.
@@ -75,7 +80,7 @@ def read_bytes(path: Path, budget: Budget) -> bytes:
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         what = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
-        raise InputError(f"{path} is {what}, expected a file.")
+        raise InputError(f"{path} is {what}, expected a file{advice and f'; {advice}'}.")
     budget.check(path, status.st_size)
     return path.read_bytes()
 

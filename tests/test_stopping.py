@@ -205,6 +205,7 @@ def test_what_the_process_ignores_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with answered():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
             send(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import stat
 import struct
 import warnings
 import zlib
@@ -19,7 +18,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from rgbt.budgets import CONTENT, PIXELS
+from rgbt.budgets import CONTENT, PIXELS, read_bytes
 from rgbt.checks import InputError
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
@@ -48,12 +47,7 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
             larger than `CONTENT` allows, or a fault of the disk.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            what = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
-            raise InputError(f"{path} is {what}, expected a file; {advice}.")
-        CONTENT.check(path, status.st_size)
-        return path.read_bytes()
+        return read_bytes(path, CONTENT, advice)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path} is missing{_why_missing(path)}.") from None
     except PermissionError:

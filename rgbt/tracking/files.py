@@ -12,6 +12,7 @@ from pathlib import Path
 
 POLL_S = 0.1
 """Seconds between two attempts to take a lock."""
+
 LEFT_BEHIND = re.compile(
     r"\.(?:last|last_previous|best)\.pt\.partial|\.counts_\w+\.npz\.partial"
     r"|\..+\.(\d+)|.+\.(\d+)\.partial"

@@ -110,11 +110,9 @@ def sync_all(options: dict[str, str]) -> int:
             run_id = tracking.sync(folder, status_of(folder))
         except raised:
             raise
-        except StoreBusyError as error:
-            busy[named.uri] = error
-            failed += 1
-            sys.stderr.write(f"rgbt: {folder.path} was not sent ({error}).\n")
         except Exception as error:  # A store may fail in any way; the next folder may be sent.
+            if isinstance(error, StoreBusyError):
+                busy[named.uri] = error
             failed += 1
             reason = without_passwords((str(error).splitlines() or [""])[0]).rstrip(".")
             sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
