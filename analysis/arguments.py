@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from rgbt.checks import InputError, check_range, nearest
-from rgbt.command import built
+from rgbt.config.command import built
 
 if TYPE_CHECKING:
     from analysis.uncertainty.settings import NamedBlocks

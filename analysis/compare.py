@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 
 from analysis.arguments import MOST, blocks_of, decimal, out_folder, refuse_others, whole
 from rgbt.checks import InputError, check_choice, split_list
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
     from analysis.results import Frames, Stored
@@ -300,7 +300,7 @@ def _p(value: float) -> str:
 
 
 def _write(out: Path, grid: Grid, said: str, comparison: Comparison) -> None:
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
     from rgbt.tracking.terminal import place_lines, show
 
     out.mkdir(parents=True, exist_ok=True)

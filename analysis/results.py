@@ -13,7 +13,7 @@ import numpy as np
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
-from rgbt.naming import GROUP, group_of
+from rgbt.spec.naming import GROUP, group_of
 from rgbt.tracking.folder import Description, RunFolder, find_run, runs_in
 from rgbt.tracking.terminal import tell
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from analysis.results import RUNS, Stored, open_counts
-from rgbt.budgets import read_json
 from rgbt.checks import InputError, nearest, split_list
+from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
 
 FOLDER = Path("evaluations") / "robustness"

@@ -22,7 +22,7 @@ from analysis.arguments import (
 )
 from analysis.bar import progress
 from rgbt.checks import InputError, check_choice
-from rgbt.command import built, plain_command
+from rgbt.config.command import built, plain_command
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
@@ -92,7 +92,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     overrides of the data set, such as dataset=mfnet dataset.root=/data/MFNet
     """
     from analysis.predictions.text import remarks_on
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
 
     given = [key for key in ("predictions", "counts") if arguments[key]]
     if len(given) != 1:
@@ -186,7 +186,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
     from rich.text import Text
 
     from analysis.predictions.text import convention_line, grids, markdown, tidy_csv
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     places = []

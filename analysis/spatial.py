@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from analysis.arguments import MOST, dataset_of, decimal, out_folder, refuse_others, whole
 from analysis.bar import progress
 from rgbt.checks import InputError, check_choice
-from rgbt.command import built, plain_command
+from rgbt.config.command import built, plain_command
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.collect import DataSet, Settings
@@ -156,7 +156,7 @@ def _write(
 ) -> list[tuple[str, str]]:
     """The files of `folder`, as (what, path)."""
     from analysis.statistics import tables
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
 
     chosen = values["estimator"], values["average"]
     ways = sorted({_way(claim) for claim in found if claim.estimator}, key=lambda w: w != chosen)

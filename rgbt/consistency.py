@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from rgbt.checks import InputError, check_choice
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
+    from rgbt.build.session import Session
+    from rgbt.evaluation.temporal_consistency import Pairs
     from rgbt.metrics.pairs import Protocol
-    from rgbt.session import Session
     from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import ConsistencyTable
-    from rgbt.two_frames import Pairs
 
 OWN = {
     "run": "",
@@ -49,13 +49,18 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
               they do not name is as in conf/consistency/views.yaml, whatever the run measured
     """
-    from rgbt.session import panel_names, view_of
-    from rgbt.stored import open_trained
-    from rgbt.stored_config import parse_trust
+    from rgbt.build.load_run import open_trained
+    from rgbt.build.session import panel_names, view_of
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation.temporal_consistency import (
+        PROTOCOLS,
+        Frames,
+        consistency_table,
+        count_pairs,
+    )
     from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import place_lines, rich_table, show
-    from rgbt.two_frames import PROTOCOLS, Frames, consistency_table, count_pairs
 
     check_choice("frames", arguments["frames"], PROTOCOLS)
     if not any(item.split("=")[0] == "consistency" for item in overrides):
@@ -105,7 +110,7 @@ def _write(
     found: Pairs, session: Session, folder: Path, beside: list[str]
 ) -> list[tuple[str, str]]:
     """Write counts and picture; (what, where) of each. `beside` ends their names."""
-    from rgbt.session import legend_of
+    from rgbt.build.session import legend_of
     from rgbt.tracking.pair_pictures import draw_pairs
     from rgbt.tracking.terminal import tell
 
@@ -128,11 +133,11 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
     """What a run would hold had it measured this itself: result, tables, MLflow."""
     from dataclasses import asdict
 
+    from rgbt.evaluation.temporal_consistency import consistency_values
     from rgbt.tracking.mlflow_fill import read_sent
     from rgbt.tracking.sync import status_of, tracking_of
     from rgbt.tracking.tables import without_nan
     from rgbt.tracking.terminal import tell
-    from rgbt.two_frames import consistency_values
 
     result, tables = run.result(), run.tables()
     kinds = {session.trainer.selection_split: "val", "test": "test"}
@@ -163,9 +168,9 @@ def _name(protocol: Protocol, session: Session, split: str, beside: list[str]) -
 
 def _keep_other_motions(session: Session, path: Path) -> None:
     """Refuse to replace counts on other second frames by those on these."""
+    from rgbt.evaluation.temporal_consistency import views_of
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.pairs import partition_name
-    from rgbt.two_frames import views_of
 
     asked = partition_name("next", 1, views_of(session, "next"))
     if path.is_file() and Counts.load(path).partition != asked:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
 from rgbt.checks import InputError, check_choice
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.data.domains import TestedHead
 
 if TYPE_CHECKING:
-    from rgbt.degraded import Failure
+    from rgbt.evaluation.corrupted import Failure
 
 OWN = {
     "run": "",
@@ -48,12 +48,12 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
               degradation: degradation.block=16 degradation.seed=1
     """
-    from rgbt.degraded import own_words
-    from rgbt.overview import announce_stored
-    from rgbt.session import evaluate, result_tables, view_of
-    from rgbt.stored import open_trained
-    from rgbt.stored_config import parse_trust
+    from rgbt.build.load_run import open_trained
+    from rgbt.build.session import evaluate, result_tables, view_of
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation.corrupted import own_words
     from rgbt.tracking.terminal import result_view, show
+    from rgbt.training.overview import announce_stored
 
     if Path(arguments["out"] or "x").is_dir():
         raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
@@ -102,7 +102,7 @@ def _head(asked: str) -> TestedHead | None:
 
 def _failure(arguments: dict[str, str], words: list[str], trust: Collection[str]) -> Failure | None:
     """The degradation and its severity; None where none is asked for."""
-    from rgbt.degraded import choose
+    from rgbt.evaluation.corrupted import choose
 
     if arguments["degradation"] != OWN["degradation"]:
         return choose(arguments["degradation"], words, trust).at(arguments["severity"])

@@ -1,7 +1,8 @@
 """Predict images with a trained network: ``python -m rgbt.predict run=... input=... out=folder``.
 
 For every image a colour overlay and a PNG of class indices are written; with pseudo_labels=true
-labels and confidences of a split instead, to train other networks on (`rgbt.pseudo`).
+labels and confidences of a split instead, to train other networks on
+(`rgbt.evaluation.pseudo_labels`).
 """
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
 from rgbt.checks import InputError, check_choice
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from rgbt.build.load_run import Stored
+    from rgbt.build.session import Session
     from rgbt.data.domains import TestedHead
     from rgbt.data.label_map import LabelMap
     from rgbt.data.to_predict import ToPredict
-    from rgbt.session import Session
-    from rgbt.stored import Stored
     from rgbt.types import Sample, View
 
 OWN = {
@@ -62,10 +63,10 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     threshold smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
-    from rgbt.overview import announce_stored
-    from rgbt.pseudo import label_map_of
-    from rgbt.stored import open_trained
-    from rgbt.stored_config import parse_trust
+    from rgbt.build.load_run import open_trained
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation.pseudo_labels import label_map_of
+    from rgbt.training.overview import announce_stored
 
     check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
     as_labels = arguments["pseudo_labels"] == "true"
@@ -88,8 +89,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
 
 
 def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMap | None) -> None:
-    from rgbt.pseudo import summary, teacher_of, write_pseudo_labels
-    from rgbt.session import view_of
+    from rgbt.build.session import view_of
+    from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     session, split = stored.session, arguments["input"]
@@ -122,8 +123,8 @@ def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMa
 def _pictures(arguments: dict[str, str], session: Session, label_map: LabelMap | None) -> None:
     import numpy as np
 
+    from rgbt.build.session import view_of
     from rgbt.engine.progress import progress
-    from rgbt.session import view_of
     from rgbt.tracking.pictures import overlay
 
     view, head = view_of(session, arguments["modality"]), _head(arguments["head"])
@@ -186,7 +187,7 @@ def _head(asked: str) -> TestedHead | None:
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
     import cv2
 
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
 
     encoded, content = cv2.imencode(".png", image)
     assert encoded, "8 bit images can be encoded"
@@ -196,9 +197,9 @@ def _write(path: Path, image: NDArray[np.uint8]) -> None:
 def _classes(
     session: Session, images: ToPredict, view: View, head: TestedHead | None
 ) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
+    from rgbt.build.session import heads_of
     from rgbt.data.batches import collate
     from rgbt.engine.evaluate import predictions
-    from rgbt.session import heads_of
 
     heads = heads_of(session, view, head)
     for sample in images.samples(session.loading.on_error):

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, split_list
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
-    from rgbt.degraded import Chosen
-    from rgbt.failing_images import Measured
-    from rgbt.stored import Stored
+    from rgbt.build.load_run import Stored
+    from rgbt.evaluation.corrupted import Chosen
+    from rgbt.evaluation.robustness import Measured
     from rgbt.tracking.tables import Grid
 
 OWN = {
@@ -51,10 +51,10 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     Stopped and given again, it goes on; what is there is made again only where the data, the
     weights or the degradation differ. python -m analysis.figures figure=robustness draws it.
     """
-    from rgbt.degraded import own_words
-    from rgbt.failing_images import measure
-    from rgbt.stored import open_trained
-    from rgbt.stored_config import parse_trust
+    from rgbt.build.load_run import open_trained
+    from rgbt.config.stored_config import parse_trust
+    from rgbt.evaluation.corrupted import own_words
+    from rgbt.evaluation.robustness import measure
     from rgbt.tracking.folder import find_run
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
@@ -88,12 +88,12 @@ def chosen_of(text: str, words: Sequence[str], trust: Collection[str] = ()) -> l
     Args:
         text: names with commas, or "all".
         words: ``degradation.KEY=VALUE``; any key of a single degradation, the seed of several.
-        trust: see `rgbt.degraded.choose`.
+        trust: see `rgbt.evaluation.corrupted.choose`.
 
     Raises:
         InputError: an unknown name, one that stands twice, or keys of several degradations at once.
     """
-    from rgbt.degraded import NODE, SEED, choose, known_degradations
+    from rgbt.evaluation.corrupted import NODE, SEED, choose, known_degradations
 
     names = split_list(text, "degradations")
     names = known_degradations() if names == ["all"] else names
@@ -132,7 +132,7 @@ def _check_comparable(
 
 def _place(stored: Stored, arguments: dict[str, str]) -> str:
     """Folder of a split's counts: plain where the run is measured as its own evaluation is."""
-    from rgbt.failing_images import read_json
+    from rgbt.evaluation.robustness import read_json
 
     session = stored.session
     regions = [session.regions.name] if arguments["regions"] != OWN["regions"] else []
@@ -158,7 +158,7 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
         measured: the clean images first.
         title: shown above.
     """
-    from rgbt.failing_images import CLEAN
+    from rgbt.evaluation.robustness import CLEAN
     from rgbt.tracking.tables import Grid, percent
 
     clean, *others = measured
@@ -181,8 +181,8 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
 
 def _write_tables(measured: Sequence[Measured], grid: Grid, place: Path) -> None:
     """The numbers and the table in `place` with .csv and .md."""
+    from rgbt.files.atomic import write_atomic
     from rgbt.tracking.csv_files import csv_text
-    from rgbt.tracking.files import write_atomic
 
     scores = list(measured[0].mious)
     rows: list[tuple[object, ...]] = [("row", "title", "unit", "severity", "view", *scores)]

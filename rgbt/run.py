@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rgbt.command import command, task_overrides
+from rgbt.config.command import command, task_overrides
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -18,10 +18,15 @@ if TYPE_CHECKING:
 def main(config: DictConfig) -> int:
     """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
     # torch loads here, after --help
-    from rgbt.earlier import earlier_runs, finish_earlier, reads_pretrained, warn_of_other_code
-    from rgbt.prepared import rehearse
+    from rgbt.build.training_setup import rehearse
     from rgbt.tracking.terminal import tell
-    from rgbt.training import is_finished, train
+    from rgbt.training.pipeline import (
+        earlier_runs,
+        finish_earlier,
+        reads_pretrained,
+        warn_of_other_code,
+    )
+    from rgbt.training.train import is_finished, train
 
     if config.pretrained is not None and not reads_pretrained(config):
         tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.command import composing, readable_paths
-from rgbt.config import NODES, TOP_LEVEL, check_node
+from rgbt.config.command import composing, readable_paths
+from rgbt.config.schema import NODES, TOP_LEVEL, check_node
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
-    from sweeps.running.found import Runs
-    from sweeps.running.lists import PointList
     from sweeps.settings import Settings
     from sweeps.table.cell_points import Wanted
+    from sweeps.worker.found import Runs
+    from sweeps.worker.lists import PointList
 
 Arguments = Mapping[str, str]
 """Values by key, as typed."""
@@ -68,7 +68,7 @@ def settings_of(arguments: Arguments) -> Settings:
     """
     from omegaconf import DictConfig, OmegaConf
 
-    from rgbt.config import conf_dir
+    from rgbt.config.compose import conf_dir
     from sweeps.settings import read_settings
 
     node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
@@ -141,11 +141,11 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
     Raises:
         InputError: no such table, scale or metric; no seeds.
     """
-    from rgbt.config import conf_dir
-    from sweeps.running.storage import NAME
+    from rgbt.config.compose import conf_dir
     from sweeps.table.cell_points import Wanted, seeds_of
     from sweeps.table.scoring import check_metrics
     from sweeps.table.table import load_table
+    from sweeps.worker.storage import NAME
 
     scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
     check_choice("scale", arguments["scale"], scales)
@@ -178,8 +178,8 @@ def _weights(word: str) -> tuple[str, str]:
 
 def runs_of(place: Place) -> Runs:
     """Where finished runs are found, as the overrides of the tracker say."""
-    from rgbt.config import compose
-    from sweeps.running.found import open_runs
+    from rgbt.config.compose import compose
+    from sweeps.worker.found import open_runs
 
     with composing(place.base):
         config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])
@@ -189,7 +189,7 @@ def runs_of(place: Place) -> Runs:
 
 def point_list(wanted: Wanted, place: Place, runs: Runs) -> PointList:
     """The runs of a table, as the driver takes them."""
-    from sweeps.running.lists import PointList
+    from sweeps.worker.lists import PointList
 
     return PointList(
         study=f"table/{wanted.name}",

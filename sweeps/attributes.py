@@ -13,7 +13,7 @@ OVERRIDES = "rgbt.overrides"
 
 LABEL = "rgbt.label"
 OWNER = "rgbt.owner"
-"""Who works on the trial: host, process, start of the process, see `sweeps.running.owner`."""
+"""Who works on the trial: host, process, start of the process, see `sweeps.worker.owner`."""
 
 BEAT = "rgbt.beat"
 """Seconds since 1970 at which the owner last said that it is alive."""

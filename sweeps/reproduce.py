@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 from rgbt.checks import InputError
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from sweeps.asked import Arguments, Place, place_of, point_list, runs_of, settings_of, wanted_of
 from sweeps.settings import Settings
 from sweeps.table.cell_points import Wanted
@@ -69,8 +69,8 @@ def _preview(wanted: Wanted, place: Place, settings: Settings) -> int:
     from rich.text import Text
 
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.running.lists import survey
     from sweeps.sheet.preview import cells_grid, summary
+    from sweeps.worker.lists import survey
 
     outcomes = survey(point_list(wanted, place, runs_of(place)), settings)
     if outcomes:
@@ -83,9 +83,9 @@ def _preview_all(
     arguments: Arguments, extra: tuple[str, ...], place: Place, settings: Settings
 ) -> int:
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.running.lists import survey
     from sweeps.sheet.preview import tables_grid
     from sweeps.table.table import table_names
+    from sweeps.worker.lists import survey
 
     if not settings.dry_run:
         raise InputError("table=all is for dry_run=true; run one table at a time.")
@@ -97,8 +97,8 @@ def _preview_all(
 
 
 def _reproduce(wanted: Wanted, place: Place, settings: Settings) -> int:
-    from sweeps.running.lists import work_off
     from sweeps.sheet.results import finish
+    from sweeps.worker.lists import work_off
 
     runs = runs_of(place)
     points = point_list(wanted, place, runs)

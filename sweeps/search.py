@@ -13,19 +13,19 @@ from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
 from sweeps.points import Point
-from sweeps.running.driver import Driver
-from sweeps.running.found import Runs
-from sweeps.running.ledger import Ledger, counted
-from sweeps.running.lists import make_executor
-from sweeps.running.live import View
-from sweeps.running.owner import Owner
-from sweeps.running.plan import Plan, Planner
-from sweeps.running.sources import SearchSource
-from sweeps.running.storage import begin_study, existing_study, open_storage
 from sweeps.settings import Settings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_places, study_folder
+from sweeps.worker.driver import Driver
+from sweeps.worker.found import Runs
+from sweeps.worker.lists import make_executor
+from sweeps.worker.live import View
+from sweeps.worker.owner import Owner
+from sweeps.worker.plan import Plan, Planner
+from sweeps.worker.sources import SearchSource
+from sweeps.worker.storage import begin_study, existing_study, open_storage
+from sweeps.worker.trial_store import Ledger, counted
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
-from rgbt.command import built, plain_command, readable_paths
+from rgbt.config.command import built, plain_command, readable_paths
 from rgbt.tracking.provenance import without_passwords
-from sweeps.running.storage import JOURNAL, load_study, open_storage, study_names
+from sweeps.worker.storage import JOURNAL, load_study, open_storage, study_names
 
 if TYPE_CHECKING:
     import optuna
@@ -70,7 +70,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     from rich.console import Group
     from rich.text import Text
 
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
     from rgbt.tracking.terminal import rich_table, show
     from sweeps.report.data import importances, read
     from sweeps.report.figures import draw

@@ -20,8 +20,14 @@ from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.points import Point
 from sweeps.report.data import short_names
-from sweeps.running.found import Runs, open_runs
-from sweeps.running.lists import (
+from sweeps.search import Search, search
+from sweeps.settings import Settings, read_settings
+from sweeps.sheet.groups import group_grid, unfinished_grid
+from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
+from sweeps.space.merge import merge_space
+from sweeps.space.space import as_overrides
+from sweeps.worker.found import Runs, open_runs
+from sweeps.worker.lists import (
     Outcome,
     PointList,
     estimated_seconds,
@@ -29,13 +35,7 @@ from sweeps.running.lists import (
     survey,
     work_off,
 )
-from sweeps.running.live import duration
-from sweeps.search import Search, search
-from sweeps.settings import Settings, read_settings
-from sweeps.sheet.groups import group_grid, unfinished_grid
-from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
-from sweeps.space.merge import merge_space
-from sweeps.space.space import as_overrides
+from sweeps.worker.live import duration
 
 PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""

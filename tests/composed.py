@@ -9,7 +9,8 @@ from functools import cache
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.config import check, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import check
 from sweeps.table.table import Row, Table
 
 

@@ -15,12 +15,13 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from rgbt.build.training_setup import prepare
 from rgbt.checks import InputError
-from rgbt.config import NODES, build, check, check_node, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import NODES, build, check, check_node
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
-from rgbt.identity import run_key
-from rgbt.prepared import prepare
+from rgbt.spec.run_key import run_key
 
 NO_NUMBER = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 10**12)
 NO_TEXT = ("", "x" * 100_000, "a\x00b", "two\nlines")

@@ -18,11 +18,12 @@ import pytest
 import torch
 
 from rgbt.checkpoints.stored import save
-from rgbt.config import build, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import build
 from rgbt.engine.checkpoint import load_checkpoint
-from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
 from rgbt.schemes.adversarial import Adversarial
+from rgbt.spec.run_key import run_key
 from tests.commands import Call, assert_one_sentence
 from tests.conftest import write_png
 from tests.test_run import ADAPTATION, EXPERIMENTS
@@ -96,7 +97,7 @@ def elsewhere(call: Call, place: Path, tmp_path: Path) -> Callable[[str], Runs]:
 def evaluated(call: Call, tmp_path: Path) -> Callable[..., Counts]:
     """Counts of `rgbt.evaluate` of a run folder."""
     from rgbt import evaluate
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     def evaluate_run(folder: Path, *words: str) -> Counts:
         out = tmp_path / "evaluated.npz"
@@ -269,7 +270,7 @@ def test_which_head_predicted_what_is_said(
     run: Runs, call: Call, tmp_path: Path, experiment: str, own: str | None
 ) -> None:
     from rgbt import evaluate
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     folder = run(experiment)
     expected = [] if own is None else [f"heads {own}"]
@@ -289,7 +290,7 @@ def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
     run: Runs, call: Call, tmp_path: Path
 ) -> None:
     from rgbt import predict
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     folder = run("multi_head_night")
     broken = without_head(folder, "target", tmp_path / "broken")

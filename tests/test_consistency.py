@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import ca, ca_released, tc
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, short, train

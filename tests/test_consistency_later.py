@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.budgets import read_json
-from rgbt.config import compose
+from rgbt.config.compose import compose
+from rgbt.files.budgets import read_json
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
-from rgbt.naming import describe
-from sweeps.running.found import Found
+from rgbt.spec.naming import describe
+from sweeps.worker.found import Found
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, train
 from tests.conftest import pair, write_png
 from tests.test_consistency import ALIGNED, RELEASED, TEMPORAL, copied, measure

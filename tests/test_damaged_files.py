@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.budgets import sealed
 from rgbt.checks import InputError, RunError
+from rgbt.files.budgets import sealed
 from tests.commands import Call, Trained, short, train
 from tests.damage import damaged
 
@@ -311,13 +311,13 @@ def read_marker(path: Path) -> Any:
 
 
 def follow(path: Path) -> Any:
-    from sweeps.running.follow import Follower
+    from sweeps.worker.follow import Follower
 
     return plain(Follower(path.parent).new_lines())
 
 
 def found(path: Path) -> Any:
-    from sweeps.running.found import Found
+    from sweeps.worker.found import Found
 
     run = Found("key", path.parent)
     return plain((run.dataset, run.commit, run.scores()))
@@ -343,7 +343,7 @@ def pseudo(folder: Path) -> Path:
 
 def read_pseudo(path: Path) -> Any:
     from rgbt.data.pseudo_labels import PseudoLabels
-    from rgbt.identity import manifest_of
+    from rgbt.spec.run_key import manifest_of
 
     folder = path if (path / "pseudo_labels.json").is_file() else path.parent
     if folder.name in ("labels", "confidence"):
@@ -369,9 +369,9 @@ STORE_ABOUT = {"class": "MFNet", "fingerprint": "0123", "root": "/data"}
 
 
 def store(folder: Path) -> Path:
-    from rgbt.data.decoded.file import crc_of
-    from rgbt.data.decoded.stamps import Stamp
-    from rgbt.data.decoded.store import Fresh, Store
+    from rgbt.data.cache.file import crc_of
+    from rgbt.data.cache.stamps import Stamp
+    from rgbt.data.cache.store import Fresh, Store
     from rgbt.types import Sample
 
     rgb = picture((10, 12), 3)
@@ -386,7 +386,7 @@ def store(folder: Path) -> Path:
 
 def read_store(path: Path) -> Any:
     """Every frame that is whole; damaged ones are decoded anew, and count as refused here."""
-    from rgbt.data.decoded.store import Store
+    from rgbt.data.cache.store import Store
 
     opened = Store(path.parent, STORE_ABOUT, 1)
     opened.load(lambda *_: None)
@@ -416,7 +416,7 @@ def in_store(name: str) -> Callable[[Path], Path]:
 def journal(folder: Path) -> Path:
     import optuna
 
-    from sweeps.running.storage import open_storage
+    from sweeps.worker.storage import open_storage
 
     opened = open_storage(None, folder)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -429,7 +429,7 @@ def journal(folder: Path) -> Path:
 
 
 def read_journal(path: Path) -> Any:
-    from sweeps.running.storage import existing_study
+    from sweeps.worker.storage import existing_study
 
     study = existing_study("s", None, path.parent)
     if study is None:

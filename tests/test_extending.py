@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.config import check, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import check
 from rgbt.randomness import numpy_generator
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data
@@ -123,7 +124,7 @@ def words_of(lab: Path) -> list[str]:
 
 def test_the_page_runs(lab: Path, call: Call) -> None:
     from rgbt import evaluate, predict
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
     from rgbt.maskers import sketch
     from rgbt.run import main
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from rgbt import evaluate, source_code
-from rgbt.command import plain_command
+from rgbt import evaluate
+from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
+from rgbt.spec import source_code
 from rgbt.tracking import other_code
 from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.provenance import code

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig
 
-from rgbt.config import conf_dir
+from rgbt.config.compose import conf_dir
 from tests.fuzz import EXPERIMENTS, Case, cases, checked, composed, outcome, used
 
 FINE = ("refused", "accepted")

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from rgbt import predict
-from rgbt.command import plain_command
-from rgbt.config import build, compose
+from rgbt.config.command import plain_command
+from rgbt.config.compose import compose
+from rgbt.config.schema import build
 from rgbt.data.pseudo_labels import PseudoLabels
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
 

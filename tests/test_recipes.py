@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.config import conf_dir
+from rgbt.build.training_setup import _tell_what_is_not_as_published
+from rgbt.config.compose import conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
-from rgbt.prepared import _tell_what_is_not_as_published
 from tests.commands import SMALL, Call, only_run, short
 from tests.composed import composed
 from tests.test_run import ELSEWHERE

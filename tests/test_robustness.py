@@ -18,14 +18,14 @@ from torch import nn
 
 from rgbt import evaluate, robustness
 from rgbt.checks import InputError
-from rgbt.command import plain_command
-from rgbt.degraded import Failure, choose
-from rgbt.failing_images import Asked, Measured, asked_of, measure, weights_digest
+from rgbt.config.command import plain_command
+from rgbt.evaluation.corrupted import Failure, choose
+from rgbt.evaluation.robustness import Asked, Measured, asked_of, measure, weights_digest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.robustness import chosen_of, robustness_grid
 from tests.commands import Call, Trained, assert_one_sentence, short
-from tests.degradations.recorded import Recorded
+from tests.corruptions.recorded import Recorded
 
 ENTRY = plain_command(robustness.OWN, robustness.main)
 EVALUATE = plain_command(evaluate.OWN, evaluate.main)
@@ -65,7 +65,7 @@ def opened(**changes: Any) -> Any:
 
 
 class Evaluator:
-    """Stands for `rgbt.session.evaluate`; the accuracy tells what was evaluated."""
+    """Stands for `rgbt.build.session.evaluate`; the accuracy tells what was evaluated."""
 
     def __init__(self, stop_at: int = 99) -> None:
         self.calls: list[tuple[float, str]] = []
@@ -92,7 +92,7 @@ class Evaluator:
 @pytest.fixture
 def evaluator(monkeypatch: pytest.MonkeyPatch) -> Evaluator:
     made = Evaluator()
-    monkeypatch.setattr("rgbt.session.evaluate", made)
+    monkeypatch.setattr("rgbt.build.session.evaluate", made)
     return made
 
 
@@ -215,10 +215,10 @@ def test_stopped_and_given_again_it_goes_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     stopped, later = Evaluator(stop_at=3), Evaluator()
-    monkeypatch.setattr("rgbt.session.evaluate", stopped)
+    monkeypatch.setattr("rgbt.build.session.evaluate", stopped)
     with pytest.raises(KeyboardInterrupt):
         measure(opened(), "test", noise(), tmp_path)
-    monkeypatch.setattr("rgbt.session.evaluate", later)
+    monkeypatch.setattr("rgbt.build.session.evaluate", later)
     measure(opened(), "test", noise(), tmp_path)
     assert later.calls == [(10.0, "rgbt"), (50.0, "rgbt")]
 
@@ -227,7 +227,7 @@ def test_counts_of_other_weights_are_never_taken_for_these(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Killed between the two files: what says what made the counts is gone before they change."""
-    monkeypatch.setattr("rgbt.session.evaluate", Evaluator())
+    monkeypatch.setattr("rgbt.build.session.evaluate", Evaluator())
     measure(opened(), "test", [], tmp_path)
     other = Network()
     other.weight.data += 1
@@ -235,7 +235,7 @@ def test_counts_of_other_weights_are_never_taken_for_these(
     def killed(path: Path, content: bytes) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rgbt.tracking.files.write_atomic", killed)
+    monkeypatch.setattr("rgbt.files.atomic.write_atomic", killed)
     with pytest.raises(KeyboardInterrupt):
         measure(opened(model=other), "test", [], tmp_path)
     assert not (tmp_path / "clean.json").exists()

@@ -305,7 +305,7 @@ def test_evaluate_and_predict_a_stored_run(
     call: Call, data: Path, runs: Path, tmp_path: Path
 ) -> None:
     from rgbt import evaluate, predict
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     folder = only_run(runs)
     evaluate_entry = plain_command(evaluate.OWN, evaluate.main)
@@ -351,7 +351,7 @@ def test_evaluate_and_predict_a_stored_run(
 
 def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
     from rgbt import evaluate
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     folder = only_run(runs)
     entry = plain_command(evaluate.OWN, evaluate.main)
@@ -394,7 +394,7 @@ def test_a_checkpoint_of_another_model_is_refused(
 def test_multirun_finishes_the_other_points_when_one_is_wrong(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sweeps.running import executors
+    from sweeps.worker import executors
 
     monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
     code, _, err = train(

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rgbt import identity
-from rgbt.config import check, conf_dir
-from rgbt.identity import run_key
+from rgbt.config.compose import conf_dir
+from rgbt.config.schema import check
+from rgbt.spec import run_key as identity
+from rgbt.spec.run_key import run_key
 from tests.composed import composed
 
 RECORDED: dict[str, dict[str, str]] = json.loads(

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rgbt.config import check, compose
-from rgbt.identity import run_key
+from rgbt.config.compose import compose
+from rgbt.config.schema import check
+from rgbt.spec.run_key import run_key
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run
 from tests.conftest import write_data
 from tests.data.folder_files import PATTERNS, write_folder

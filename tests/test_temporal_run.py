@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.config import compose
+from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
-from rgbt.identity import run_key
 from rgbt.metrics.counts import Counts
+from rgbt.spec.run_key import run_key
 from rgbt.transforms.virtual_view import VirtualView
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from rgbt import evaluate, predict
-from rgbt.command import plain_command
-from rgbt.identity import run_key
+from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
-from rgbt.weights.__main__ import main as weights_main
+from rgbt.spec.run_key import run_key
+from rgbt.weights import main as weights_main
 from tests.commands import Call, Trained, assert_one_sentence, only_run, short, train
 from tests.models.golden import SHARED, compose
 

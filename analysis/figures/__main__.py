@@ -6,7 +6,7 @@ Without ``figure=`` it lists all figures and what each is made from.
 from __future__ import annotations
 
 from rgbt.checks import InputError
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 
 OF_FIGURES = (
     *("maps", "statistics", "methods", "runs", "runs_dir", "frames", "names", "pick", "rows"),
@@ -73,7 +73,7 @@ def _draw(figure: str, out: str, given: dict[str, str], overrides: list[str]) ->
             ".pdf (or .svg, .png)."
         )
     from analysis.figures.style import out_path, save
-    from rgbt.tracking.files import write_atomic
+    from rgbt.files.atomic import write_atomic
 
     path = out_path(out)
     drawn, numbers = make(figure, given, overrides)

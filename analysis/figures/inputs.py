@@ -112,8 +112,8 @@ class Given:
     @cached_property
     def config(self) -> DictConfig:
         """The configuration, with the partition of the figure unless another one was given."""
-        from rgbt.command import composing
-        from rgbt.config import compose
+        from rgbt.config.command import composing
+        from rgbt.config.compose import compose
 
         chosen = any(word.startswith("metric=") for word in self.overrides)
         words = [*([] if chosen else [f"metric={self.metric}"]), *self.overrides]
@@ -142,7 +142,7 @@ class Given:
         return made
 
     def _built(self, node: str) -> Any:
-        from rgbt.config import build, check_node
+        from rgbt.config.schema import build, check_node
 
         check_node(self.config[node], node)
         return build(self.config[node])

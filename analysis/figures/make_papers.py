@@ -159,7 +159,7 @@ def multihead_fig3(given: Given) -> Figure:
 def crm_fig5(given: Given) -> Figure:
     """Masks on a pair of images."""
     from analysis.figures import masks
-    from rgbt.command import built
+    from rgbt.config.command import built
 
     patches = given.numbers("patches", masks.PATCHES)
     sample = given.dataset.read(_one_name(given))

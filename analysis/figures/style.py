@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from analysis.arguments import out_folder
 from rgbt.checks import InputError
-from rgbt.tracking.files import write_atomic
+from rgbt.files.atomic import write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

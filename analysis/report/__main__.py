@@ -13,8 +13,8 @@ from typing import Any
 
 from analysis.arguments import MOST, out_folder, refuse_others, whole
 from rgbt.checks import InputError
-from rgbt.command import built, plain_command, readable_paths
-from rgbt.stored_config import parse_trust
+from rgbt.config.command import built, plain_command, readable_paths
+from rgbt.config.stored_config import parse_trust
 
 OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000", "trust": ""}
 

@@ -14,9 +14,9 @@ from analysis.report.runs import Run
 from analysis.report.tables_intervals import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
 from rgbt.checks import InputError
-from rgbt.identity import NOT_IN_KEY
+from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
-from rgbt.yaml_files import read_yaml
+from rgbt.spec.run_key import NOT_IN_KEY
 
 FILE = Path(__file__).with_name("differences.yaml")
 METRICS = (names.MIOU, names.VAR)

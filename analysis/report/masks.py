@@ -15,7 +15,7 @@ from analysis.report.data import Picture
 from analysis.report.runs import Run
 from analysis.report.tables_intervals import Track
 from rgbt.checks import InputError
-from rgbt.stored_config import check_targets
+from rgbt.config.stored_config import check_targets
 
 MOST = 8
 """Pictures on the page."""
@@ -60,7 +60,7 @@ def mask_pictures(
         runs: of the store.
         track: shows how far it is.
         remarks: gets a sentence for each that cannot be drawn, and for those beyond `MOST`.
-        trust: modules that their configurations may name (`rgbt.stored_config`).
+        trust: modules that their configurations may name (`rgbt.config.stored_config`).
     """
     maskers = maskers_in_use(runs)
     if len(maskers) > MOST:
@@ -145,7 +145,7 @@ def picture(masked: Masked, remarks: list[str], trust: Collection[str] = ()) -> 
 
 def _sample(node: Mapping[str, Any]) -> tuple[Any, str]:
     """A pair of the data set, or of the embedded one where its files are not here."""
-    from rgbt.config import compose
+    from rgbt.config.compose import compose
 
     try:
         dataset, where = _built("dataset", node), ""
@@ -161,7 +161,7 @@ def _sample(node: Mapping[str, Any]) -> tuple[Any, str]:
 def _built(name: str, values: Mapping[str, Any]) -> Any:
     from omegaconf import OmegaConf
 
-    from rgbt.config import build, check_node
+    from rgbt.config.schema import build, check_node
 
     node = OmegaConf.create({name: dict(values)})[name]
     check_node(node, name)

@@ -13,7 +13,7 @@ from typing import Any
 
 from analysis.report.data import ReportData
 from rgbt.checks import InputError
-from rgbt.tracking.files import write_atomic
+from rgbt.files.atomic import write_atomic
 
 STATIC = Path(__file__).with_name("static")
 STYLES = ("style.css", "tables.css", "drawings.css")

@@ -22,15 +22,15 @@ from analysis.report.runs_provenance import (
 )
 from analysis.report.store import Files, StoredRun
 from rgbt.checks import InputError, check_choice
+from rgbt.config.stored_config import settings_of
+from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics import names
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import iou, miou, summary
-from rgbt.naming import group_of
-from rgbt.stored_config import settings_of
+from rgbt.spec.naming import group_of
 from rgbt.tracking.provenance import without_passwords
-from rgbt.yaml_files import parse_yaml
 from sweeps.table.cell_points import DEFAULT_SCALE, TAG
 
 SPLIT = "test"

@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlparse
 
-from rgbt.budgets import TEXT, read_bytes
 from rgbt.checks import InputError, RunError, nearest
+from rgbt.files.budgets import TEXT, read_bytes
 from rgbt.tracking.mlflow_client import ENVIRONMENT
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.provenance import without_passwords

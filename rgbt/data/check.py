@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rgbt.command import command
-from rgbt.config import build
+from rgbt.config.command import command
+from rgbt.config.schema import build
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.report.dataset import check_dataset, layout_of, num_listed
 from rgbt.data.report.values import Report, SplitReport

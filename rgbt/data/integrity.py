@@ -18,8 +18,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from rgbt.budgets import CONTENT, PIXELS, read_bytes
 from rgbt.checks import InputError
+from rgbt.files.budgets import CONTENT, PIXELS, read_bytes
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 """How files of these kinds begin, whatever their names end in."""

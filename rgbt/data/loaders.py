@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, RunError
 from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
-from rgbt.data.decoded.dataset import check_cache
+from rgbt.data.cache.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
@@ -62,7 +62,7 @@ class LoaderSettings:
         augment: "loader" augments in the processes that read, "device" whole batches where the
             network is, with the same bits; "auto" does so on a GPU, where the transform can.
         cache: images are decoded once into memory-mapped files of this folder and read from there
-            (`rgbt.data.decoded`); "auto": in the folder of the user's cache; None: no such files.
+            (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
         on_error: "raise" stops at a file that cannot be read; "skip" names it once and takes the
             next readable sample of the list instead (training) or leaves it out (evaluation).
     """

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
+from rgbt.data.cache.dataset import Decoded
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.files import read_array
 from rgbt.data.mfnet import MFNet
 

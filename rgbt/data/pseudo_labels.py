@@ -1,6 +1,6 @@
 """Labels that a trained network predicted, in the place of those of a data set.
 
-A folder of them (written by `rgbt.pseudo`) holds:
+A folder of them (written by `rgbt.evaluation.pseudo_labels`) holds:
 
     labels/NAME.png       8 bit, class ids of the data set, 255 where the network was not sure
     confidence/NAME.png   16 bit, 65535 times the probability of the predicted class
@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from rgbt.budgets import read_json
 from rgbt.checks import InputError
 from rgbt.data.batches import Dataset
 from rgbt.data.files import decode, read_label
+from rgbt.files.budgets import read_json
 from rgbt.types import Sample
 
 FORMAT = "rgbt pseudo-labels 1"

@@ -31,7 +31,7 @@ Stack = Callable[[list[Any]], Loadable]
 """Examples of one size -> one value; InputError where their sizes differ."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a command (`rgbt.stopping`)."""
+"""Signals that end a command (`rgbt.runtime.signals`)."""
 
 LOOK_S = 2.0
 """How often a worker looks whether its main process is still there."""

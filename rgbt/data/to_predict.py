@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError, nearest
+from rgbt.data.cache.dataset import Decoded
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.images import Images, ReadsPairs
 from rgbt.data.new_images import find_pairs
 from rgbt.types import Sample

@@ -22,7 +22,7 @@ from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.randomness import torch_generator
-from rgbt.stopping import Stopped, at_once, deferred
+from rgbt.runtime.signals import Stopped, at_once, deferred
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
 RecordStep = Callable[[int, dict[str, float]], None]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
-from rgbt.command import command
-from rgbt.config import build
+from rgbt.config.command import command
+from rgbt.config.schema import build
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator

@@ -21,8 +21,8 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.budgets import ARRAYS, check_array
 from rgbt.checks import InputError, one_line
+from rgbt.files.budgets import ARRAYS, check_array
 
 FORMAT, DIGEST = "format", "digest"
 """Members of every archive: its mark, and the SHA-256 of all others (`_digest`)."""

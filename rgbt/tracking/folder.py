@@ -15,7 +15,7 @@ evaluations/*.npz   counts of later evaluations (`rgbt.evaluate`) and of pairs o
 evaluations/robustness/<split>/  counts of failing images, and what made them (`rgbt.robustness`)
 last.pt best.pt     checkpoints: to resume from, and the best by the selection split;
                     last_previous.pt, checkpoints/: while training (`rgbt.engine.committed`)
-dataset.json        which images the run was begun on (`rgbt.training`)
+dataset.json        which images the run was begun on (`rgbt.training.train`)
 lock mlflow.json    who trains here now; what MLflow has been sent
 result.json         written last, by rename: the run is finished exactly if it exists
 ==================  ==============================================================================
@@ -32,9 +32,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from rgbt.budgets import TEXT, parse_json, read_bytes, read_json, sealed
 from rgbt.checks import InputError, one_line
-from rgbt.tracking.files import holder_of, holding, is_held, remove_left_behind, write_atomic
+from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
+from rgbt.files.budgets import TEXT, parse_json, read_bytes, read_json, sealed
 from rgbt.tracking.formats import (
     Kind,
     LineForm,

@@ -1,7 +1,7 @@
 """The JSON files of a run folder: which keys of which types each of them holds, and their readers.
 
-A mapping is written with a check sum (`rgbt.budgets.sealed`), so that a damaged file is refused and
-gives no other value. Files of before there was one are read by their types alone.
+A mapping is written with a check sum (`rgbt.files.budgets.sealed`), so that a damaged file is
+refused and gives no other value. Files of before there was one are read by their types alone.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Literal, Required
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
-from rgbt.budgets import read_json
+from rgbt.files.budgets import read_json
 
 Kind = Literal["train", "val", "test"]
 
@@ -43,7 +43,7 @@ class MarkerForm(TypedDict):
 
 
 class ResultForm(TypedDict, total=False):
-    """``result.json`` (`rgbt.training`)."""
+    """``result.json`` (`rgbt.training.train`)."""
 
     name: str
     key: str

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rgbt.tracking.files import holding
+from rgbt.files.atomic import holding
 from rgbt.tracking.mlflow_view import view_tags
 
 ENVIRONMENT = {

@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from rgbt.budgets import read_json, sealed
+from rgbt.files.atomic import write_atomic
+from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
-from rgbt.tracking.files import write_atomic
 from rgbt.tracking.folder import MetricLine, RunFolder
 from rgbt.tracking.formats import SentForm
 from rgbt.tracking.mlflow_client import Store

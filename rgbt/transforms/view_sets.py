@@ -12,8 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.budgets import TEXT, read_bytes
 from rgbt.checks import InputError, nearest, one_line
+from rgbt.files.budgets import TEXT, read_bytes
 from rgbt.ranges import Names
 from rgbt.transforms.virtual_view import VirtualView
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from rgbt.config import PIXELS, with_pixels
+from rgbt.config.compose import PIXELS, with_pixels
 from sweeps import attributes
 
 if TYPE_CHECKING:

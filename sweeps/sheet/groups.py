@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps.points import Point
-from sweeps.running.lists import Outcome
 from sweeps.sheet.texts import Text
 from sweeps.table.cells import Cell, Value, over_seeds
+from sweeps.worker.lists import Outcome
 
 MOST_REGIONS = 99
 

@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Sequence
 
 from rgbt.tracking.tables import ABSENT, Grid
-from sweeps.running.lists import Outcome, estimated_seconds, other_code_line
-from sweeps.running.live import duration
-from sweeps.running.sources import State
 from sweeps.table.cell_points import Wanted
 from sweeps.table.sizes import SCALE
+from sweeps.worker.lists import Outcome, estimated_seconds, other_code_line
+from sweeps.worker.live import duration
+from sweeps.worker.sources import State
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rgbt.tracking.files import write_atomic
+from rgbt.files.atomic import write_atomic
 from rgbt.tracking.terminal import line_width, place_lines, show, tell
 from sweeps.report.records import record
-from sweeps.running.lists import Outcome, other_code_line
 from sweeps.sheet.figure import draw_table
 from sweeps.sheet.files import latex, markdown, tidy_csv
 from sweeps.sheet.sheet import Sheet, sheet_of
@@ -20,6 +19,7 @@ from sweeps.table.cell_points import Wanted
 from sweeps.table.cells import NO_VALUE
 from sweeps.table.scoring import Scored, score
 from sweeps.table.sizes import parameter_cells
+from sweeps.worker.lists import Outcome, other_code_line
 
 if TYPE_CHECKING:
     from rgbt.tracking.mlflow_store import Tracking

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
-from rgbt.command import readable_paths
+from rgbt.config.command import readable_paths
 from sweeps.points import Evaluation, Point
 from sweeps.table.cells import evaluation_of, is_counted
 from sweeps.table.table import Table
 
 if TYPE_CHECKING:
-    from sweeps.running.lists import Outcome
+    from sweeps.worker.lists import Outcome
 
 DEFAULT_SCALE = "demo"
 """What a run is without ``scale=...``."""

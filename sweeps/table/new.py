@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.command import composing
-from rgbt.config import PIXELS, check, compose
-from rgbt.tracking.files import write_atomic
+from rgbt.config.command import composing
+from rgbt.config.compose import PIXELS, compose
+from rgbt.config.schema import check
+from rgbt.files.atomic import write_atomic
 from sweeps.table.table import OWN as FOLDER
 from sweeps.table.table import PUBLISHED, load_table
 

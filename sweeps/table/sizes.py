@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rgbt.checks import InputError
-from rgbt.command import composing
-from rgbt.config import build, check_node, compose
+from rgbt.config.command import composing
+from rgbt.config.compose import compose
+from rgbt.config.schema import build, check_node
 from sweeps.table.cell_points import Wanted
 from sweeps.table.cells import NO_VALUE, Cell, Place
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError, nearest
+from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics.pairs import Protocol
-from rgbt.yaml_files import read_yaml
 from sweeps.points import Head
 from sweeps.table.checks import check_table
 

@@ -15,7 +15,7 @@ import pytest
 from analysis.compare import OWN, comparison_csv, main, metrics_of, settings_of
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
 from tests.analysis.test_results import COMMAS, make_run
 from tests.analysis.uncertainty.simulated import Population, counts_of
@@ -274,7 +274,7 @@ def test_help_is_light():
     code = (
         "import sys; sys.argv = ['compare', '--help']\n"
         "from analysis.compare import OWN, main\n"
-        "from rgbt.command import plain_command\n"
+        "from rgbt.config.command import plain_command\n"
         "try:\n    plain_command(OWN, main)()\n"
         "except SystemExit as left:\n    assert not left.code\n"
         "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'scipy'} & set(sys.modules)\n"

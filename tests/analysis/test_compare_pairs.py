@@ -12,7 +12,7 @@ from analysis.compare import OWN, main, metrics_of
 from analysis.results import open_counts
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import PROTOCOLS, file_name
 from tests.analysis.test_results import make_run

@@ -11,8 +11,8 @@ from analysis.compare import OWN, main
 from analysis.results import open_counts
 from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
-from rgbt.command import plain_command
-from rgbt.failing_images import CLEAN, FORMAT
+from rgbt.config.command import plain_command
+from rgbt.evaluation.robustness import CLEAN, FORMAT
 from rgbt.metrics.named import value
 from rgbt.robustness import FOLDER
 from tests.analysis import robust_runs

@@ -18,7 +18,7 @@ from analysis.predictions.scoring import score_folder
 from analysis.predictions.table import Cell
 from analysis.score import OWN, main, score_tables
 from analysis.uncertainty import Resampling, estimate
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value

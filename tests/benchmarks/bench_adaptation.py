@@ -37,9 +37,10 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
     """Seconds per step, wall and CPU, and peak memory in MiB of one case, in this process."""
     import torch
 
-    from rgbt.config import check, compose
+    from rgbt.build.training_setup import prepare
+    from rgbt.config.compose import compose
+    from rgbt.config.schema import check
     from rgbt.engine.trainer import Trainer
-    from rgbt.prepared import prepare
 
     experiment, changes = CASES[case]
     config = compose(

@@ -24,9 +24,10 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from rgbt.config import build, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import build
+from rgbt.data.cache.dataset import Decoded
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.decoded.dataset import Decoded
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.dataset import synth

@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 
 from sweeps import attributes as names
-from sweeps.running.storage import load_study, open_storage, study_names
+from sweeps.worker.storage import load_study, open_storage, study_names
 
 POINTS = 6
 TRIALS = 16

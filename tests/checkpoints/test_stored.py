@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from rgbt.checkpoints import stored
+from rgbt.checkpoints.read import read
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, training_payload
 from rgbt.engine.committed import Checkpoints
-from rgbt.weights.read import read
 from tests.checkpoints.damaging import damaged
 
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data.decoded import file as decoded_file
-from rgbt.data.decoded import stamps as decoded_stamps
-from rgbt.data.decoded import store as decoded_store
-from rgbt.data.decoded.__main__ import main
-from rgbt.data.decoded.dataset import Decoded, decoded_dataset, default_folder
+from rgbt.data.cache import file as decoded_file
+from rgbt.data.cache import stamps as decoded_stamps
+from rgbt.data.cache import store as decoded_store
+from rgbt.data.cache.__main__ import main
+from rgbt.data.cache.dataset import Decoded, decoded_dataset, default_folder
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
 from rgbt.data.reader import Source
@@ -745,7 +745,7 @@ def test_which_folder(case: Case, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 def test_the_command(
     case: Case, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rgbt.data.decoded.__main__.built", lambda node, overrides: case.source)
+    monkeypatch.setattr("rgbt.data.cache.__main__.built", lambda node, overrides: case.source)
     arguments = {"cache": str(case.cache), "remove": "false"}
     assert main(arguments, []) == 0
     size = sum(path.stat().st_size for path in case.cache.glob("arrays-*/*"))

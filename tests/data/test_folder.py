@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node
+from rgbt.config.schema import build, check_node
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import grey, label_codes, painted
 from rgbt.data.freiburg_images import _grey_levels

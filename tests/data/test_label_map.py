@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.config import compose
+from rgbt.config.compose import compose
 from rgbt.data.label_map import LabelMap
-from rgbt.pseudo import label_map_of
+from rgbt.evaluation.pseudo_labels import label_map_of
 
 TARGETS = ("road", "car")
 

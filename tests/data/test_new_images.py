@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.data.decoded.dataset import Decoded
+from rgbt.data.cache.dataset import Decoded
 from rgbt.data.freiburg_images import FreiburgImages
 from rgbt.data.images import PairPattern
 from rgbt.data.kp import KP

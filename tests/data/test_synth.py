@@ -433,7 +433,7 @@ def test_a_cache_that_is_a_file_is_named(tmp_path: Path) -> None:
 def test_the_yaml_names_every_setting_with_its_default() -> None:
     import inspect
 
-    from rgbt.config import compose
+    from rgbt.config.compose import compose
 
     node = dict(compose(["dataset=synth"]).dataset)
     assert node.pop("absent") == "released"

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import build, check_node
 from rgbt.data.freiburg import CLASSES, Freiburg
 from rgbt.data.synth import freiburg
 from rgbt.data.synth.factors import SceneFactors

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node, compose, conf_dir
+from rgbt.config.compose import compose, conf_dir
+from rgbt.config.schema import build, check_node
 from rgbt.data.pst900 import CLASSES, PST900, bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors

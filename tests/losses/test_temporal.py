@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node
+from rgbt.config.schema import build, check_node
 from rgbt.losses import temporal as module
 from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.cross_entropy import CrossEntropy

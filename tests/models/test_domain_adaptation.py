@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from torch.nn import functional as F
 
-from rgbt.config import conf_dir
+from rgbt.config.compose import conf_dir
 from tests.models.golden import alone, network
 from tests.models.plain import generator, images
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config import conf_dir
+from rgbt.config.compose import conf_dir
 from rgbt.models.inputs import Inputs
 from rgbt.models.mfnet import MFNet, doubled
 from tests.models.contract import (

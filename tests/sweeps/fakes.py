@@ -21,18 +21,18 @@ from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.points import Point
-from sweeps.running import driver as drivers
-from sweeps.running import sources
-from sweeps.running.driver import Driver
-from sweeps.running.found import Runs
-from sweeps.running.ledger import Ledger
-from sweeps.running.owner import STALE_S, Owner
-from sweeps.running.plan import Plan, PlannedRun
-from sweeps.running.sources import ListSource, SearchSource
-from sweeps.running.storage import begin_study
-from sweeps.running.work import Work
 from sweeps.settings import Objective, Settings
 from sweeps.space.space import parse_space
+from sweeps.worker import driver as drivers
+from sweeps.worker import sources
+from sweeps.worker.driver import Driver
+from sweeps.worker.found import Runs
+from sweeps.worker.owner import STALE_S, Owner
+from sweeps.worker.plan import Plan, PlannedRun
+from sweeps.worker.sources import ListSource, SearchSource
+from sweeps.worker.storage import begin_study
+from sweeps.worker.trial_store import Ledger
+from sweeps.worker.work import Work
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
@@ -454,7 +454,7 @@ def until(condition: Callable[[], Any], what: str) -> Any:
 HOLDER = """
 import sys, time
 from pathlib import Path
-from rgbt.tracking.files import holding
+from rgbt.files.atomic import holding
 with holding(Path(sys.argv[1])) as holder:
     assert holder is None, holder
     print("held", flush=True)

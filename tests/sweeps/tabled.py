@@ -11,9 +11,9 @@ import numpy as np
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.points import Evaluation, Point
-from sweeps.running.lists import Outcome
 from sweeps.table.scoring import Scored, score
 from sweeps.table.table import Column, Row, Table
+from sweeps.worker.lists import Outcome
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
@@ -50,7 +50,7 @@ def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
 
 @dataclass(frozen=True)
 class FakeFound:
-    """Stands for `sweeps.running.found.Found`."""
+    """Stands for `sweeps.worker.found.Found`."""
 
     key: str
     made: Mapping[Evaluation | None, Counts]

@@ -12,10 +12,10 @@ from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.asked import OF_THE_TABLE, settings_of
 from sweeps.points import Point
 from sweeps.reproduce import OWN, entry
-from sweeps.running import lists
-from sweeps.running.lists import Outcome, PointList
 from sweeps.settings import EXECUTION, Settings
 from sweeps.sheet import results as table_results
+from sweeps.worker import lists
+from sweeps.worker.lists import Outcome, PointList
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeFound, right
 

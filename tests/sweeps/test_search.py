@@ -10,14 +10,14 @@ import pytest
 
 import sweeps.search as searching
 from rgbt.checks import InputError, RunError
-from rgbt.config import compose
+from rgbt.config.compose import compose
 from sweeps import attributes as names
-from sweeps.running.found import open_runs
-from sweeps.running.ledger import Ledger
-from sweeps.running.storage import load_study, open_storage
 from sweeps.search import Search, _probe, search
 from sweeps.settings import Objective, Settings
 from sweeps.space.space import parse_space
+from sweeps.worker.found import open_runs
+from sweeps.worker.storage import load_study, open_storage
+from sweeps.worker.trial_store import Ledger
 from tests.sweeps.fakes import settings as plain_settings
 
 SPACE = {"masker.sigma_div": {"type": "float", "low": 1, "high": 4}}

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import conf_dir
+from rgbt.config.compose import conf_dir
 from sweeps.settings import EXECUTION, Objective, Settings, read_settings
 
 FILE = conf_dir() / "hydra" / "sweeper" / "study.yaml"

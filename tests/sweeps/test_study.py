@@ -13,7 +13,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from sweeps import attributes
 from sweeps.study import OWN, dashboard_command, main, study_folder
 from tests.commands import Call, assert_one_sentence

@@ -12,11 +12,11 @@ from omegaconf import open_dict
 
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
-from rgbt.config import conf_dir, register_resolvers
-from sweeps.running.lists import Outcome, PointList
+from rgbt.config.compose import conf_dir, register_resolvers
 from sweeps.search import Search
 from sweeps.settings import Settings
 from sweeps.sweep import study_command, sweep
+from sweeps.worker.lists import Outcome, PointList
 
 
 class Asked:

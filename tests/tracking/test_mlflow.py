@@ -17,9 +17,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config import build, check_node
+from rgbt.config.schema import build, check_node
+from rgbt.files.atomic import holding
 from rgbt.tracking import mlflow_client, sync
-from rgbt.tracking.files import holding
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, shown, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rgbt.budgets import SEAL
+from rgbt.files.budgets import SEAL
 from rgbt.tracking import other_code as module
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code, warn_of_result, warn_of_steps

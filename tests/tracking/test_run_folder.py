@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.tracking.files import is_held, write_atomic
+from rgbt.files.atomic import is_held, write_atomic
 from rgbt.tracking.folder import Description, RunFolder, runs_in
 
 
@@ -162,7 +162,7 @@ def test_lock_is_freed_when_its_process_is_killed_though_a_forked_child_lives_on
     code = (
         "import os, sys, time\n"
         "from pathlib import Path\n"
-        "from rgbt.tracking.files import holding\n"
+        "from rgbt.files.atomic import holding\n"
         "with holding(Path(sys.argv[1])):\n"
         "    child = os.fork()\n"
         "    if child: print(child, flush=True)\n"

@@ -112,6 +112,6 @@ def _check(dataset: LabelledDataset, words: str) -> int:
 
 
 if __name__ == "__main__":
-    from rgbt.command import plain_command
+    from rgbt.config.command import plain_command
 
     plain_command(OWN, main)()

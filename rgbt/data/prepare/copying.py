@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rgbt.budgets import read_json
 from rgbt.checks import InputError
 from rgbt.data.prepare.source import Entry
+from rgbt.files.budgets import read_json
 
 PLAN = ".prepare.json"
 """In the folder that is written: what from, so that an interrupted command goes on."""

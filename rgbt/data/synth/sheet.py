@@ -17,10 +17,10 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
+from rgbt.config.values import check_value
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import Scene, render_scene
 from rgbt.ranges import Seed
-from rgbt.values import check_value
 
 COLOURS = np.array(
     [

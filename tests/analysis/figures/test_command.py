@@ -15,7 +15,7 @@ from analysis.figures.__main__ import OF_FIGURES, OWN, main
 from analysis.figures.catalogue import FIGURES
 from analysis.predictions.scoring import Options, score_folder
 from analysis.statistics.data import SpatialStatistics
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from tests.analysis.figures.drawn import counts, statistics, strips
@@ -309,7 +309,7 @@ def test_help_does_not_wait_for_heavy_libraries() -> None:
     script = (
         "import sys; sys.argv = ['x', '--help']\n"
         "from analysis.figures.__main__ import OWN, main\n"
-        "from rgbt.command import plain_command\n"
+        "from rgbt.config.command import plain_command\n"
         "try:\n    plain_command(OWN, main)()\nexcept SystemExit:\n    pass\n"
         "print([m for m in ('torch', 'matplotlib', 'mlflow', 'pandas', 'cv2') if m in sys.modules])"
     )

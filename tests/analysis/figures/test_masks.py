@@ -18,7 +18,8 @@ from analysis.figures.masks import (
     whole_cells,
 )
 from rgbt.checks import InputError
-from rgbt.config import build, compose
+from rgbt.config.compose import compose
+from rgbt.config.schema import build
 from rgbt.types import MaskPair, Sample
 from tests.analysis.figures.drawn import texts
 

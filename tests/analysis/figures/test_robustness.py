@@ -14,7 +14,7 @@ from analysis.figures.__main__ import OWN, main
 from analysis.figures.robustness import MISSING, Curve, draw, numbers, panels
 from analysis.robustness import Training, levels_of
 from rgbt.checks import InputError
-from rgbt.command import plain_command
+from rgbt.config.command import plain_command
 from tests.analysis.figures.drawn import letters, texts
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call

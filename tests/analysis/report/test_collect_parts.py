@@ -19,7 +19,7 @@ from analysis.report.store import Files, StoredRun
 from analysis.report.studies import pareto_front, read_study
 from analysis.report.tables_files import read_recorded, reproduce_command
 from rgbt.checks import InputError
-from rgbt.config import flatten
+from rgbt.config.compose import flatten
 from rgbt.metrics.counts import Counts
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
 from tests.composed import composed as configuration

@@ -11,7 +11,7 @@ from analysis.report import collect as collecting
 from analysis.report.store import Files, StoredRun, read_store
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
-from sweeps.running.found import Found
+from sweeps.worker.found import Found
 from tests.analysis.report.stores import RGB, RGB_FILE
 
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sweeps.points import Point
-from sweeps.running.found import Found
-from sweeps.running.lists import Outcome
 from sweeps.sheet.groups import configuration, group_grid, unfinished_grid
+from sweeps.worker.found import Found
+from sweeps.worker.lists import Outcome
 from tests.sweeps.fakes import finish
 
 

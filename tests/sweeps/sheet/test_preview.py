@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sweeps.running.lists import Outcome
 from sweeps.sheet.preview import cells_grid, summary, tables_grid
 from sweeps.table.cell_points import Wanted
 from sweeps.table.table import Column, Row
+from sweeps.worker.lists import Outcome
 from tests.sweeps.tabled import table
 
 FRAMES = (

@@ -12,7 +12,7 @@ from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from rgbt.checks import InputError
-from rgbt.config import conf_dir
+from rgbt.config.compose import conf_dir
 from sweeps.space.grid import distributions, grid_points, list_points, split
 
 LOADER = ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_dir())))

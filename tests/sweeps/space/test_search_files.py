@@ -8,7 +8,8 @@ import hydra
 import pytest
 from omegaconf import DictConfig
 
-from rgbt.config import check, conf_dir, flatten, register_resolvers
+from rgbt.config.compose import conf_dir, flatten, register_resolvers
+from rgbt.config.schema import check
 from sweeps.settings import read_settings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, plain_space

@@ -5,9 +5,9 @@ import pytest
 from rgbt.checks import InputError
 from sweeps.asked import wanted_of
 from sweeps.points import Evaluation
-from sweeps.running.lists import Outcome
 from sweeps.table.cell_points import Wanted, seeds_of
 from sweeps.table.table import Column, Row
+from sweeps.worker.lists import Outcome
 from tests.sweeps.tabled import table
 
 COLUMNS = (

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.config import build
-from rgbt.identity import run_key
+from rgbt.config.schema import build
 from rgbt.metrics.named import parse
+from rgbt.spec.run_key import run_key
 from sweeps.table.table import Column, Row, Table, load_table, table_names
 from tests.sweeps.composed import row_config
 

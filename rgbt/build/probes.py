@@ -1,0 +1,65 @@
+"""Problems that one sample or one mask shows, checked before a run starts."""
+
+from __future__ import annotations
+
+from rgbt.checks import InputError
+from rgbt.build.contracts import check_first_sample, check_regions, check_transform, is_own
+from rgbt.data.cache.dataset import Decoded
+from rgbt.maskers.contract import check_masker
+from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.build.session import Session
+from rgbt.types import Masker, Sample
+
+
+def first_readable(session: Session, split: str) -> Sample:
+    """The first sample of a split; unreadable ones are passed over where the run does so too."""
+    refused: InputError | None = None
+    for name in session.dataset.names(split):
+        try:
+            return session.dataset.read(name)
+        except InputError as error:
+            if session.loading.on_error == "raise":
+                raise
+            refused = refused or error
+    assert refused is not None, "a split holds a name"
+    raise refused
+
+
+def example_hw(session: Session) -> tuple[int, int]:
+    """Size of the first training example."""
+    sample = first_readable(session, session.domains.source.split)
+    example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
+    height, width = example.thermal.shape
+    return height, width
+
+
+def check_own_parts(session: Session) -> None:
+    """Refuse a user's data set, transform or partition that does not do what it must.
+
+    Raises:
+        InputError: in the words of `rgbt.build.contracts`.
+    """
+    dataset, transform = session.dataset, session.transform
+    dataset = dataset.source if isinstance(dataset, Decoded) else dataset
+    splits = [domain.split for domain in session.domains.named.values()]
+    if is_own(dataset):
+        for split in dict.fromkeys((*splits, session.trainer.selection_split, "test")):
+            check_first_sample(dataset, split)
+    if is_own(transform):
+        sample = first_readable(session, splits[0])
+        check_transform(transform, sample, numpy_generator(session.config.seed, "probe"))
+    if is_own(session.regions):
+        check_regions(session.regions, first_readable(session, "test").thermal.shape)
+
+
+def check_cells(session: Session, masker: Masker) -> None:
+    """Draw one mask, so that cells that do not fit the crop are reported before the run starts.
+
+    Raises:
+        InputError: they do not, or a user's masker is none.
+    """
+    crop_hw = getattr(session.transform, "crop_hw", None)
+    if crop_hw is None and is_own(masker):
+        crop_hw = example_hw(session)
+    if crop_hw is not None and not getattr(masker, "hides_nothing", False):
+        check_masker(masker, crop_hw, torch_generator(session.config.seed, "probe"))

@@ -1,0 +1,147 @@
+"""How a kind of file is described: how it is recognised, and where each of its names belongs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor, nn
+
+from rgbt.checkpoints.read import Contents
+
+Shapes = Mapping[str, tuple[int, ...]]
+Overrides = tuple[str, ...]
+Reasons = tuple[tuple[str, str], ...]
+"""(regular expression at the beginning of a name, why); the first that fits counts."""
+
+NOT_IN_FILE = "not part of the ImageNet network"
+DERIVED = "rebuilt from the sizes of the network"
+COUNTER = "num_batches_tracked"
+"""Last word of batch normalisation's counters, which files of old torch versions lack."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a file is, read off its names and shapes.
+
+    Attributes:
+        layout: name of the layout.
+        what: in words, such as "CMX checkpoint".
+        family: of networks that the file holds a whole one of; "" where it is a backbone.
+        size: in words, such as "MiT-B2"; "" where it has none of the published sizes.
+        classes: K; None for a backbone, or where it cannot be read.
+        prefix: before every name that belongs to the network.
+        window: side of the attention windows in tokens, where there are such.
+        fits: command-line overrides of the networks that the file fits; the first is the usual.
+        convention: overrides of what the release does and its weights do not tell: how the
+            network is fed and evaluated.
+        inputs: how the network was fed, as the file itself says it; None where it does not.
+        remarks: what whoever uses the file should know.
+    """
+
+    layout: str
+    what: str
+    family: str = ""
+    size: str = ""
+    classes: int | None = None
+    prefix: str = ""
+    window: int | None = None
+    fits: tuple[Overrides, ...] = ()
+    convention: Overrides = ()
+    inputs: Mapping[str, object] | None = None
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """All in words."""
+        classes = "" if self.classes is None else f"{self.classes} classes"
+        details = ", ".join(filter(None, (self.size, classes)))
+        return f"{self.what} ({details})" if details else self.what
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a network is filled from a file.
+
+    Attributes:
+        source: entry of the network -> name in the file, without `Facts.prefix`.
+        fresh: entries that such a file does not hold, which keep their initial values.
+        leftover: names of the file that the network has no place for.
+        stems: entries whose input channels may be others than in the file: for one channel the
+            mean over the file's, for further ones behind the file's the same mean.
+        remarks: as in `Facts`.
+    """
+
+    source: Callable[[str], str] = str
+    fresh: Reasons = ()
+    leftover: Reasons = ()
+    stems: Collection[str] = ()
+    remarks: tuple[str, ...] = ()
+
+
+class Layout(Protocol):
+    """A module of `rgbt.checkpoints.layouts`."""
+
+    def recognise(self, contents: Contents) -> Facts | None:
+        """What the file is, None where it is of another layout."""
+        ...
+
+    def rule(self, family: str, model: nn.Module, facts: Facts) -> Rule | None:
+        """How a network of `family` is filled, None where the file is of no use to it."""
+        ...
+
+
+def reason(reasons: Reasons, name: str) -> str | None:
+    """The first reason whose pattern fits the beginning of `name`."""
+    return next((why for pattern, why in reasons if re.match(pattern, name)), None)
+
+
+def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Name -> shape."""
+    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
+def size_at(shapes: Shapes, name: str, dimension: int = 0) -> int | None:
+    """One size of a tensor, None where it is missing or has fewer dimensions."""
+    shape = shapes.get(name, ())
+    return shape[dimension] if dimension < len(shape) else None
+
+
+def count_blocks(names: Collection[str], pattern: str) -> int:
+    """How many different numbers the first group of `pattern` takes among the names."""
+    matches = (re.match(pattern, name) for name in names)
+    return len({match.group(1) for match in matches if match})
+
+
+FAMILIES: Mapping[str, str] = {
+    "mask2former": "RGB-T Mask2Former",
+    "cmx": "CMX",
+    "rtfnet": "RTFNet",
+    "mfnet": "MFNet",
+    "pspnet": "PSPNet (HeatNet)",
+    "deeplabv2": "DeepLab v2",
+}
+"""Module of rgbt.models -> what its network is called."""
+
+CLASS_PARTS: Mapping[str, tuple[str, ...]] = {
+    "mask2former": ("sem_seg_head.predictor.class_embed",),
+    "cmx": ("decode_head.linear_pred",),
+    "rtfnet": ("deconv5.1",),
+    "mfnet": ("decode1",),
+    "pspnet": ("final",),
+    "deeplabv2": ("heads", "auxiliary"),
+}
+"""Parts of a network whose sizes depend on the number of classes."""
+
+
+def family_of(network: type[nn.Module]) -> str:
+    """The module of rgbt.models that a class or a base of it is from, "" for all others."""
+    return next(filter(None, (family_named(each.__module__) for each in network.__mro__)), "")
+
+
+def family_named(path: str) -> str:
+    """The same for a dotted path: "cmx" for "rgbt.models.cmx.model.CMX"."""
+    words = path.split(".")
+    return words[2] if words[:2] == ["rgbt", "models"] and len(words) > 2 else ""

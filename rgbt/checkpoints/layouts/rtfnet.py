@@ -1,0 +1,46 @@
+"""RTFNet's checkpoints: bare state dicts, without counters where they are old."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from rgbt.checkpoints.layout import Facts, Rule, count_blocks, shapes_of, size_at
+from rgbt.checkpoints.layouts.resnet import DEPTHS
+from rgbt.checkpoints.read import Contents
+
+CONVENTION = ("model/inputs=unit", "model.final_relu=true")
+
+
+def recognise(contents: Contents) -> Facts | None:
+    """A file with both encoders and the decoder."""
+    shapes = shapes_of(contents.tensors)
+    parts = ("encoder_rgb_", "encoder_thermal_", "deconv")
+    if not all(any(name.startswith(part) for name in shapes) for part in parts):
+        return None
+    bottlenecks = any(name.startswith("encoder_rgb_layer1.0.conv3.") for name in shapes)
+    blocks = tuple(
+        count_blocks(shapes, rf"encoder_rgb_layer{stage}\.(\d+)\.") for stage in range(1, 5)
+    )
+    layers = DEPTHS.get((bottlenecks, blocks))
+    return Facts(
+        layout="rtfnet",
+        what="RTFNet checkpoint",
+        family="rtfnet",
+        size=f"ResNet-{layers}" if layers else "",
+        classes=size_at(shapes, "deconv5.1.conv1.weight"),
+        fits=((f"model=rtfnet_{layers}",),) if layers else (),
+        convention=CONVENTION,
+    )
+
+
+def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
+    """Names are ours."""
+    return Rule() if family == "rtfnet" else None
+
+
+def released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """RTFNet's names, which are ours."""
+    return OrderedDict(state)

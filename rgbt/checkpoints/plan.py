@@ -1,0 +1,164 @@
+"""Where each tensor of a file goes, and what is left on either side."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from rgbt.checkpoints.layout import COUNTER, Rule, reason
+from rgbt.checks import InputError, nearest
+
+NAMED_FRESH = "named in model.fresh"
+
+
+@dataclass
+class Plan:
+    """What a file does to a network.
+
+    Attributes:
+        values: entry of the network -> name in the file.
+        zeros: counters of batch normalisation that the file lacks; they begin at 0.
+        fresh: entry that keeps its initial value -> why.
+        leftover: name in the file without a place -> why.
+        missing: entries that the file should hold and does not.
+        unexpected: names in the file that nothing explains.
+        unfit: entry -> how the file's tensor differs in shape or kind.
+        torn: pairs of entries that are one tensor in the network and two different in the file.
+    """
+
+    values: dict[str, str] = field(default_factory=dict)
+    zeros: list[str] = field(default_factory=list)
+    fresh: dict[str, str] = field(default_factory=dict)
+    leftover: dict[str, str] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+    unexpected: list[str] = field(default_factory=list)
+    unfit: dict[str, str] = field(default_factory=dict)
+    torn: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def fits(self) -> bool:
+        """Every name is used or explained, every entry set or explained."""
+        return not (self.missing or self.unexpected or self.unfit or self.torn)
+
+
+def make_plan(
+    state: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
+    rule: Rule,
+    *,
+    prefix: str,
+    fresh: tuple[str, ...],
+) -> Plan:
+    """Find a place for everything.
+
+    Args:
+        state: entries of the network, as `state_dict(keep_vars=True)` gives them.
+        tensors: of the file.
+        rule: how this network is filled from this kind of file.
+        prefix: before every name in the file that belongs to the network.
+        fresh: parts that keep their initial values, by the beginning of their names.
+
+    Raises:
+        InputError: a part in `fresh` that the network does not have.
+    """
+    check_parts(fresh, state)
+    plan, explained = Plan(), {}
+    for entry, value in state.items():
+        name = prefix + rule.source(entry)
+        if _under(entry, fresh):
+            plan.fresh[entry] = explained[name] = NAMED_FRESH
+        elif why := reason(rule.fresh, entry):
+            plan.fresh[entry] = why
+        elif name in tensors:
+            plan.values[entry] = name
+            if difference := _difference(tensors[name], value, is_stem=entry in rule.stems):
+                plan.unfit[entry] = difference
+        elif entry.endswith(COUNTER):
+            plan.zeros.append(entry)
+        else:
+            plan.missing.append(entry)
+    used = set(plan.values.values())
+    for name in (name for name in tensors if name not in used):
+        why = explained.get(name) or reason(rule.leftover, name.removeprefix(prefix))
+        if why:
+            plan.leftover[name] = why
+        else:
+            plan.unexpected.append(name)
+    if not plan.unfit:
+        plan.torn = list(_torn(state, tensors, plan.values))
+    return plan
+
+
+def adapted(tensor: Tensor, value: Tensor) -> Tensor:
+    """A file's tensor for an entry of the network: the same, or with other input channels.
+
+    One channel gets the mean over the file's; channels behind the file's get it too.
+
+    Args:
+        tensor: (C, c, k, k) where the shapes differ.
+        value: (C, c', k, k), c' = 1 or more than c.
+    """
+    if tensor.shape == value.shape:
+        return tensor
+    mean = tensor.float().mean(1, keepdim=True)
+    if value.shape[1] == 1:
+        return mean
+    extra = value.shape[1] - tensor.shape[1]
+    return torch.cat([tensor.float(), *[mean] * extra], 1)
+
+
+def check_parts(parts: tuple[str, ...], state: Mapping[str, Tensor]) -> None:
+    """Raise InputError where a part is not the beginning of an entry's name."""
+    for part in parts:
+        if not any(_under(entry, (part,)) for entry in state):
+            words = [entry.split(".") for entry in state]
+            known = {".".join(each[:n]) for each in words for n in (1, 2, 3)}
+            close = nearest(part, known).split("known: ")[0].rstrip("? ")
+            hint = f" ({close}?)" if close else ""
+            raise InputError(
+                f"model.fresh: the network has no part '{part}'{hint}; a part is named by the "
+                "first words of its entries, such as they stand in its state_dict()."
+            )
+
+
+def _under(entry: str, parts: tuple[str, ...]) -> bool:
+    return any(entry == part or entry.startswith(f"{part.rstrip('.')}.") for part in parts)
+
+
+def _difference(tensor: Tensor, value: Tensor, *, is_stem: bool) -> str:
+    """How a file's tensor does not fit an entry, "" where it does."""
+    if tensor.is_floating_point() != value.is_floating_point():
+        return f"file {_kind(tensor)}, network {_kind(value)}"
+    found, own = tuple(tensor.shape), tuple(value.shape)
+    if found == own:
+        return ""
+    if is_stem and len(found) == len(own) == 4 and found[1] == 3 and own[1] in (1, 4):
+        found, own = (found[0], *found[2:]), (own[0], *own[2:])
+        if found == own:
+            return ""
+    return f"file {_shape(tensor)}, network {_shape(value)}"
+
+
+def _kind(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
+
+
+def _shape(tensor: Tensor) -> str:
+    return " x ".join(map(str, tensor.shape)) or "one number"
+
+
+def _torn(
+    state: Mapping[str, Tensor], tensors: Mapping[str, Tensor], values: Mapping[str, str]
+) -> Iterator[tuple[str, str]]:
+    """Entries that are one parameter under two names and would get different values."""
+    shared: dict[int, list[str]] = defaultdict(list)
+    for entry in values:
+        shared[id(state[entry])].append(entry)
+    for first, *others in shared.values():
+        for other in others:
+            if not torch.equal(tensors[values[first]], tensors[values[other]]):
+                yield first, other

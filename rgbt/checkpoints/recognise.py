@@ -1,0 +1,67 @@
+"""What a file of weights is, by its names and shapes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from rgbt.checkpoints.layout import Facts, Layout
+from rgbt.checkpoints.layouts import (
+    cmx,
+    heatnet,
+    mask2former,
+    mfnet,
+    mit,
+    own,
+    resnet,
+    rtfnet,
+    swin,
+)
+from rgbt.checkpoints.read import Contents
+from rgbt.checkpoints.records import printable
+
+LAYOUTS: MappingProxyType[str, Layout] = MappingProxyType(
+    {
+        "own": own,
+        "mask2former": mask2former,
+        "cmx": cmx,
+        "rtfnet": rtfnet,
+        "mfnet": mfnet,
+        "heatnet": heatnet,
+        "mit": mit,
+        "swin": swin,
+        "resnet": resnet,
+    }
+)
+"""By name, in the order they are tried: whole networks before backbones."""
+
+UNKNOWN = Facts("unknown", "file of weights in no layout known here")
+
+
+def recognise(contents: Contents) -> Facts:
+    """The first layout that fits; `UNKNOWN` where none does."""
+    found = (layout.recognise(contents) for layout in LAYOUTS.values())
+    facts = next((each for each in found if each is not None), UNKNOWN)
+    if contents.note:
+        # How it is fed is in the note and cannot be told from the layout.
+        origin = " ".join(filter(None, map(contents.note.get, ("run", "checkpoint"))))
+        said = f"exported from {printable(origin or 'this project')}, fed as its note says"
+        return replace(
+            facts,
+            fits=tuple(each[:1] for each in facts.fits),
+            convention=(),
+            inputs=_inputs(contents.note.get("inputs", "")),
+            remarks=(said,),
+        )
+    return facts
+
+
+def _inputs(text: str) -> Mapping[str, object] | None:
+    """`model.inputs` as an export notes it, None where it does not."""
+    try:
+        said = json.loads(text)
+    except json.JSONDecodeError:
+        return None
+    return said if isinstance(said, dict) else None

@@ -1,0 +1,141 @@
+"""Weights written so that the authors' code, or anybody's, can load them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rgbt.checkpoints.layout import FAMILIES
+from rgbt.checkpoints.layouts import cmx, heatnet, mask2former, mfnet, rtfnet
+from rgbt.checkpoints.read import NOTE
+from rgbt.checks import InputError, check_choice
+
+FORMATS = ("safetensors", "released", "released_temporal")
+
+Note = Mapping[str, str]
+"""What an export says about itself: which network, how it is fed, which run."""
+
+
+def _lightning(state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
+    # Without the configuration object of the release, which its test does not read from here.
+    return {
+        "epoch": 0,
+        "global_step": int(note.get("step", 0)),
+        "pytorch-lightning_version": "1.9.2",
+        "state_dict": mask2former.released(state),
+        NOTE: dict(note),
+    }
+
+
+def _under_model(state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
+    return {"model": cmx.released(state), NOTE: dict(note)}
+
+
+Container = Callable[[Mapping[str, Tensor], Note], Any]
+RELEASED: Mapping[str, Container] = {
+    "mask2former": _lightning,
+    "cmx": _under_model,
+    "rtfnet": lambda state, _: rtfnet.released(state),
+    "mfnet": lambda state, _: mfnet.released(state),
+    "pspnet": lambda state, _: heatnet.released(state),
+}
+"""Family -> what its release's torch.load gives."""
+
+CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
+    ("released", "cmx"): cmx.RELEASED,
+    ("released_temporal", "cmx"): cmx.TEMPORAL,
+    ("released", "rtfnet"): rtfnet.CONVENTION,
+    ("released", "mfnet"): mfnet.CONVENTION,
+    ("released", "pspnet"): heatnet.CONVENTION,
+}
+"""Format and family -> how the authors' code feeds and evaluates the network."""
+
+SAID: Mapping[tuple[str, str], str] = {
+    ("released", "pspnet"): (
+        "no name under module.critics. is written, because a critic is not part of this network; "
+        "HeatNet's code loads the file with no_conf, without critics"
+    ),
+    ("released_temporal", "cmx"): (
+        "voting.weight and voting.bias are zeros, because nothing ever uses them"
+    ),
+}
+"""What to tell about a format and a family."""
+
+
+def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> Any:
+    """What torch.save writes for a released layout.
+
+    Args:
+        layout: "released", or "released_temporal" for CMX as the temporal paper uses it.
+        family: of the network.
+        state: its entries.
+        note: goes in where the container has room for it.
+
+    Raises:
+        InputError: there is no such layout for this family.
+    """
+    if layout == "released_temporal":
+        if family != "cmx":
+            raise InputError(
+                f"format={layout} is the temporal release's CMX; this network is "
+                f"{FAMILIES.get(family, 'none of rgbt.models')}; take another format."
+            )
+        return cmx.released_temporal(state)
+    if family not in RELEASED:
+        raise InputError(
+            f"there is no release of {FAMILIES.get(family, 'this network')} whose layout could be "
+            "written; take format=safetensors."
+        )
+    return RELEASED[family](state, note)
+
+
+def save(
+    path: Path, layout: str, family: str, state: Mapping[str, Tensor], note: Note
+) -> str | None:
+    """Write weights under a temporary name and rename it.
+
+    Args:
+        path: of the new file.
+        layout: one of `FORMATS`.
+        family: of the network, "" for one from elsewhere.
+        state: its entries.
+        note: what the file says about itself.
+
+    Returns:
+        a remark on what was written, if there is one to make.
+
+    Raises:
+        InputError: the file exists, the format is unknown or does not fit the network.
+    """
+    check_choice("format", layout, FORMATS)
+    if path.exists():
+        raise InputError(f"out={path} exists already; remove it or name another file.")
+    content = None if layout == "safetensors" else payload(layout, family, state, note)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        if layout == "safetensors":
+            _save_safetensors(temporary, state, note)
+        else:
+            torch.save(content, temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return SAID.get((layout, family))
+
+
+def _save_safetensors(path: Path, state: Mapping[str, Tensor], note: Note) -> None:
+    from safetensors.torch import save_file
+
+    # The format knows no shared memory: what two branches share is written for each.
+    separate = {key: value.detach().clone().contiguous() for key, value in state.items()}
+    metadata = {"format": "pt", **{f"{NOTE}.{key}": value for key, value in note.items()}}
+    save_file(separate, path, metadata=metadata)

@@ -1,0 +1,181 @@
+"""A stored configuration is data: what is read from a run folder, a store or a stranger's file.
+
+Whoever wrote it can name any callable in a ``_target_``, and building the node would run it. So a
+stored configuration may name what the files of ``conf/`` name inside `rgbt`, and what lies in a
+module that the user names with ``trust=``. Everything else is refused before it is imported.
+Classes and functions of `rgbt` that no file of ``conf/`` names are refused as well: some of them
+write files. What a user types or composes now is the user's own and follows Hydra's rules
+(`rgbt.config.build`).
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Collection, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError, split_list
+from rgbt.config.compose import conf_dir
+from rgbt.config.schema import NODES, constructor
+from rgbt.files.yaml_files import read_yaml
+
+OWN = "rgbt."
+NAMED = re.compile(r"_target_:\s*[\"']?(rgbt\.[\w.]+)", re.ASCII)
+DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
+LONGEST_SHOWN = 100
+
+
+def load_config(path: Path, trust: Collection[str] = ()) -> DictConfig:
+    """A stored configuration whose objects may be built.
+
+    Args:
+        path: ``config.yaml`` of a run, or another YAML file with targets.
+        trust: modules (or single targets) that the user trusts, see `parse_trust`.
+
+    Raises:
+        InputError: see `settings_of` and `check_targets`.
+    """
+    settings = read_settings(path)
+    check_targets(settings, trust, str(path))
+    config = OmegaConf.create(settings)
+    assert isinstance(config, DictConfig), "settings are a mapping"
+    return config
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Plain values of a stored configuration, from which nothing is built.
+
+    Raises:
+        InputError: not readable within the budget (`rgbt.files.yaml_files`), or see `settings_of`.
+    """
+    return settings_of(read_yaml(path), str(path))
+
+
+def settings_of(plain: Any, source: str) -> dict[str, Any]:
+    """`plain`, where it can be a stored configuration.
+
+    Raises:
+        InputError: not a mapping with text as keys, a node that is not a mapping, or an
+            interpolation: a configuration is resolved when it is stored.
+    """
+    if not isinstance(plain, dict):
+        raise InputError(f"{source}: expected a mapping of keys and values, got {_shown(plain)}.")
+    for key, value in _walk(plain):
+        if isinstance(value, str) and "${" in value:
+            raise InputError(
+                f"{source}: '{_shown(key)}' is {_shown(value)}; a stored configuration holds "
+                "values and no interpolations. Replace it by its value."
+            )
+    for key in NODES:
+        if key in plain and not isinstance(plain[key], dict):
+            raise InputError(f"{source}: '{key}' must be a mapping with `_target_`.")
+    return plain
+
+
+def check_targets(
+    settings: Mapping[str, Any], trust: Collection[str], source: str, group: str = ""
+) -> None:
+    """Refuse targets that are neither shipped nor trusted, wherever they are in `settings`.
+
+    Args:
+        settings: plain values.
+        trust: modules (or single targets) that the user trusts.
+        source: where the settings come from, for messages.
+        group: a folder of ``conf/`` that alone says what is shipped, such as "masker".
+
+    Raises:
+        InputError: naming source, key and target, and what to type.
+    """
+    shipped = shipped_targets(group)
+    for key, target in targets(settings):
+        if isinstance(target, str) and (target in shipped or target in trust):
+            continue
+        home = _trusted_home(target, trust)
+        if home is not None and any(_is_inside(home, module) for module in trust):
+            continue
+        raise InputError(_refusal(source, key, target, home, group))
+
+
+def targets(settings: Any) -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of every ``_target_``, inside lists too."""
+    for key, value in _walk(settings):
+        if key == "_target_" or key.endswith("._target_"):
+            yield key, value
+
+
+def parse_trust(text: str) -> tuple[str, ...]:
+    """Modules of ``trust=my.module,other``; brackets around them are allowed.
+
+    Raises:
+        InputError: a word is not a dotted name.
+    """
+    words = split_list(text, "modules") if text else []
+    for word in words:
+        if not DOTTED.fullmatch(word):
+            raise InputError(
+                f"trust={text}: expected names of your own modules with commas, such as "
+                f"trust=my_lab or trust=my_lab.models,other; got '{word}'."
+            )
+    return tuple(words)
+
+
+@cache
+def shipped_targets(group: str = "") -> frozenset[str]:
+    """Targets inside `rgbt` that files of ``conf/`` (of ``conf/<group>/``) name."""
+    files = sorted((conf_dir() / group).rglob("*.yaml"))
+    return frozenset(name for path in files for name in NAMED.findall(path.read_text()))
+
+
+def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of everything below `node`, which is at most 50 levels deep."""
+    entries: Any = ()
+    if isinstance(node, Mapping):
+        entries = node.items()
+    elif isinstance(node, list):
+        entries = enumerate(node)
+    for key, value in entries:
+        if not isinstance(key, str) and isinstance(node, Mapping):
+            raise InputError(f"'{_shown(path)}': {key!r} is not a name; keys are text.")
+        dotted = f"{path}.{key}" if path else str(key)
+        yield dotted, value
+        yield from _walk(value, dotted)
+
+
+def _trusted_home(target: Any, trust: Collection[str]) -> str | None:
+    """The module that defines `target`; None where no trusted module would be imported for it."""
+    if not isinstance(target, str) or not any(_is_inside(target, module) for module in trust):
+        return None
+    found = constructor(target, "_target_")
+    return str(getattr(found, "__module__", None) or type(found).__module__)
+
+
+def _is_inside(name: str, module: str) -> bool:
+    return name == module or name.startswith(f"{module}.")
+
+
+def _refusal(source: str, key: str, target: Any, home: str | None, group: str) -> str:
+    what = f"{source}: '{_shown(key)}' names {_shown(target)}, which "
+    if home is not None:
+        return (
+            f"{what}is defined in {home}, a module that is not trusted. Only if you know that "
+            f"code, add {home} to trust=... (it is run)."
+        )
+    what += f"no file of conf/{group} names. " if group else "is not part of rgbt's conf/. "
+    is_name = isinstance(target, str) and DOTTED.fullmatch(target) is not None
+    if not is_name or target.partition(".")[0] in sys.stdlib_module_names:
+        return f"{what}It is not built: the configuration was damaged or made to run code."
+    return (
+        f"{what}A configuration can run any code that it names. Only if you know this code and who "
+        f"made the configuration, add trust={_shown(target.rpartition('.')[0] or target)}."
+    )
+
+
+def _shown(value: Any) -> str:
+    """Text of a stranger's without control characters, cut."""
+    text = ascii(value).strip("'\"") if isinstance(value, str) else ascii(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."

@@ -1,0 +1,73 @@
+"""A thermal camera that does not keep pace with the colour camera.
+
+Frames are counted in the order of the split list; by day and by night apart where the data set
+tells them apart. A list that leaves frames out (as those of the published data sets do) makes a
+step of one longer than the time between two frames of the camera.
+"""
+
+from __future__ import annotations
+
+from rgbt.checks import InputError
+from rgbt.corruptions.corruption import Severities, check_ladder, check_whole
+
+
+class Frozen:
+    """The thermal image stands still and is renewed every n frames.
+
+    Frame i shows the thermal image of frame ``i - i mod n``: one frame in n is right, the others
+    are 1 to n - 1 frames old.
+
+    Args:
+        severities: n, at least 2.
+
+    Raises:
+        InputError: a severity out of range.
+    """
+
+    title = "frozen thermal"
+    unit = "frames between two images"
+
+    def __init__(self, *, severities: Severities) -> None:
+        self.severities = severities
+        check_ladder(self)
+
+    def check(self, severity: float) -> None:
+        """Whole frames, at least 2: with 1 every frame is new."""
+        check_whole(severity)
+        if severity < 2:
+            raise InputError(
+                "severity of frozen counts the frames from one thermal image to the next: 1 is "
+                "no failure; give 2 or more."
+            )
+
+    def shown(self, place: int, severity: float) -> int:
+        """See `OfTime`."""
+        return place - place % int(severity)
+
+
+class Delayed:
+    """The thermal image is that of n frames earlier.
+
+    The first n frames show the thermal image of the first one: there is none before it.
+
+    Args:
+        severities: n, at least 1.
+
+    Raises:
+        InputError: a severity out of range.
+    """
+
+    title = "delayed thermal"
+    unit = "frames"
+
+    def __init__(self, *, severities: Severities) -> None:
+        self.severities = severities
+        check_ladder(self)
+
+    def check(self, severity: float) -> None:
+        """Whole frames, at least 1."""
+        check_whole(severity)
+
+    def shown(self, place: int, severity: float) -> int:
+        """See `OfTime`."""
+        return max(0, place - int(severity))

@@ -1,0 +1,1 @@
+"""Evaluations of a trained network: segmentation, consistency, corruptions, pseudo-labels."""

@@ -1,0 +1,377 @@
+"""Pseudo-labels: what a trained network predicts for a split, kept where it is sure enough.
+
+The folder is described in `rgbt.data.pseudo_labels`. Writing it can be stopped and taken up again:
+images whose files are there are not predicted a second time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from rgbt.build.session import Session, decode_ahead, heads_of
+from rgbt.checks import InputError, RunError, check_range
+from rgbt.config.command import composing
+from rgbt.config.compose import compose
+from rgbt.config.schema import build, check_node
+from rgbt.data.batches import Dataset
+from rgbt.data.domains import TestedHead
+from rgbt.data.label_map import LabelMap
+from rgbt.data.loaders import eval_batches
+from rgbt.data.pseudo_labels import (
+    FORMAT,
+    FULL,
+    MANIFEST,
+    PseudoLabels,
+    confidence_path,
+    label_path,
+    read_pair,
+)
+from rgbt.engine.confidence import probabilities
+from rgbt.engine.progress import progress
+from rgbt.files.atomic import holding, write_atomic
+from rgbt.files.budgets import read_json, sealed
+from rgbt.tracking.tables import Grid, percent
+from rgbt.tracking.terminal import tell
+from rgbt.types import IGNORE, Sample, View
+
+BEGUN = "pseudo_labels.begun.json"
+"""What a folder that is not finished was begun with."""
+
+LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """The network whose predictions become labels.
+
+    Attributes:
+        name: key of its run, or file of its weights; for people.
+        weights: SHA-256 over its parameters and statistics, in hexadecimal.
+    """
+
+    name: str
+    weights: str
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is predicted and what is kept of it; see `write_pseudo_labels`."""
+
+    split: str
+    view: View
+    threshold: float
+    label_map: LabelMap | None
+    head: TestedHead | None
+
+
+def teacher_of(name: str, model: nn.Module) -> Teacher:
+    """The teacher that `model` is, with the weights it holds now."""
+    digest = hashlib.sha256()
+    for key, tensor in model.state_dict().items():
+        digest.update(f"{key} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        flat = tensor.detach().cpu().contiguous().reshape(-1)
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return Teacher(name, digest.hexdigest())
+
+
+def label_map_of(name: str) -> LabelMap | None:
+    """The file of ``conf/label_map/`` called `name`; None for "none".
+
+    Raises:
+        InputError: there is no such file, or its lists do not fit.
+    """
+    if name == "none":
+        return None
+    with composing([]):
+        node = compose([f"+label_map={name}"]).label_map
+    check_node(node, "label_map")
+    made: LabelMap = build(node)
+    return made
+
+
+def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where to, and what is kept
+    session: Session,
+    teacher: Teacher,
+    split: str,
+    view: View,
+    out: Path,
+    threshold: float,
+    label_map: LabelMap | None,
+    head: TestedHead | None,
+) -> PseudoLabels:
+    """Predict a split with the network of `session` and write its sure pixels as labels.
+
+    The confidence of a pixel is the largest of its class probabilities
+    (`rgbt.engine.confidence.probabilities`), with a label map that of the network's own class. A
+    folder that is finished with the same settings is returned as it is. A second process that
+    writes to the same folder waits for the first.
+
+    Source: HeatNet's release (labels and confidences of the thermal teacher for night images). It
+    keeps every pixel: threshold 0.
+
+    Args:
+        session: see `rgbt.build.session.open_session`; its network is the teacher.
+        teacher: who that is.
+        split: of the session's data set.
+        view: what is predicted from.
+        out: folder, made where it is missing.
+        threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
+        label_map: from the classes of the network to those of the data set; None: they are the
+            same.
+        head: which of two heads predicts an image; None: as the teacher's configuration says.
+
+    Raises:
+        InputError: settings that do not fit each other, a folder that holds something else or was
+            begun with other settings, an image that cannot be read (data.on_error=raise).
+        RunError: the network's predictions are not finite.
+    """
+    check_range("threshold", threshold, 0, 1)
+    if label_map is not None:
+        num_classes = session.config.model.get("num_classes", label_map.num_source)
+        label_map.check(num_classes, tuple(session.dataset.classes), session.dataset.name)
+    asked = _Asked(split, view, threshold, label_map, head)
+    settings = _settings(session, teacher, asked)
+    names = tuple(dict.fromkeys(session.dataset.names(split)))
+    _refuse_other_content(out)
+    out.mkdir(parents=True, exist_ok=True)
+    with _alone(out):
+        finished = _is_finished(out, settings)
+        missing = tuple(name for name in names if not _is_written(out, name))
+        if not finished or set(missing) - set(PseudoLabels(out).manifest["skipped"]):
+            # First the one, then the other: a killed process leaves a folder that is known.
+            write_atomic(out / BEGUN, _text(settings))
+            (out / MANIFEST).unlink(missing_ok=True)
+            skipped = _predict(session, asked, out, missing, len(names))
+            _finish(out, settings, [name for name in names if name not in skipped], skipped)
+    return PseudoLabels(out)
+
+
+def summary(found: PseudoLabels) -> Grid:
+    """Which share of the pixels got which class, and how sure the teacher was of them."""
+    said = found.manifest
+    by_class = [said["by_class"][name] for name in found.classes]
+    rows = [
+        (name, percent(each["share"]), _percent(each["mean_confidence"]))
+        for name, each in zip(found.classes, by_class, strict=True)
+    ]
+    least = said["threshold"]
+    which = f"pixels with a confidence of at least {least:g}" if least else "every pixel"
+    title = f"{said['images']} images of {said['dataset']} {said['split']}, {which}"
+    total = sum(each["share"] * (each["mean_confidence"] or 0.0) for each in by_class)
+    kept = ("kept", percent(said["kept"]), _percent(total / said["kept"] if said["kept"] else None))
+    whole = ("all pixels", percent(1.0), percent(said["mean_confidence"]))
+    return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
+
+
+def _percent(fraction: float | None) -> str:
+    return percent(float("nan") if fraction is None else fraction)
+
+
+@dataclass
+class _Chosen:
+    """A data set of which only some names are read."""
+
+    name: str
+    dataset: Dataset
+    chosen: tuple[str, ...]
+
+    def names(self, split: str) -> tuple[str, ...]:
+        del split
+        return self.chosen
+
+    def read(self, name: str) -> Sample:
+        return self.dataset.read(name)
+
+
+def _settings(session: Session, teacher: Teacher, asked: _Asked) -> dict[str, Any]:
+    """The first part of the manifest: all that the files follow from."""
+    settings = {
+        "format": FORMAT,
+        "teacher": teacher.name,
+        "weights": teacher.weights,
+        "network": _network(session.config),
+        "view": asked.view,
+        "head": asked.head or session.domains.tested_head,
+        "label_map": None if asked.label_map is None else asdict(asked.label_map),
+        "threshold": float(asked.threshold),
+        "dataset": session.dataset.name,
+        "fingerprint": session.dataset.fingerprint(),
+        "split": asked.split,
+        "classes": session.dataset.classes,
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(settings))
+    return plain
+
+
+def _network(config: DictConfig) -> str:
+    """SHA-256 of how the network is built, fed and asked, whatever its weights.
+
+    How the data set is read belongs to it (the range of thermal counts), where it lies does not.
+    """
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    model = {key: value for key, value in plain["model"].items() if key not in ("weights", "fresh")}
+    places = ("root", "cache_dir", "palette", "layout")
+    read = {key: value for key, value in plain["dataset"].items() if key not in places}
+    asked = [model, read, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
+    text = json.dumps(asked, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _refuse_other_content(out: Path) -> None:
+    ours = (MANIFEST, BEGUN)
+    if not out.is_dir() or any((out / name).exists() for name in ours):
+        return
+    others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+    if others:
+        raise InputError(
+            f"{out} holds {others[0]} and no pseudo-labels; name a new folder, so that nothing is "
+            "overwritten."
+        )
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """No other process writes to the folder meanwhile; leftovers of killed ones are removed."""
+    with holding(out / LOCK) as holder:
+        if holder is None:
+            yield from _tidied(out)
+            return
+    tell(f"{out} is being written by {holder}; waiting for it.")
+    with holding(out / LOCK, wait_s=math.inf):
+        yield from _tidied(out)
+
+
+def _tidied(out: Path) -> Iterator[None]:
+    for folder in ("labels", "confidence"):
+        for leftover in (out / folder).rglob(".*.png.*"):
+            leftover.unlink()
+    yield
+
+
+def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
+    """Whether all was written before; InputError where it was begun with other settings."""
+    finished = (out / MANIFEST).exists()
+    if finished:
+        _refuse_others(out, PseudoLabels(out).manifest, settings)
+    elif (out / BEGUN).exists():
+        _refuse_others(
+            out, read_json(out / BEGUN, dict[str, Any], "remove it and predict again"), settings
+        )
+    return finished
+
+
+def _refuse_others(out: Path, stored: dict[str, Any], settings: dict[str, Any]) -> None:
+    for key, value in settings.items():
+        if key != "teacher" and stored.get(key) != value:
+            before, now = (str(each)[:60] for each in (stored.get(key), value))
+            raise InputError(
+                f"{out} was begun with pseudo-labels of another {key} ({before}, now {now}); name "
+                "another folder, or remove this one."
+            )
+
+
+def _is_written(out: Path, name: str) -> bool:
+    return label_path(out, name).is_file() and confidence_path(out, name).is_file()
+
+
+def _predict(
+    session: Session, asked: _Asked, out: Path, missing: tuple[str, ...], total: int
+) -> dict[str, str]:
+    """Predict and write the missing images; why others could not be read, by name."""
+    if not missing:
+        return {}
+    decode_ahead(session, asked.split)
+    chosen = _Chosen(session.dataset.name, session.dataset, missing)
+    batches = eval_batches(chosen, asked.split, session.transform, session.loading)
+    model, fabric = session.model.eval(), session.fabric
+    heads_by = heads_of(session, asked.view, asked.head)
+    with progress() as display:
+        done = total - len(missing)
+        task = display.add_task("predicting", total=total, completed=done, note="images")
+        for batch in batches:
+            heads = heads_by(batch.name)
+            found = probabilities(model, batch.to(fabric.device), fabric, asked.view, heads)
+            confidence, classes = (each.cpu().numpy() for each in found.max(1))
+            for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
+                _write(out, name, sure, ids.astype(np.uint8), asked)
+            display.advance(task, len(batch.name))
+    return batches.skipped
+
+
+def _write(
+    out: Path,
+    name: str,
+    confidence: NDArray[np.float32],
+    classes: NDArray[np.uint8],
+    asked: _Asked,
+) -> None:
+    if not np.isfinite(confidence).all():
+        raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
+    mapped = classes if asked.label_map is None else asked.label_map(classes)
+    label = np.where(confidence < asked.threshold, np.uint8(IGNORE), mapped)
+    stored = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+    _write_png(confidence_path(out, name), stored)
+    _write_png(label_path(out, name), label)
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    encoded, content = cv2.imencode(".png", image)
+    assert encoded, "an 8-bit or 16-bit image of one channel"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, content.tobytes())
+
+
+def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict[str, str]) -> None:
+    """Read all files once, and write the manifest."""
+    if not names:
+        raise InputError(
+            f"split '{settings['split']}' of {settings['dataset']}: no image could be read."
+        )
+    digest = hashlib.sha256()
+    counts = np.zeros(IGNORE + 1, np.int64)
+    sums = np.zeros(IGNORE + 1)
+    with progress() as display:
+        task = display.add_task("checking", total=len(names), note="images")
+        for name in names:
+            label, confidence = read_pair(out, name, len(settings["classes"]))
+            digest.update(f"{name} {label.shape}\n".encode())
+            digest.update(label.tobytes())
+            digest.update(confidence.astype("<u2").tobytes())
+            counts += np.bincount(label.ravel(), minlength=IGNORE + 1)
+            sums += np.bincount(label.ravel(), confidence.ravel(), IGNORE + 1)
+            display.advance(task)
+    total = int(counts.sum())
+    found = {
+        "images": len(names),
+        "skipped": sorted(skipped),
+        "kept": 1 - int(counts[IGNORE]) / total,
+        "mean_confidence": float(sums.sum()) / FULL / total,
+        "by_class": {
+            name: {
+                "share": int(count) / total,
+                "mean_confidence": float(added) / FULL / int(count) if count else None,
+            }
+            for name, count, added in zip(settings["classes"], counts, sums, strict=False)
+        },
+        "digest": digest.hexdigest(),
+    }
+    write_atomic(out / MANIFEST, _text(settings | found))
+    (out / BEGUN).unlink(missing_ok=True)
+
+
+def _text(values: dict[str, Any]) -> bytes:
+    return (json.dumps(sealed(values), indent=1) + "\n").encode()

@@ -1,0 +1,1 @@
+"""Reading and writing files: within budgets, in one rename, under a lock."""

@@ -1,0 +1,1 @@
+"""The process: signals, and disks and memory that are full."""

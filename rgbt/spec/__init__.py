@@ -1,0 +1,1 @@
+"""What a run is: its specification, key, name and upstream runs."""

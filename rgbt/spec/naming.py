@@ -1,0 +1,163 @@
+"""What a run is called: what varies comes first, then the experiment.
+
+The group is a tag that all seeds of one configuration share. Users type it in commands, so its form
+is kept: "grbm sigma_div=2". The name is for people: "sigma_div=2 seed=1 · grbm".
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError
+from rgbt.config.compose import flatten, with_pixels
+from rgbt.tracking.folder import Description
+
+TAGS = "RGBT_TAGS"
+"""Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it."""
+
+GROUP = "rgbt.group"
+"""Tag that the seeds of one configuration share."""
+
+VARIED = "rgbt.varied"
+"""Tag with the keys in which the points of a sweep differ, separated by spaces."""
+
+VALUE_LENGTH = 32
+"""Characters of a value in a name; a longer one, such as a path, is cut in the middle."""
+
+SILENT = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed", "fresh")
+BESIDE = ("tracking.", "consistency")
+"""What is measured beside is no part of the run, and neither are its trackers."""
+
+SIZES = ("scale", "recipe", "tracking", "consistency")
+"""Nodes whose keys never make a short key ambiguous: the settings of the run repeat them."""
+
+
+def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
+    """How the run is shown: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
+
+    Only what differs from the experiment is named. Of a point of a sweep, what is common to all
+    points follows the experiment: "sigma_div=2 seed=1 · grbm max_steps=9". Keys are cut to
+    their last part where only one key of the configuration ends with it.
+
+    Args:
+        config: composed and checked.
+        overrides: as typed.
+    """
+    flat = flatten(config)
+    params = {
+        key: str(value)
+        for key, value in flat.items()
+        # Paths and passwords of the tracker are no property of the run.
+        if not key.endswith("_target_") and not key.startswith("tracking.") and key != "fresh"
+    }
+    asked = _asked_tags()
+    words = _words(overrides, params)
+    tags = {
+        "rgbt.experiment": config.name,
+        GROUP: " ".join([config.name, *map(_word, words.values())]),
+        "rgbt.seed": str(config.seed),
+        **asked,
+    }
+    name = _name(config, words, asked.get(VARIED, "").split())
+    return Description(name, tags, params)
+
+
+def group_of(tags: Mapping[str, str], params: Mapping[str, str]) -> str:
+    """The group of a stored run, written as `describe` writes it now; "" without one.
+
+    Older runs have ``${px:64}`` for its value, and short keys with which several keys end.
+
+    Args:
+        tags: of the run.
+        params: of the run, as `describe` made them.
+    """
+    return " ".join(_as_now(word, params) for word in tags.get(GROUP, "").split(" "))
+
+
+def _as_now(word: str, params: Mapping[str, str]) -> str:
+    key, equals, value = word.partition("=")
+    value = _resolved(value, key, params)
+    if equals and "." not in key:
+        same = [each for each in _ending(key, params) if params.get(each) == value]
+        is_clear = len(_ending(key, params)) < 2 or len(same) != 1 or key in params
+        key = key if is_clear else same[0]
+    return f"{key}{equals}{value}"
+
+
+def _words(overrides: Sequence[str], params: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """What was changed, in typed order: key -> (key as shown, value).
+
+    Of a key that was typed twice the last value counts.
+    """
+    pairs = dict(item.lstrip("+").partition("=")[::2] for item in overrides)
+    changed = {
+        key: value
+        for key, value in pairs.items()
+        if key not in SILENT and not key.rpartition("@")[2].startswith(BESIDE)
+    }
+    ends = [key.rpartition(".")[2] for key in changed]
+    found = {}
+    for (key, value), end in zip(changed.items(), ends, strict=True):
+        others = _ending(end, params) - {key.rpartition("@")[2]}
+        is_clear = ends.count(end) == 1 and end != "seed" and not others and key[0] != "~"
+        found[key] = (end if is_clear else key, _resolved(value, key, params))
+    return found
+
+
+def _word(pair: tuple[str, str]) -> str:
+    return "=".join(filter(None, pair))  # ~masker.ratio has no value
+
+
+def _ending(end: str, params: Mapping[str, str]) -> set[str]:
+    """Keys of settings and of nodes that end with `end`, but for those that only give sizes."""
+    parts = [key.split(".") for key in params if not key.startswith(SIZES)]
+    paths = (".".join(each[: each.index(end) + 1]) for each in parts if end in each)
+    return set(paths)
+
+
+def _resolved(value: str, key: str, params: Mapping[str, str]) -> str:
+    """A value as typed, but for references, which are shown as their values."""
+    factor = params.get("scale.pixel_factor")
+    if factor is not None:
+        value = with_pixels(value, float(factor))
+    return params.get(key, value) if "${" in value else value
+
+
+def _name(config: DictConfig, words: Mapping[str, tuple[str, str]], varied: Sequence[str]) -> str:
+    """What varies, a dot, and what does not; outside of a sweep everything may vary."""
+    shown = {key: _word((label, _short(value))) for key, (label, value) in words.items()}
+    first = [word for key, word in shown.items() if key in varied or not varied]
+    rest = [word for word in shown.values() if word not in first]
+    seed = f"seed={config.seed}"
+    if "experiment" in varied:
+        return " · ".join(filter(None, (" ".join([config.name, *first, seed]), " ".join(rest))))
+    return f"{' '.join([*first, seed])} · {' '.join([config.name, *rest])}"
+
+
+def _short(value: str) -> str:
+    """A value without quotes; a long one cut in the middle, and kept distinct by a digest."""
+    if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
+        value = value[1:-1]
+    if len(value) <= VALUE_LENGTH:
+        return value
+    digest = hashlib.sha256(value.encode()).hexdigest()[:4]
+    half = (VALUE_LENGTH - len(digest) - 2) // 2
+    return f"{value[:half]}…{digest}…{value[-half:]}"
+
+
+def _asked_tags() -> dict[str, str]:
+    text = os.environ.get(TAGS, "{}")
+    try:
+        tags = json.loads(text)
+        if not isinstance(tags, dict):
+            raise TypeError("not a mapping")
+    except (json.JSONDecodeError, TypeError) as error:
+        raise InputError(
+            f'{TAGS}={text}: expected JSON such as {{"ticket": "42"}} ({error}).'
+        ) from error
+    return {str(name): str(value) for name, value in tags.items()}

@@ -1,0 +1,167 @@
+"""What a run uses of a user's own code: the modules of its targets, and what these import.
+
+Part of the key of a run (`rgbt.spec.run_key`). Imports are read from the source, nothing is
+imported for it. A module that is loaded by a name made at run time, and a file that the code reads,
+cannot be seen.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import pkgutil
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+RELEASED = ("rgbt", "torch")
+"""Packages whose targets do not count: their versions are in ``provenance.json``."""
+
+INSTALLED = {"site-packages", "dist-packages"}
+
+Used = tuple[str, str]
+"""Name of a module and SHA-256 of its code, or name and version of an installed distribution."""
+
+
+_used_by: dict[str, tuple[Used, ...]] = {}
+"""What each module used when this process first read it."""
+
+
+def user_code(targets: Iterable[str]) -> tuple[Used, ...]:
+    """What the objects of a configuration are made with, outside this package and torch.
+
+    Args:
+        targets: values of `_target_`, such as "my_lab.losses.Boundary".
+
+    Returns:
+        modules of the user's own tree with the digest of their code, by name: those of the targets,
+        their packages, and what all of these import. Of a target in an installed distribution the
+        distribution and its version. () where every target is released. Each module is read once
+        per process, so that the answer belongs to the code that this process has loaded.
+    """
+    own = {_module_of(each) for each in targets if each.split(".")[0] not in RELEASED}
+    for module in own - set(_used_by):
+        _used_by[module] = tuple(_follow(module))
+    return tuple(sorted({used for module in own for used in _used_by[module]}))
+
+
+def counted_modules() -> list[str]:
+    """Modules of the user's own tree that `user_code` has read and this process has imported."""
+    names = {name for used in _used_by.values() for name, _ in used}
+    return sorted(name for name in names & set(sys.modules) if name != "__main__")
+
+
+def loaded_modules() -> list[str]:
+    """Modules of the user's own tree that this process has imported."""
+    files = [(name, getattr(module, "__file__", None)) for name, module in sys.modules.items()]
+    return [name for name, file in files if name.split(".")[0] not in RELEASED and _is_own(file)]
+
+
+def _module_of(target: str) -> str:
+    """The longest beginning of a target that is a module."""
+    name = target.rpartition(".")[0]
+    while "." in name and _place(name) is None:
+        name = name.rpartition(".")[0]
+    return name
+
+
+def _follow(module: str) -> Iterator[Used]:
+    """What `user_code` gives for one module."""
+    place = _place(module)
+    if place is not None and INSTALLED & set(Path(place[0] or "").parts):
+        yield from _distributions(module.split(".")[0])
+        return
+    waiting = [*_with_packages(module)]
+    seen: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        place = None if name in seen or name.split(".")[0] in RELEASED else _place(name)
+        seen.add(name)
+        if place is not None and place[0] is not None and _is_own(place[0]):
+            digest, imported = _read(name, Path(place[0]))
+            waiting += imported
+            yield name, digest
+
+
+def _distributions(package: str) -> Iterator[Used]:
+    for name in sorted(set(metadata.packages_distributions().get(package, ()))):
+        yield name, metadata.version(name)
+
+
+def _place(name: str) -> tuple[str | None, Any] | None:
+    """File of a module and where its submodules lie; None where there is no such module."""
+    module = sys.modules.get(name)
+    if module is not None:
+        return getattr(module, "__file__", None), getattr(module, "__path__", None)
+    package = name.rpartition(".")[0]
+    if not package:
+        specs = (finder.find_spec(name, None, None) for finder in sys.meta_path)
+    else:
+        # Finders of whole paths need the package imported; those of one folder do not.
+        folders = (_place(package) or (None, None))[1] or ()
+        finders = filter(None, map(pkgutil.get_importer, folders))
+        specs = (finder.find_spec(name) for finder in finders)
+    spec = next(filter(None, specs), None)
+    return None if spec is None else (spec.origin, spec.submodule_search_locations)
+
+
+def _is_own(file: str | None) -> bool:
+    """Whether a file is neither of Python nor of an installed distribution."""
+    if file is None or INSTALLED & set(Path(file).parts) or not Path(file).is_file():
+        return False
+    library = (sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib"))
+    return not any(Path(file).is_relative_to(folder) for folder in library)
+
+
+def _read(name: str, file: Path) -> tuple[str, list[str]]:
+    """Digest of a module's code, and what it imports."""
+    content = file.read_bytes()
+    if file.suffix != ".py":  # a compiled library
+        return hashlib.sha256(content).hexdigest(), []
+    try:
+        tree = ast.parse(content)
+    except SyntaxError:  # imported in a function that has not been called
+        return hashlib.sha256(content).hexdigest(), []
+    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+    return hashlib.sha256(repr(_structure(tree)).encode()).hexdigest(), [*_imports(tree, package)]
+
+
+def _structure(node: Any) -> Any:
+    """A syntax tree without what does not run: comments, layout, docstrings, line numbers.
+
+    Empty fields are left out, so that Python versions that add fields give the same.
+    """
+    if isinstance(node, list):
+        return [_structure(each) for each in node if not _is_docstring(each)]
+    if not isinstance(node, ast.AST):
+        return node
+    fields = [(name, value) for name, value in ast.iter_fields(node) if value not in (None, [])]
+    return (type(node).__name__, *((name, _structure(value)) for name, value in fields))
+
+
+def _is_docstring(node: Any) -> bool:
+    is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_text and isinstance(node.value.value, str)
+
+
+def _imports(tree: ast.AST, package: str) -> Iterator[str]:
+    """Names that a module of `package` may import, with the packages that they lie in."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield from _with_packages(alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            relative = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name(relative, package) if node.level else relative
+            yield from _with_packages(base)
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def _with_packages(name: str) -> Iterator[str]:
+    """A dotted name and all its beginnings: importing a module runs its packages first."""
+    parts = name.split(".")
+    yield from (".".join(parts[: n + 1]) for n in range(len(parts)))

@@ -1,0 +1,1 @@
+"""The life of one run, and the pipeline of several."""

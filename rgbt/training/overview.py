@@ -1,0 +1,72 @@
+"""What a command is about to work with, said on stderr before its first progress bar."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from rgbt.build.load_run import Stored
+from rgbt.build.session import Session
+from rgbt.build.training_setup import Prepared
+from rgbt.tracking.terminal import place_lines
+
+MILLION = 1e6
+
+
+def announce_training(prepared: Prepared, name: str, folder: Path) -> None:
+    """Say what is trained on what: device, network, images, steps and the run folder."""
+    session, trainer = prepared.session, prepared.session.trainer
+    critics = "".join(f", {key} {_millions(net)}" for key, net in prepared.others.items())
+    batch = session.loading.batch_size * trainer.accumulate
+    epochs = trainer.max_steps * trainer.accumulate / prepared.steps_per_epoch()
+    lines = [
+        ("device", device_line(session)),
+        ("network", f"{network_line(session)}{critics}"),
+        ("images", f"{session.dataset.name}: {_images(prepared)}"),
+        (
+            "steps",
+            f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), "
+            f"validated every {trainer.eval_every}",
+        ),
+        ("folder", str(folder)),
+    ]
+    _write(name, *(f"  {line}" for line in place_lines(lines).plain.splitlines()))
+
+
+def announce_stored(stored: Stored) -> None:
+    """Say what predicts, in one line: device, network and checkpoint."""
+    session = stored.session
+    checkpoint = f"checkpoint of step {stored.step}" if stored.step else stored.label
+    _write(f"{device_line(session)}; {network_line(session)}; {checkpoint}")
+
+
+def device_line(session: Session) -> str:
+    """The device with its precision: "cpu, 2 threads, 32-true"."""
+    device = session.fabric.device
+    gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
+    threads = torch.get_num_threads()
+    plural = "" if threads == 1 else "s"
+    return f"{device}{gpu}, {threads} thread{plural}, {session.trainer.precision}"
+
+
+def network_line(session: Session) -> str:
+    """Class and number of parameters: "Mask2Former, 1.23 M parameters"."""
+    return f"{type(session.model).__name__}, {_millions(session.model)} parameters"
+
+
+def _write(*lines: str) -> None:
+    # Not as a remark (`tell`): drivers of sweeps take the last remark for what went wrong.
+    sys.stderr.write("".join(f"{line}\n" for line in lines))
+
+
+def _millions(network: nn.Module) -> str:
+    return f"{sum(each.numel() for each in network.parameters()) / MILLION:.2f} M"
+
+
+def _images(prepared: Prepared) -> str:
+    """Numbers of images by split: those of the training, of the selection and of the test."""
+    counts = ((len(prepared.session.dataset.names(each)), each) for each in prepared.read_splits())
+    return ", ".join(f"{count} {split}" for count, split in counts)

@@ -1,0 +1,396 @@
+"""One run from its configuration to its result, and everything it leaves in its folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from rgbt.build.session import (
+    Session,
+    decode_ahead,
+    evaluate,
+    legend_of,
+    names_key,
+    panel_names,
+    result_tables,
+    view_of,
+)
+from rgbt.build.training_setup import Prepared, prepare
+from rgbt.checks import InputError
+from rgbt.config.schema import build
+from rgbt.data.domains import Domains
+from rgbt.data.loaders import Batches
+from rgbt.data.pairs import PairedBatches
+from rgbt.engine.checkpoint import State, restore_weights
+from rgbt.engine.committed import Checkpoints
+from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
+from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
+from rgbt.metrics import names, scores
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.pairs import file_name
+from rgbt.runtime.signals import deferred
+from rgbt.spec.naming import describe, group_of
+from rgbt.spec.run_key import own_code, run_key
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.mlflow_store import Tracking
+from rgbt.tracking.other_code import warn_of_result, warn_of_steps
+from rgbt.tracking.pair_pictures import draw_pairs
+from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
+from rgbt.tracking.provenance import provenance, without_passwords
+from rgbt.tracking.replaced import replace_finished
+from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
+from rgbt.tracking.terminal import result_view, show, tell
+from rgbt.training.overview import announce_training
+from rgbt.transforms.view_sets import ViewSets
+
+MUCH_WAITING = 0.3
+"""Share of a step spent waiting for images above which a sentence says so."""
+
+
+def is_finished(config: DictConfig) -> bool:
+    """Whether the run of a configuration has its result."""
+    return (Path(config.runs_dir) / run_key(config) / "result.json").exists()
+
+
+def train(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Run `config` to its end, continuing where an earlier process stopped.
+
+    Args:
+        config: composed and checked.
+        overrides: as typed, for the run's name.
+
+    Raises:
+        InputError: the configuration, the data or the run folder do not fit.
+        RunError: the run cannot go on.
+    """
+    if config.out is not None:
+        raise InputError(f"out={config.out}: a run is written to runs_dir=...; omit out=...")
+    fresh, config = config.fresh, config.copy()
+    config.fresh = False  # a request to this command, no property of the run
+    path = Path(config.runs_dir) / run_key(config)
+    asked = describe(config, overrides)
+    tracking: Tracking = build(config.tracking)
+    if is_finished(config) and not fresh:
+        folder = RunFolder(path)
+        folder.clean()
+        _show_again(folder, tracking, asked)
+        warn_of_result(folder)
+        _tell_other_files(folder, config)
+        _tell_unmeasured(folder, build(config.consistency))
+    else:
+        # Everything is built before the folder is made: a wrong value leaves nothing behind.
+        prepared = prepare(config)
+        announce_training(prepared, asked.name, path)
+        decode_ahead(prepared.session, *prepared.read_splits())
+        if is_finished(config):
+            replace_finished(RunFolder(path), tracking)
+        folder = RunFolder(path)
+        with folder.lock():
+            Run(prepared, folder, tracking, asked).complete()
+    _show_result(folder, tracking, build(config.domains))
+
+
+def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
+    tables = folder.tables()
+    assert tables is not None, "a finished run has its tables"
+    heads = domains.told(domains.tested_head)
+    links = [*([("heads", heads)] if heads else []), *tracking.links()]
+    show(result_view(ResultTables.from_json(tables), folder.path, links))
+
+
+def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> None:
+    known = folder.description()
+    assert known is not None, "a finished run has its description"
+    tell(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
+    # A point of a grid that is the default elsewhere: the name that says more is the one to read.
+    lengths = [len(group_of(each.tags, each.params)) for each in (asked, known)]
+    shown = asked if lengths[0] > lengths[1] else known
+    tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
+    tracking.finish("FINISHED")
+
+
+def _tell_other_files(folder: RunFolder, config: DictConfig) -> None:
+    """A finished run of the same key may have been made on another copy: say so."""
+    if "root" not in config.dataset:
+        return  # made by its settings alone, which are in the key; it need not be made for this
+    result = folder.result()
+    try:
+        now = build(config.dataset).fingerprint()
+    except InputError:
+        return  # a result can be shown where its data are not at hand
+    if result is not None and result["dataset"] != now:
+        tell(
+            f"it was made on other files of the data set ({result['dataset'][:8]}, now "
+            f"{now[:8]}); to train on these: runs_dir=..., or dataset.name=..."
+        )
+
+
+def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
+    """A finished run measures nothing more: say how its consistency can still be had."""
+    places = [folder.path / file_name("aligned", split, asked.mark) for split in asked.splits]
+    if asked.sets and not all(place.is_file() for place in places):
+        tell(
+            "its consistency on these views and splits has not been measured; to add it: "
+            f"python -m rgbt.consistency run={folder.path} split=..."
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that is not finished: trains, evaluates and fills its folder."""
+
+    prepared: Prepared
+    folder: RunFolder
+    tracking: Tracking
+    description: Description
+
+    def complete(self) -> None:
+        """Train to the last step, evaluate the best checkpoint, write the result."""
+        started = time.time()
+        session = self.prepared.session
+        self._claim(session)
+        shown = self.description
+        tags = {**shown.tags, "rgbt.key": self.folder.path.name}
+        try:
+            self.tracking.start(self.folder, shown.name, tags, shown.params)
+            state = self._train(session)
+            checkpoints = Checkpoints(self.folder.path)
+            best = checkpoints.load_best(state.best_step)
+            restore_weights(session.model, best, checkpoints.best)
+            pairs = self._consistency(session)
+            self._test(session, state, pairs.get("test"))
+            checkpoints.tidy()
+            self._finish(session, state, time.time() - started, pairs)
+        except KeyboardInterrupt:
+            self.tracking.finish("KILLED")
+            raise
+        except BaseException:
+            # A run that stops on an error is shown as failed, not as running for ever.
+            self.tracking.finish("FAILED")
+            raise
+        with deferred():  # a signal must not leave a finished run as running in the store
+            self.tracking.finish("FINISHED")
+
+    def _finish(
+        self, session: Session, state: State, seconds: float, pairs: Mapping[str, ConsistencyTable]
+    ) -> None:
+        self.folder.finish(
+            {
+                "name": self.description.name,
+                "key": self.folder.path.name,
+                "dataset": session.dataset.fingerprint(),
+                "steps": state.step,
+                "best_step": state.best_step,
+                "best_score": state.best_score,
+                "seconds_of_last_process": round(seconds, 1),
+                "skipped": state.skipped,
+                **self._scores(state, pairs),
+            }
+        )
+
+    def _scores(
+        self, state: State, pairs: Mapping[str, ConsistencyTable]
+    ) -> dict[str, dict[str, float | None]]:
+        """What the best checkpoint reached on the selection split and on the test split."""
+        lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
+        val = lines.get(("val", state.best_step)) or self._validated()
+        found = {"val": val, "test": lines["test", state.step]}
+        found = {
+            kind: {**values, **(consistency_values(pairs[kind]) if kind in pairs else {})}
+            for kind, values in found.items()
+        }
+        return {kind: without_nan(values) for kind, values in found.items()}
+
+    def _validated(self) -> dict[str, float]:
+        """Scores of the best checkpoint from its counts, where their line was damaged."""
+        session = self.prepared.session
+        path = self.folder.counts_path(session.trainer.selection_split)
+        return scores.summary(Counts.load(path), session.regions.absent)
+
+    def _claim(self, session: Session) -> None:
+        """Write what identifies the run; refuse a folder that was started on other images."""
+        dataset = session.dataset
+        found = {"names": names_key(session), "files": dataset.fingerprint()}
+        before = self.folder.marker() or found
+        if before["names"] != found["names"]:
+            raise InputError(
+                f"{self.folder.path} was started on other images than the lists of "
+                f"{dataset.root} name; give the runs another folder (runs_dir=...), or the data "
+                "set another name (dataset.name=...)."
+            )
+        if before["files"] != found["files"]:
+            tell(f"files of {dataset.root} have changed since this run was started.")
+        self.folder.mark(**found)
+        config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
+        self.folder.write_config(config)
+        self.folder.add_provenance({**provenance(), "own_code": own_code(session.config)})
+
+    def _train(self, session: Session) -> State:
+        state = State(seed=session.config.seed)
+        trainer = self._trainer(session, state)
+        if trainer.resume(state):
+            if trainer.checkpoints.warning:
+                tell(trainer.checkpoints.warning)
+            tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
+        self.folder.begin_at(state.step)
+        warn_of_steps(self.folder, state.step)
+        self._truncate(state)
+        accumulate = session.trainer.accumulate
+        steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
+        batches = self.prepared.batches(steps)
+        trainer.fit(_noting_skipped(batches, state), state)
+        self._tell_waiting(session)
+        return state
+
+    def _truncate(self, state: State) -> None:
+        """Prepare ``metrics.jsonl`` for a run that resumes; say what is repeated or lost of it."""
+        step = state.step
+        before = self.folder.truncate_after(step, state.evaluated_step)
+        if before.reached > step:
+            tell(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
+        logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
+        every = max([self.prepared.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
+        if step - logged[-1] >= every:
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
+                f"checkpoint is of step {step}; the lines between are missing, counts and "
+                "checkpoint are not affected."
+            )
+        if before.damaged:
+            more = f" and {len(before.damaged) - 1} more" if len(before.damaged) > 1 else ""
+            tell(
+                f"warning: {self.folder.path / 'metrics.jsonl'} was damaged "
+                f"({before.damaged[0]}{more}); "
+                "these lines are left out, metrics.jsonl.damaged holds the file as it was."
+            )
+
+    def _tell_waiting(self, session: Session) -> None:
+        """Say so where the training mostly waited for images, and what helps."""
+        shares = [
+            line.values[WAIT_SHARE]
+            for line in self.folder.lines()
+            if line.kind == "train" and WAIT_SHARE in line.values
+        ]
+        if shares and np.median(shares) > MUCH_WAITING:
+            cache = (
+                "" if session.loading.cache else "data.cache=auto decodes every image once, and "
+            )
+            tell(
+                f"{np.median(shares):.0%} of the time of a step was waiting for images; {cache}"
+                "data.num_workers=... gives more processes to reading them."
+            )
+
+    def _trainer(self, session: Session, state: State) -> Trainer:
+        split = session.trainer.selection_split
+        per_epoch = self.prepared.steps_per_epoch()
+
+        def validate(step: int) -> float:
+            found = evaluate(session, self.prepared.model, split)
+            place = trainer.checkpoints.begin_evaluation(step)
+            found.counts.save(place / self.folder.counts_path(split).name)
+            values = scores.summary(found.counts, session.regions.absent)
+            values |= self._of_target(session, self.prepared.model, split, place)
+            self.folder.append(step, "val", values)
+            state.skip(found.skipped)
+            return values[names.MIOU]
+
+        trainer = Trainer(
+            fabric=session.fabric,
+            settings=session.trainer,
+            scheme=self.prepared.scheme,
+            model=self.prepared.model,
+            others=self.prepared.others,
+            optimizers=self.prepared.optimizers,
+            schedule=self.prepared.schedule,
+            steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
+            folder=self.folder.path,
+            record=lambda step, values: self.folder.append(step, "train", values),
+            validate=validate,
+            committed=self.tracking.update,
+        )
+        return trainer
+
+    def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
+        """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
+        tables: dict[str, ConsistencyTable] = {}
+        for kind in session.consistency.splits if session.consistency.sets else ():
+            split = session.trainer.selection_split if kind == "val" else kind
+            keep = panel_names(session.dataset, split) if kind == "test" else ()
+            try:
+                found = count_pairs(session, session.model, split, "virtual", keep=keep)
+            except InputError as error:
+                # The training is done, and is not lost for what is measured beside.
+                tell(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
+                continue
+            for protocol, counts in found.counts.items():
+                path = self.folder.path / file_name(protocol, split, session.consistency.mark)
+                path.parent.mkdir(exist_ok=True)
+                counts.save(path)
+            tables[kind] = consistency_table(found.counts, session.regions.absent)
+            if found.kept:
+                draw_pairs(found.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
+        return tables
+
+    def _test(self, session: Session, state: State, pairs: ConsistencyTable | None) -> None:
+        """Counts, tables and figures of the best checkpoint on the test split."""
+        found = evaluate(session, session.model, "test", keep=panel_names(session.dataset, "test"))
+        state.skip(found.skipped)
+        found.counts.save(self.folder.counts_path("test"))
+        values = scores.summary(found.counts, session.regions.absent)
+        of_target = self._of_target(session, session.model, "test", self.folder.path)
+        values |= of_target | ({} if pairs is None else consistency_values(pairs))
+        self.folder.append(state.step, "test", values)
+        name = self.description.name
+        tables = result_tables(found.counts, session.regions, name, state.best_step)
+        subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
+        classes = replace(tables.classes, subset_mious=subsets)
+        tables = replace(tables, classes=classes, consistency=pairs)
+        self.folder.write_tables(tables.to_json())
+        if found.kept:
+            self._draw(session, tables, found.kept)
+        else:
+            tell("none of the images of the panel could be read; no pictures were drawn.")
+
+    def _of_target(
+        self, session: Session, model: nn.Module, split: str, place: Path
+    ) -> dict[str, float]:
+        """Where the target is seen in another view than the source: its mIoU, named after that.
+
+        Its counts are written to the folder `place`.
+        """
+        target = session.domains.target
+        if target is None or target.view in (None, view_of(session)):
+            return {}
+        counts = evaluate(session, model, split, view=target.view).counts
+        counts.save(place / self.folder.counts_path(f"{split}_{target.view}").name)
+        values = scores.summary(counts, session.regions.absent)
+        kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
+        return {names.subset(target.view, name): values[name] for name in kept if name in values}
+
+    def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
+        draw_panel(kept, legend_of(session.dataset), self.folder.figure_path("panel"))
+        heat = RegionHeat(
+            title=f"{self.description.name}: IoU by region, {session.dataset.name} {tables.split}",
+            region_map=session.regions.map(kept[0].label.shape).astype(np.int64),
+            ious=tables.regions.region_ious,
+        )
+        draw_region_heat(heat, self.folder.figure_path("regions"))
+
+
+def _parts_of(of_target: Mapping[str, float]) -> dict[str, float]:
+    """The same as rows of the table: "thermal", "thermal, day", "thermal, night"."""
+    return {", ".join(name.split("/")[:-1]): value for name, value in of_target.items()}
+
+
+def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iterator[Loaded]:
+    """The batches, with unreadable files noted in `state` before a checkpoint is written."""
+    for batch in batches:
+        state.skip(batches.skipped)
+        yield batch

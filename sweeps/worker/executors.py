@@ -1,0 +1,170 @@
+"""How a command becomes a process: here, in a worker that is already warm.
+
+Importing torch and MLflow takes longer than a small run's first step. A fork server imports them
+once and forks a fresh process for every run: no state is carried from run to run, and the code is
+the one that was there when the driver began, also if somebody edits it meanwhile.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pkgutil
+import runpy
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import rgbt
+from rgbt.checks import InputError
+from rgbt.spec.source_code import counted_modules
+
+PRELOADED = (
+    *("sweeps.worker.executors", "torch", "hydra"),
+    *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
+)
+COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
+"""Run as programs, and a few lines each: not imported before."""
+
+GPUS = "CUDA_VISIBLE_DEVICES"
+
+GRACE_S = 20.0
+"""What a process that is asked to stop may take before it is killed."""
+
+
+class Job(Protocol):
+    """A process that was started."""
+
+    def poll(self) -> int | None:
+        """Its exit code, negative for a signal; None while it runs."""
+        ...
+
+    def stop(self) -> None:
+        """Ask it to stop; where it does not, later calls of `poll` kill it."""
+        ...
+
+
+class Executor(Protocol):
+    """Starts commands; it does not wait for them."""
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
+        """Start ``python -m <command>``.
+
+        Args:
+            command: module and its arguments, e.g. ("rgbt.run", "+experiment=grbm").
+            environment: variables set beside those of this process.
+            log: file that takes stdout and stderr, appended to.
+        """
+        ...
+
+
+class LocalExecutor:
+    """Processes on this machine, forked from one that has imported torch.
+
+    Args:
+        workers: processes at a time.
+    """
+
+    def __init__(self, workers: int = 1) -> None:
+        if workers > 1:
+            # Read when torch loads in the fork server. A run has a fixed number of threads: those
+            # of one that wait in a loop would take the cores of the others (2.3 times slower). A
+            # run alone is faster with them (1.15 to 1.5).
+            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        self._context = multiprocessing.get_context("forkserver")
+        self._is_preloaded = False
+
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
+        """See `Executor.start`."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        if not self._is_preloaded:
+            # Now, when the points are planned and have imported what the user wrote for them.
+            last = "sweeps.worker.preload"
+            modules = (*PRELOADED, *own_modules(), *counted_modules(), last)
+            self._context.set_forkserver_preload(list(modules))
+            self._is_preloaded = True
+        process = self._context.Process(
+            target=_run_module, args=(tuple(command), dict(environment), str(log), str(Path.cwd()))
+        )
+        # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
+        process.start()
+        return LocalJob(process)
+
+
+def check_gpus(gpus: tuple[int, ...] | None) -> None:
+    """Refuse numbers of GPUs that this machine does not have, or does not show to us.
+
+    Raises:
+        InputError: naming the first.
+    """
+    if gpus is None:
+        return
+    shown = os.environ.get(GPUS)
+    if shown is None:
+        import torch  # takes seconds: only where GPUs are named
+
+        known = [str(number) for number in range(torch.cuda.device_count())]
+    else:
+        known = [word.strip() for word in shown.split(",") if word.strip()]
+    for number in gpus:
+        if str(number) not in known:
+            here = "this machine" if shown is None else f"{GPUS}={shown}"
+            found = f"the GPUs {', '.join(known)} alone; take" if known else "no GPU; omit"
+            raise InputError(
+                f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
+                f"{'some of these' if known else 'gpus'}."
+            )
+
+
+def own_modules() -> list[str]:
+    """Every module of rgbt but the commands themselves, so that later edits reach no run."""
+    found = pkgutil.walk_packages(rgbt.__path__, "rgbt.")
+    names = [module.name for module in found if not module.name.endswith("__main__")]
+    return [name for name in names if name not in COMMANDS]
+
+
+class LocalJob:
+    """See `Job`. The process leads a process group, so that its workers go with it."""
+
+    def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
+        self._process = process
+        self._kill_at = float("inf")
+
+    def poll(self) -> int | None:
+        """See `Job.poll`."""
+        if self._process.exitcode is None and time.monotonic() > self._kill_at:
+            self._signal(signal.SIGKILL)
+        return self._process.exitcode
+
+    def stop(self) -> None:
+        """See `Job.stop`."""
+        self._kill_at = min(self._kill_at, time.monotonic() + GRACE_S)
+        self._signal(signal.SIGTERM)
+
+    def _signal(self, number: signal.Signals) -> None:
+        assert self._process.pid is not None, "a started process has a number"
+        try:
+            os.killpg(self._process.pid, number)
+        except ProcessLookupError:  # not yet the leader of its group, or gone already
+            if self._process.exitcode is None:
+                os.kill(self._process.pid, number)
+
+
+def _run_module(
+    command: Sequence[str], environment: Mapping[str, str], log: str, folder: str
+) -> None:
+    """In the new process: become ``python -m <command>``."""
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.update(environment)
+    os.chdir(folder)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    module, *arguments = command
+    sys.argv = [module, *arguments]
+    sys.orig_argv = [sys.executable, "-m", *command]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)

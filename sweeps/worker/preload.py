@@ -1,0 +1,10 @@
+"""Imported last by the process that all runs of a sweep are forked from: notes the code it has.
+
+The runs then carry the digests of the code that they execute, whatever is edited meanwhile.
+"""
+
+from rgbt.spec.source_code import loaded_modules, user_code
+from rgbt.tracking.provenance import code
+
+code()
+user_code(f"{module}.any" for module in loaded_modules())

@@ -1,0 +1,244 @@
+"""Runs as jobs of a cluster: ``executor=submitit``, one submitit job per run.
+
+The driver stays where it was started (a login node, inside tmux) and submits as many jobs at a time
+as it has workers. Nothing of a run is kept in submitit: what is submitted is the plain command,
+which continues its own run folder. So a job that SLURM pre-empts and queues again goes on from its
+checkpoint, and so does one that reaches its time limit: submitit's signal shortly before it has
+the job queued again, at most ``max_num_timeout`` times.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, check_choice, nearest
+from sweeps.worker.submitit_command import Command
+
+if TYPE_CHECKING:
+    import submitit
+
+CLUSTERS = ("slurm", "local", "debug")
+
+LOCAL_OPTIONS = ("timeout_min", "setup", "max_num_timeout")
+YEAR_MIN = 365 * 24 * 60
+"""Time limit of a local job: submitit's own is two minutes."""
+
+NOT_OURS = ("time", "job_name", "nodes", "ntasks_per_node", "tasks_per_node", "array_parallelism")
+"""Options with a second name (timeout_min, name), or for jobs that are not one process each."""
+
+PATIENCE_S = 60.0
+"""How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
+
+ASK_S = 5.0
+"""Seconds between two questions after a job that was told to stop."""
+
+FAILED = 1
+"""Exit code of a job that ended without telling one; its log says why."""
+
+
+class SubmititExecutor:
+    """Starts every run as a job; see `sweeps.worker.executors.Executor`.
+
+    Args:
+        folder: where submitit keeps what it writes, a folder for each job; for SLURM on a disk that
+            the nodes share.
+        options: ``cluster`` ("slurm", "local": processes of this machine, "debug": inside the
+            driver, one after the other) and submitit's parameters, with or without ``slurm_`` in
+            front: timeout_min, partition, gpus_per_node, cpus_per_task, mem_gb,
+            additional_parameters, max_num_timeout, ...
+
+    Raises:
+        InputError: submitit or SLURM is missing, an option is unknown or has a wrong value.
+    """
+
+    def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
+        self._submitit = _submitit()
+        self._cluster = str(options.get("cluster", "slurm"))
+        check_choice("submitit.cluster", self._cluster, CLUSTERS)
+        values = self._checked({k: v for k, v in options.items() if k != "cluster"})
+        limit = {}
+        if "max_num_timeout" in values:
+            limit[f"{self._cluster}_max_num_timeout"] = values.pop("max_num_timeout")
+        try:
+            self._executor = self._submitit.AutoExecutor(
+                Path(folder).resolve() / "%j", cluster=self._cluster, **limit
+            )
+            self._executor.update_parameters(**self._named(values))
+        except RuntimeError as error:
+            raise InputError(
+                "executor=submitit: there is no `srun` here; start the command on a login node of "
+                "the cluster, or use submitit.cluster=local."
+            ) from error
+        except (AssertionError, TypeError, ValueError) as error:
+            raise InputError(f"submitit={dict(options)}: {str(error).splitlines()[0]}") from error
+
+    def start(
+        self, command: Sequence[str], environment: Mapping[str, str], log: Path
+    ) -> SubmititJob:
+        """See `Executor.start`; a job that the cluster refuses fails, saying why.
+
+        Raises:
+            InputError: a GPU of the driver's machine is asked for on SLURM.
+        """
+        log.parent.mkdir(parents=True, exist_ok=True)
+        wanted: dict[str, str | None] = dict(environment)
+        gpus = "CUDA_VISIBLE_DEVICES"
+        if self._cluster == "slurm" and gpus in wanted:
+            raise InputError(
+                "gpus=[...] are GPUs of this machine; with executor=submitit the cluster gives "
+                "each run its own: submitit.gpus_per_node=1."
+            )
+        if self._cluster == "local":
+            # submitit hides all GPUs from a local job that did not ask for a number of them.
+            wanted.setdefault(gpus, os.environ.get(gpus))
+        task = Command(tuple(command), wanted, str(log.resolve()), str(Path.cwd()))
+        errors = self._submitit.core.utils
+        try:
+            job = self._executor.submit(task)
+        except (errors.FailedJobError, errors.FailedSubmissionError, OSError) as error:
+            _note(log, f"the job was not accepted: {_first_line(error)}")
+            return SubmititJob(None, log, self._cluster)
+        return SubmititJob(job, log, self._cluster)
+
+    def _checked(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Options by submitit's name without prefix."""
+        known = _known(self._submitit, self._cluster)
+        values = {key.removeprefix(f"{self._cluster}_"): value for key, value in options.items()}
+        for key in values:
+            if key not in known:
+                raise InputError(
+                    f"'submitit.{key}' is not an option of cluster={self._cluster}; "
+                    f"{nearest(key, known)}."
+                )
+        if self._cluster == "slurm" and values.get("timeout_min") is None:
+            raise InputError(
+                "submitit.timeout_min has no value; give the minutes that a job may take, at most "
+                "what the partition allows (`sinfo` shows it)."
+            )
+        return values
+
+    def _named(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values by the names that `AutoExecutor.update_parameters` takes."""
+        if self._cluster == "debug":
+            return {}
+        defaults: dict[str, Any] = {"name": "rgbt", "timeout_min": YEAR_MIN}
+        if "cpus_per_task" in values:
+            # From SLURM 22.05 on, a step does not take over the cores of its job by itself.
+            defaults["srun_args"] = [f"--cpus-per-task={values['cpus_per_task']}"]
+        shared = self._submitit.AutoExecutor._valid_parameters()
+        return {
+            key if key in shared else f"{self._cluster}_{key}": value
+            for key, value in {**defaults, **values}.items()
+        }
+
+
+class SubmititJob:
+    """A job of the cluster; see `sweeps.worker.executors.Job`.
+
+    Args:
+        job: None: it was refused.
+        log: of the run; gets a line if the job ends without an exit code.
+        cluster: one of `CLUSTERS`.
+    """
+
+    def __init__(self, job: submitit.Job[int] | None, log: Path, cluster: str) -> None:
+        self._job = job
+        self._log = log
+        self._cluster = cluster
+        self._code: int | None = FAILED if job is None else None
+        self._patience_s = PATIENCE_S if cluster == "slurm" else 0.0
+        self._gone_at: float | None = None
+        self._ask_at: float | None = None
+
+    def poll(self) -> int | None:
+        """See `Job.poll`. Cheap: submitit looks for a file, and asks SLURM more and more rarely.
+
+        A job that SLURM ends without a word is noticed within ten minutes.
+        """
+        if self._code is None and self._job is not None and self._is_done(self._job):
+            self._code = self._outcome(self._job)
+        return self._code
+
+    def stop(self) -> None:
+        """See `Job.stop`; a job that waits in the queue leaves it."""
+        if self._code is not None or self._job is None:
+            return
+        if self._cluster == "debug":
+            self._code = -signal.SIGTERM
+        self._cancel(self._job)
+        self._ask_at = time.monotonic() + ASK_S
+
+    def _cancel(self, job: submitit.Job[int]) -> None:
+        if self._cluster != "local":
+            job.cancel(check=False)
+            return
+        # submitit's own way leaves a run one second to go; the number of a local job is that of the
+        # process that looks after it, which hands the signal on.
+        with suppress(ProcessLookupError):
+            os.kill(int(job.job_id), signal.SIGTERM)
+
+    def _is_done(self, job: submitit.Job[int]) -> bool:
+        if self._ask_at is None or time.monotonic() < self._ask_at:
+            return bool(job.done())
+        self._ask_at = time.monotonic() + ASK_S
+        if job.done(force_check=True):
+            return True
+        if self._cluster == "local":
+            # The first signal may have come before anybody listened.
+            self._cancel(job)
+        return False
+
+    def _outcome(self, job: submitit.Job[int]) -> int | None:
+        """The exit code of a job that is done; None while it may still appear."""
+        if self._cluster == "debug" or job.paths.result_pickle.exists():
+            error = job.exception()
+            return int(job.result()) if error is None else self._lost(job, _last_line(error))
+        now = time.monotonic()
+        self._gone_at = now if self._gone_at is None else self._gone_at
+        if now - self._gone_at < self._patience_s:
+            return None
+        return self._lost(job, f"no result, state {job.state}")
+
+    def _lost(self, job: submitit.Job[int], reason: str) -> int:
+        _note(self._log, f"job {job.job_id} ended ({reason}); see {job.paths.stderr}.")
+        return FAILED if self._ask_at is None else -signal.SIGTERM
+
+
+def _submitit() -> Any:
+    try:
+        import submitit
+    except ImportError as error:
+        raise InputError(
+            "executor=submitit needs a package that is not installed: pip install 'rgbt[cluster]'."
+        ) from error
+    return submitit
+
+
+def _known(module: Any, cluster: str) -> list[str]:
+    """Options of a cluster, as submitit itself lists them."""
+    if cluster != "slurm":
+        return list(LOCAL_OPTIONS) if cluster == "local" else []
+    names = module.AutoExecutor._valid_parameters() | module.SlurmExecutor._valid_parameters()
+    return sorted({*names, "max_num_timeout"} - set(NOT_OURS))
+
+
+def _note(log: Path, sentence: str) -> None:
+    with log.open("a") as file:
+        file.write(f"rgbt: {sentence}\n")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _last_line(error: BaseException) -> str:
+    """The last line of the trace that submitit wraps into its own sentences."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    marks = [index for index, line in enumerate(lines) if line.startswith("-----")]
+    return lines[marks[1] - 1] if len(marks) > 1 else _first_line(error)

@@ -1,0 +1,304 @@
+"""Before anything is trained or written: whose labels a domain gets, and what is told of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from rgbt.training.train import pipeline as earlier
+from rgbt.build import training_setup as prepared_module
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.config.schema import build, check
+from rgbt.data.pseudo_labels import FORMAT
+from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
+from rgbt.evaluation.pseudo_labels import BEGUN, Teacher, write_pseudo_labels
+from rgbt.build.session import decode_ahead, open_session
+from rgbt.types import Batch
+from tests.commands import SPLITS, Call, assert_one_sentence, words_of
+from tests.composed import composed as composed_once
+
+SIZES = (
+    *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
+    *("dataset.num_val=1", "dataset.num_test=2", "scale.batch_size=1", "scale.critic_width=4"),
+    *("trainer.accelerator=cpu", "trainer.threads=1", "data.num_workers=0", "tracking=none"),
+)
+Composed = Callable[..., DictConfig]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("prepared")
+
+
+@pytest.fixture
+def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
+    place = (f"dataset.cache_dir={cache}", f"runs_dir={tmp_path / 'runs'}")
+    return lambda name, *more: [f"+experiment={name}", *SIZES, *place, *more]
+
+
+@pytest.fixture
+def composed(words: Callable[..., list[str]]) -> Composed:
+    def make(name: str, *more: str) -> DictConfig:
+        config = compose(words(name, *more))
+        check(config)
+        return config
+
+    return make
+
+
+def write_folder(config: DictConfig, folder: Path, split: str, **changes: Any) -> Path:
+    """A folder that says it is finished, with (empty) files of every image of a split."""
+    dataset = build(config.dataset)
+    for name in dataset.names(split):
+        (folder / "labels").mkdir(parents=True, exist_ok=True)
+        (folder / "labels" / f"{name}.png").touch()
+    said = {
+        **{"format": FORMAT, "digest": "abc", "classes": list(dataset.classes)},
+        **{"kept": 0.5, "threshold": 0.9, "fingerprint": dataset.fingerprint(), **changes},
+    }
+    (folder / "pseudo_labels.json").write_text(json.dumps(said))
+    return folder
+
+
+# ---- labels of the data set -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["source", "target"])
+def test_given_labels_that_the_data_set_does_not_have(composed: Composed, name: str) -> None:
+    config = composed("sh_both", f"domains.{name}.split=train_night")
+    with pytest.raises(InputError) as raised:
+        prepare(config)
+    assert f"domains.{name}.labels=given, but synth_freiburg has no labels of train_night" in str(
+        raised.value
+    )
+
+
+def test_images_without_labels_are_fine_where_none_are_read(composed: Composed) -> None:
+    night = "domains.target.split=train_night"
+    found = prepare(composed("sh_adversarial", "model.weights=null", night))
+    dataset = found.datasets["target"]
+    assert dataset.read(dataset.names("train_night")[0]).label is None
+
+
+def test_test_images_in_training_are_told(
+    composed: Composed, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def told(*more: str) -> list[str]:
+        capfd.readouterr()
+        prepare(composed("sh_both", *more))
+        return [line for line in capfd.readouterr().err.splitlines() if "test images" in line]
+
+    assert told() == []
+    # One of the two test images is of the day.
+    (line,) = told("domains.target.split=test_day")
+    assert "domains.target.split=test_day: 1 of its images are test images" in line
+    (line,) = told("domains.source.split=test")
+    assert "domains.source.split=test: 2 of its images are test images" in line
+    # Without their labels they are the images of a target that is adapted to, and may be seen.
+    prepare(composed("sh_adversarial", "model.weights=null", "domains.target.split=test_night"))
+    assert "test images" not in capfd.readouterr().err
+
+
+# ---- pseudo-labels --------------------------------------------------------------------------
+
+
+def refused(call: Call, words: list[str], sentence: str, runs: Path) -> None:
+    from rgbt.run import main
+
+    before = {*runs.glob("*/*")}
+    code, _, err = call(main, *words)
+    assert code == 2, err
+    assert_one_sentence(err, sentence)
+    assert {*runs.glob("*/*")} == before, "nothing is left behind"
+
+
+def test_pseudo_labels_of_another_split(
+    call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    folder = write_folder(composed("sh_both"), tmp_path / "night", "train_night")
+    typed = ("sh_both", f"domains.target.labels={folder}")
+    sentence = f"domains.target.labels: {folder} has no pseudo-labels of 3 of the 3 images"
+    refused(call, words(*typed), sentence, tmp_path / "runs")
+    # A file that is left out among others is none that the run goes without unasked ...
+    folder = write_folder(composed("sh_both"), tmp_path / "day", "train_day")
+    next(iter((folder / "labels").iterdir())).unlink()
+    typed = ("sh_both", f"domains.target.labels={folder}")
+    with pytest.raises(InputError, match="no pseudo-labels of 1 of the 3 images of train_day"):
+        prepare(composed(*typed))
+    prepare(composed(*typed, "data.on_error=skip"))
+    # ... and without any there is nothing to learn from.
+    for path in (folder / "labels").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="no pseudo-labels of 3 of the 3 images of train_day"):
+        prepare(composed(*typed, "data.on_error=skip"))
+
+
+def test_pseudo_labels_of_which_none_was_kept(
+    call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    folder = write_folder(composed("sh_both"), tmp_path / "none", "train_day", kept=0)
+    sentence = "holds no label of any pixel, its threshold of 0.9 was above every confidence"
+    typed = ("sh_both", f"domains.target.labels={folder}")
+    refused(call, words(*typed), sentence, tmp_path / "runs")
+
+
+def finished_teacher(config: DictConfig) -> Path:
+    """The folder of an earlier run that has its result."""
+    (found,) = earlier.earlier_runs(config)
+    found.folder.mkdir(parents=True)
+    (found.folder / "result.json").write_text("{}")
+    return found.folder
+
+
+def test_predicted_labels_of_other_files(
+    call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    """Named by their experiment they follow the data; a folder is taken as it is."""
+    config = composed("multi_head_night_stage1")
+    labels = finished_teacher(config) / "pseudo_labels" / "train_night_thermal_best"
+    write_folder(config, labels, "train_night", fingerprint="of other files")
+    sentence = f"{labels} was predicted on other files of synth_freiburg than those of"
+    refused(call, words("multi_head_night_stage1"), sentence, tmp_path / "runs")
+    write_folder(config, labels, "train_night")
+    prepare(config)
+    write_folder(config, labels, "train_night", fingerprint="of other files")
+    typed = (f"domains.target.labels={labels}", "domains.target.teacher_view=null")
+    prepare(composed("multi_head_night_stage1", *typed))
+
+
+BEFORE_TRAINING = {
+    "a view of another network": (
+        ["multi_head_night_stage1", "domains.target.teacher_view=rgb"],
+        "domains.target.teacher_view=rgb, but the network of thermal_teacher predicts from thermal",
+    ),
+    "a confidence that masks do not read": (
+        [
+            *("multi_head_night_stage1", "domains.target.confidence=true"),
+            *("model=mask2former_tiny", "loss=set_criterion"),
+        ],
+        "domains.target.confidence=true, but SetCriterion does not weigh pixels by it",
+    ),
+    "a confidence that two frames do not read": (
+        [
+            *("multi_head_night_stage1", "domains.target.confidence=true"),
+            *("loss=temporal_paper", "loss@loss.segmentation=cross_entropy"),
+        ],
+        "domains.target.confidence=true, but TemporalLoss does not weigh pixels by it",
+    ),
+}
+
+
+@pytest.mark.parametrize(("typed", "sentence"), BEFORE_TRAINING.values(), ids=BEFORE_TRAINING)
+def test_found_before_a_teacher_is_trained(
+    call: Call, words: Callable[..., list[str]], tmp_path: Path, typed: list[str], sentence: str
+) -> None:
+    refused(call, words(*typed), sentence, tmp_path / "runs")
+
+
+def test_a_view_that_the_teacher_has_passes_the_rehearsal(composed: Composed) -> None:
+    for view in ("thermal", "null"):
+        rehearse(composed("multi_head_night_stage1", f"domains.target.teacher_view={view}"))
+    rehearse(composed("multi_head_night_stage1", "domains.target.confidence=true"))
+
+
+# ---- the folder -----------------------------------------------------------------------------
+
+
+def test_another_range_of_thermal_counts_is_another_input(
+    composed: Composed, tmp_path: Path
+) -> None:
+    """The files are the same; what the network sees of them is not."""
+
+    def written(*typed: str) -> Any:
+        session = open_session(composed("thermal_teacher", *typed))
+        return write_pseudo_labels(
+            *(session, Teacher("a", "w"), "val", "thermal", tmp_path / "out", 0.0, None, None)
+        )
+
+    first = written()
+    other = "dataset.thermal_range=[21800,25000]"
+    with pytest.raises(InputError, match=r"pseudo-labels of another network \("):
+        written(other)
+    (tmp_path / "out" / "pseudo_labels.json").rename(tmp_path / "out" / BEGUN)
+    with pytest.raises(InputError, match=r"pseudo-labels of another network \("):
+        written(other)
+    assert written().digest == first.digest
+
+
+# ---- images: decoded ahead, and where they are augmented ------------------------------------
+
+
+@pytest.fixture
+def cached(data: Path, tmp_path: Path) -> DictConfig:
+    """A small network on MFNet, with a cache."""
+    model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
+    place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
+    words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
+    return composed_once((*words, *place))
+
+
+def test_all_that_is_read_is_decoded_before_the_first_step(
+    cached: DictConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a disk that is full, or may not be written, is told before anything is trained."""
+    prepare(cached, rehearsal=True)
+    assert not (tmp_path / "cache").exists(), "a rehearsal leaves nothing behind"
+    prepared = prepare(cached)
+    decode_ahead(prepared.session, *prepared.read_splits())
+    dataset: Any = prepared.session.dataset
+
+    def refuses(name: str) -> None:
+        raise AssertionError(f"{name} was decoded")
+
+    monkeypatch.setattr(dataset.source, "read", refuses)
+    for split, names in SPLITS.items():
+        assert [dataset.read(name).name for name in names] == names, split
+    one = next(prepared.batches(range(1)))
+    assert isinstance(one, Batch), "no GPU to augment on"
+    monkeypatch.setattr(prepared_module, "_where_to_augment", lambda session: "device")
+    other = next(prepared.batches(range(1)))
+    assert not isinstance(other, Batch)
+    assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
+
+
+def place_of(asked: str, device: str, transform: object, **settings: object) -> str:
+    session: Any = SimpleNamespace(
+        loading=SimpleNamespace(augment=asked),
+        transform=transform,
+        fabric=SimpleNamespace(device=torch.device(device)),
+        config=SimpleNamespace(transform=settings),
+    )
+    return _where_to_augment(session)
+
+
+def test_where_batches_are_augmented() -> None:
+    able, unable = SimpleNamespace(works_on_batches=True), SimpleNamespace(works_on_batches=False)
+    for device, where in (("cpu", "loader"), ("cuda", "device")):
+        assert place_of("auto", device, able) == where
+        assert place_of("auto", device, unable) == "loader"
+        assert place_of("auto", device, object()) == "loader"
+        assert place_of("device", device, able) == "device", "as asked"
+        assert place_of("loader", device, able) == "loader"
+        assert place_of("loader", device, unable) == "loader"
+
+
+def test_a_transform_of_single_images_is_refused_on_the_device() -> None:
+    """With the key that helps: the one value that differs, or another transform."""
+    unable = SimpleNamespace(works_on_batches=False)
+    for settings, key in (
+        ({"colour": "released"}, "transform.colour=intended"),
+        ({}, "transform=crm"),
+    ):
+        sentence = rf"^data\.augment=device, but SimpleNamespace works on .*; choose {key}, or "
+        with pytest.raises(InputError, match=sentence):
+            place_of("device", "cuda", unable, **settings)
+    with pytest.raises(InputError, match="but object works on single images"):
+        place_of("device", "cpu", object())

@@ -1,0 +1,120 @@
+"""Files of ImageNet networks as their authors' code names them, built without our networks."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.checkpoints.files import named, tensor
+
+ENDS = ("weight", "bias")
+
+
+def swin_file(
+    width: int, depths: tuple[int, ...], heads: tuple[int, ...], window: int, labels: int = 1000
+) -> OrderedDict[str, Tensor]:
+    """ImageNet Swin, `microsoft/Swin-Transformer`."""
+    span = (2 * window - 1) ** 2
+    shapes: dict[str, Any] = {
+        "patch_embed.proj.weight": (width, 3, 4, 4),
+        "patch_embed.proj.bias": (width,),
+        "patch_embed.norm.weight": (width,),
+        "patch_embed.norm.bias": (width,),
+    }
+    masks = {}
+    for stage, (depth, head) in enumerate(zip(depths, heads, strict=True)):
+        dim = width * 2**stage
+        for block in range(depth):
+            at = f"layers.{stage}.blocks.{block}"
+            if block % 2 and stage < 3:
+                masks[f"{at}.attn_mask"] = (64 // 4**stage, window**2, window**2)
+            shapes |= {f"{at}.{norm}.{end}": (dim,) for norm in ("norm1", "norm2") for end in ENDS}
+            shapes[f"{at}.attn.relative_position_bias_table"] = (span, head)
+            shapes |= linear(f"{at}.attn.qkv", dim, 3 * dim)
+            shapes |= linear(f"{at}.attn.proj", dim, dim)
+            shapes |= linear(f"{at}.mlp.fc1", dim, 4 * dim)
+            shapes |= linear(f"{at}.mlp.fc2", 4 * dim, dim)
+        if stage < 3:
+            at = f"layers.{stage}.downsample"
+            shapes |= {f"{at}.norm.{end}": (4 * dim,) for end in ENDS}
+            shapes[f"{at}.reduction.weight"] = (2 * dim, 4 * dim)
+    last = width * 2**3
+    shapes |= {"norm.weight": (last,), "norm.bias": (last,)} | linear("head", last, labels)
+    tensors = named({**shapes, **masks})
+    for name in list(tensors):
+        if name.endswith("bias_table"):
+            index = name.replace("bias_table", "index")
+            tensors[index] = tensor(index, (window**2, window**2), torch.int64)
+    return tensors
+
+
+def linear(name: str, before: int, after: int) -> dict[str, Any]:
+    return {f"{name}.weight": (after, before), f"{name}.bias": (after,)}
+
+
+def mit_file(dims: tuple[int, ...], depths: tuple[int, ...]) -> OrderedDict[str, Tensor]:
+    """ImageNet MiT, `NVlabs/SegFormer`."""
+    shapes: dict[str, Any] = linear("head", dims[3], 1000)
+    before = 3
+    for stage, (dim, depth, ratio) in enumerate(zip(dims, depths, (8, 4, 2, 1), strict=True), 1):
+        kernel = 7 if stage == 1 else 3
+        shapes[f"patch_embed{stage}.proj.weight"] = (dim, before, kernel, kernel)
+        shapes[f"patch_embed{stage}.proj.bias"] = (dim,)
+        norms = [f"patch_embed{stage}.norm", f"norm{stage}"]
+        for block in range(depth):
+            at = f"block{stage}.{block}"
+            norms += [f"{at}.norm1", f"{at}.norm2"]
+            shapes |= linear(f"{at}.attn.q", dim, dim) | linear(f"{at}.attn.kv", dim, 2 * dim)
+            shapes |= linear(f"{at}.attn.proj", dim, dim)
+            shapes |= linear(f"{at}.mlp.fc1", dim, 4 * dim) | linear(f"{at}.mlp.fc2", 4 * dim, dim)
+            shapes[f"{at}.mlp.dwconv.dwconv.weight"] = (4 * dim, 1, 3, 3)
+            shapes[f"{at}.mlp.dwconv.dwconv.bias"] = (4 * dim,)
+            if ratio > 1:
+                shapes[f"{at}.attn.sr.weight"] = (dim, dim, ratio, ratio)
+                shapes[f"{at}.attn.sr.bias"] = (dim,)
+                norms.append(f"{at}.attn.norm")
+        shapes |= {f"{norm}.{end}": (dim,) for norm in norms for end in ENDS}
+        before = dim
+    return named(shapes)
+
+
+def resnet_file(
+    layers: int, *, counters: bool = True, prefix: str = "", width: int = 64
+) -> OrderedDict[str, Tensor]:
+    """torchvision's ResNets."""
+    bottleneck = layers >= 50
+    blocks = {
+        **{18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3)},
+        **{152: (3, 8, 36, 3)},
+    }[layers]
+    shapes: dict[str, Any] = {"conv1.weight": (width, 3, 7, 7)}
+    norms = [("bn1", width)]
+    before = width
+    for stage, depth in enumerate(blocks, 1):
+        inner = width * 2 ** (stage - 1)
+        out = 4 * inner if bottleneck else inner
+        for block in range(depth):
+            at = f"layer{stage}.{block}"
+            sides = ((1, before, inner), (3, inner, inner), (1, inner, out))
+            if not bottleneck:
+                sides = ((3, before, inner), (3, inner, out))
+            for index, (side, source, target) in enumerate(sides, 1):
+                shapes[f"{at}.conv{index}.weight"] = (target, source, side, side)
+                norms.append((f"{at}.bn{index}", target))
+            if before != out:
+                shapes[f"{at}.downsample.0.weight"] = (out, before, 1, 1)
+                norms.append((f"{at}.downsample.1", out))
+            before = out
+    ends = ("weight", "bias", "running_mean", "running_var")
+    shapes |= {f"{norm}.{end}": (size,) for norm, size in norms for end in ends}
+    tensors = named({f"{prefix}{name}": shape for name, shape in shapes.items()})
+    if counters:
+        for norm, _ in norms:
+            name = f"{norm}.num_batches_tracked"
+            tensors[name] = tensor(name, (), torch.int64)
+    if not prefix:
+        tensors |= named(linear("fc", before, 1000))
+    return tensors

@@ -1,0 +1,443 @@
+"""Every layout: what a file is taken for, and where each of its tensors goes."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from rgbt.checkpoints.layout import Facts
+from rgbt.checkpoints.layouts import mask2former
+from rgbt.checkpoints.load import load_weights, plan_for
+from rgbt.checkpoints.plan import Plan
+from rgbt.checkpoints.read import read
+from rgbt.checkpoints.recognise import recognise
+from rgbt.checkpoints.view import count_parameters
+from tests.checkpoints.files import holds, like, named, network, released, saved
+from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
+from tests.models import golden
+from tests.models.golden import requires_golden
+
+RELEASES = {
+    # name of the record: yaml, classes, what it is
+    "crm_swin_t": ("mask2former_swin_t", 9, "checkpoint of CRM or SpatialSeg (Swin-T, 9 classes)"),
+    "crm_swin_s": ("mask2former_swin_s", 9, "checkpoint of CRM or SpatialSeg (Swin-S, 9 classes)"),
+    "cmx_mit_b0": ("cmx_b0", 9, "CMX checkpoint (MiT-B0, 9 classes)"),
+    "cmx_mit_b2": ("cmx_b2", 9, "CMX checkpoint (MiT-B2, 9 classes)"),
+    "temporal_cmx_b2": (
+        "cmx_b2",
+        9,
+        "CMX checkpoint of the temporal release (MiT-B2, 9 classes)",
+    ),
+    "rtfnet_50": ("rtfnet_50", 9, "RTFNet checkpoint (ResNet-50, 9 classes)"),
+    "mfnet": ("mfnet", 9, "MFNet checkpoint (9 classes)"),
+    "heatnet": ("heatnet", 13, "HeatNet checkpoint (ResNet-50, 13 classes)"),
+}
+FITS = {
+    "crm_swin_t": ("model=mask2former_swin_t",),
+    "crm_swin_s": ("model=mask2former_swin_s",),
+    "cmx_mit_b0": (
+        "model=cmx_b0",
+        "model/inputs=cmx_released",
+        "model.decoder_norm_eps_eval=1e-5",
+    ),
+    "cmx_mit_b2": (
+        "model=cmx_b2",
+        "model/inputs=cmx_released",
+        "model.decoder_norm_eps_eval=1e-5",
+    ),
+    "temporal_cmx_b2": ("model=cmx_b2", "model/inputs=temporal"),
+    "rtfnet_50": ("model=rtfnet_50",),
+    "mfnet": ("model=mfnet",),
+    "heatnet": ("model=heatnet",),
+}
+PARAMETERS = {
+    "crm_swin_t": 74_917_000,
+    "cmx_mit_b0": 12_114_641,
+    "cmx_mit_b2": 66_565_521,
+    "temporal_cmx_b2": 66_566_988,
+    "rtfnet_50": 185_238_501,
+    "mfnet": 736_275,
+    "heatnet": 54_361_040 + 2_774_977,  # and its critic
+}
+"""The published or counted ones; of Swin-T four digits are known."""
+
+LEFTOVER = {
+    "crm_swin_t": 25,  # an index per block of both branches, and the loss's class weights
+    "crm_swin_s": 49,
+    "temporal_cmx_b2": 2,
+    "heatnet": 10,
+}
+WRAPPED = {
+    "crm_swin_t": lambda state: {"epoch": 1, "state_dict": state, "hyper_parameters": {}},
+    "cmx_mit_b2": lambda state: {"model": state, "optimizer": {}, "epoch": 1, "iteration": 2},
+    "heatnet": lambda state: OrderedDict((f"module.{key}", state[key]) for key in state),
+}
+
+
+SLOW = pytest.mark.slow
+
+
+def planned(model: nn.Module, path: Path, fresh: tuple[str, ...] = ()) -> tuple[Facts, Plan]:
+    facts, plan, _ = plan_for(model, read(path), fresh)
+    return facts, plan
+
+
+def on_paper(yaml: str, num_classes: int = 9, **changed: Any) -> nn.Module:
+    """A network without memory for its weights."""
+    with torch.device("meta"):
+        return golden.network(yaml, num_classes, **changed)
+
+
+@requires_golden
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("cmx_mit_b0", "mfnet", "heatnet"),
+        *(pytest.param(n, marks=SLOW) for n in ("crm_swin_t", "crm_swin_s", "cmx_mit_b2")),
+        *(pytest.param(n, marks=SLOW) for n in ("temporal_cmx_b2", "rtfnet_50")),
+    ],
+)
+def test_released_networks_are_recognised_and_used_up(tmp_path: Path, name: str) -> None:
+    yaml, classes, title = RELEASES[name]
+    state = released(name)
+    path = saved(tmp_path, WRAPPED.get(name, OrderedDict)(state))
+    model = on_paper(yaml, classes)
+    facts, plan = planned(model, path)
+    assert facts.title == title
+    assert facts.fits[0] == FITS[name]
+    assert plan.fits
+    assert plan.fresh == {}
+    assert plan.zeros == []
+    assert plan.values.keys() == model.state_dict().keys()
+    assert len(plan.leftover) == LEFTOVER.get(name, 0)
+    assert len(plan.values) + len(plan.leftover) == len(state)
+
+
+@requires_golden
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_of_a_file_are_those_that_are_published(name: str) -> None:
+    counted = count_parameters(on_meta(released(name)))
+    assert counted == pytest.approx(PARAMETERS[name], rel=1e-4 if "swin" in name else 0)
+
+
+def on_meta(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The same shapes without memory."""
+    return {key: torch.empty_like(value, device="meta") for key, value in state.items()}
+
+
+@requires_golden
+@pytest.mark.parametrize("name", ["mfnet", "cmx_mit_b0"])
+def test_released_networks_are_loaded_equal(tmp_path: Path, name: str) -> None:
+    yaml, classes, _ = RELEASES[name]
+    model = network(yaml, classes)
+    report = load_weights(model, saved(tmp_path, released(name)))
+    assert report.num_set == report.num_entries == len(model.state_dict())
+    for key, value in model.state_dict().items():
+        assert holds(value, key), key
+
+
+@requires_golden
+def test_released_weights_of_mfnet_begin_their_counters_at_0() -> None:
+    from tests.models.golden import SHARED
+
+    path = SHARED / "realdata/mfnet_weights/final.pth"
+    model = network("mfnet")
+    report = load_weights(model, path)
+    assert (report.num_set, report.num_zeros, report.num_entries) == (228, 38, 266)
+    expected = torch.load(path, map_location="cpu", weights_only=True)
+    state = model.state_dict()
+    assert all(torch.equal(state[key], expected[key]) for key in expected)
+    assert all(value == 0 for key, value in state.items() if key.endswith("num_batches_tracked"))
+    assert count_parameters(read(path).tensors) == 736_275
+
+
+SWINS = {
+    "Swin-T": (96, (2, 2, 6, 2), (3, 6, 12, 24), "mask2former_swin_t"),
+    "Swin-S": (96, (2, 2, 18, 2), (3, 6, 12, 24), "mask2former_swin_s"),
+    "Swin-B": (128, (2, 2, 18, 2), (4, 8, 16, 32), "mask2former_swin_b"),
+}
+
+
+@pytest.mark.parametrize(
+    ("size", "container"),
+    [
+        ("Swin-T", "original"),
+        ("Swin-T", "detectron2"),
+        pytest.param("Swin-S", "original", marks=SLOW),
+        pytest.param("Swin-B", "detectron2", marks=SLOW),
+    ],
+)
+def test_imagenet_swin_fills_both_branches(tmp_path: Path, size: str, container: str) -> None:
+    import pickle
+
+    width, depths, heads, yaml = SWINS[size]
+    tensors = swin_file(width, depths, heads, 7)
+    if container == "original":
+        path = saved(tmp_path, {"model": tensors})
+    else:
+        path = tmp_path / "swin.pkl"
+        content = {"model": tensors, "__author__": "third_party", "matching_heuristics": True}
+        path.write_bytes(pickle.dumps(content))
+    model = on_paper(yaml)
+    facts, plan = planned(model, path)
+    assert facts.title == f"ImageNet Swin Transformer ({size})"
+    assert facts.fits == ((f"model={yaml}",),)
+    assert facts.window == 7
+    assert plan.fits
+
+    blocks = sum(depths)
+    # Every block of a branch has 13 parameters, and each branch 4 of the embedding, 9 of merging.
+    assert len(plan.values) == 2 * (13 * blocks + 4 + 9)
+    assert set(plan.fresh) == {
+        key
+        for key in model.state_dict()
+        if key.startswith(("sem_seg_head.", "backbone.norm_layers."))
+        or key.split(".")[2] in ("mask_token", "norm0", "norm1", "norm2", "norm3")
+    }
+    masks = [name for name in plan.leftover if name.endswith("attn_mask")]
+    assert len(masks) == sum(depth // 2 for depth in depths[:3])
+    assert {n for n in plan.leftover if n.split(".")[0] in ("norm", "head")} == {
+        *("norm.weight", "norm.bias", "head.weight", "head.bias")
+    }
+    assert len(plan.leftover) == len(masks) + 4 + blocks
+    for branch in ("RGB", "THR"):
+        entry = f"backbone.{branch}_branch.layers.2.blocks.1.attn.qkv.weight"
+        assert plan.values[entry] == "layers.2.blocks.1.attn.qkv.weight"
+
+
+SWIN_SIZES = {"embed_dim": 32, "depths": [1, 1, 2, 1], "num_heads": [1, 2, 4, 8], "window_size": 5}
+
+
+def tiny_swin() -> OrderedDict[str, Tensor]:
+    return swin_file(32, (1, 1, 2, 1), (1, 2, 4, 8), 5, labels=10)
+
+
+def test_imagenet_swin_is_loaded_into_both_branches(tmp_path: Path) -> None:
+    model, tensors = network("mask2former_tiny", **SWIN_SIZES), tiny_swin()
+    stem = torch.arange(32 * 3 * 16.0).reshape(32, 3, 4, 4)
+    tensors["patch_embed.proj.weight"] = stem
+    before = {key: value.clone() for key, value in model.state_dict().items()}
+    load_weights(model, saved(tmp_path, {"model": tensors}))
+    after = model.state_dict()
+    rgb, thermal = "backbone.RGB_branch.", "backbone.THR_branch."
+    assert torch.equal(after[f"{rgb}patch_embed.proj.weight"], stem)
+    found = after[f"{thermal}patch_embed.proj.weight"]
+    assert found.shape == (32, 1, 4, 4)
+    assert torch.allclose(found[:, 0], (stem[:, 0] + stem[:, 1] + stem[:, 2]) / 3)
+    for name in tensors:
+        if name.startswith("layers.") and f"{rgb}{name}" in after:
+            assert holds(after[f"{rgb}{name}"], name)
+            assert holds(after[f"{thermal}{name}"], name)
+    for key in after:
+        if key.startswith("sem_seg_head.") or ".norm3." in key or key.endswith("mask_token"):
+            assert torch.equal(after[key], before[key]), key
+
+
+def test_imagenet_swin_with_shared_stages(tmp_path: Path) -> None:
+    model, tensors = network("mask2former_tiny", share_start=2, **SWIN_SIZES), tiny_swin()
+    load_weights(model, saved(tmp_path, {"model": tensors}))
+    name = "layers.2.blocks.1.mlp.fc1.weight"
+    for branch in ("RGB", "THR"):
+        assert holds(model.state_dict()[f"backbone.{branch}_branch.{name}"], name)
+
+
+def test_a_thermal_stem_of_three_channels_is_copied(tmp_path: Path) -> None:
+    model, tensors = network("mask2former_tiny", **SWIN_SIZES), tiny_swin()
+    thermal = model.get_submodule("backbone.THR_branch.patch_embed")
+    thermal.proj = nn.Conv2d(3, 32, 4, stride=4)
+    stem = torch.arange(32 * 3 * 16.0).reshape(32, 3, 4, 4)
+    tensors["patch_embed.proj.weight"] = stem
+    load_weights(model, saved(tmp_path, {"model": tensors}))
+    assert torch.equal(thermal.proj.weight, stem)
+
+
+MITS = {
+    "b0": ((32, 64, 160, 256), (2, 2, 2, 2)),
+    "b1": ((64, 128, 320, 512), (2, 2, 2, 2)),
+    "b2": ((64, 128, 320, 512), (3, 4, 6, 3)),
+    "b3": ((64, 128, 320, 512), (3, 4, 18, 3)),
+    "b4": ((64, 128, 320, 512), (3, 8, 27, 3)),
+    "b5": ((64, 128, 320, 512), (3, 6, 40, 3)),
+}
+
+
+def slow_but(fast: Any, names: Iterable[Any]) -> list[Any]:
+    """Parameters of a test, all but one for the slow suite: big networks take seconds to build."""
+    return [name if name == fast else pytest.param(name, marks=SLOW) for name in names]
+
+
+@pytest.mark.parametrize("size", slow_but("b0", MITS))
+def test_imagenet_mit_fills_both_streams(tmp_path: Path, size: str) -> None:
+    tensors = mit_file(*MITS[size])
+    model = on_paper(f"cmx_{size}")
+    facts, plan = planned(model, saved(tmp_path, tensors))
+    assert facts.title == f"ImageNet MiT (MiT-{size.upper()})"
+    assert facts.fits == ((f"model=cmx_{size}",),)
+    assert plan.fits
+    assert set(plan.leftover) == {"head.weight", "head.bias"}
+    assert len(plan.values) == 2 * (len(tensors) - 2)
+    streams = [key for key in model.state_dict() if not key.startswith(("decode_head.",))]
+    assert {*plan.values} == {k for k in streams if not k.startswith(("backbone.F",))}
+    for entry, name in plan.values.items():
+        # The release's rule: the first of the three words that a name contains is preceded.
+        word = next(w for w in ("patch_embed", "block", "norm") if w in name)
+        both = (f"backbone.{name}", f"backbone.{name.replace(word, f'extra_{word}', 1)}")
+        assert entry in both
+
+
+def test_imagenet_mit_is_loaded_into_both_streams(tmp_path: Path) -> None:
+    tensors = mit_file((16, 32, 64, 96), (1, 1, 1, 1))
+    sizes = {"embed_dims": [16, 32, 64, 96], "depths": [1, 1, 1, 1], "num_heads": [1, 2, 4, 6]}
+    model = network("cmx_tiny", **sizes)
+    load_weights(model, saved(tmp_path, {"model": tensors}))
+    state = model.state_dict()
+    for name in ("patch_embed1.proj.weight", "block3.0.attn.sr.weight", "norm4.bias"):
+        assert holds(state[f"backbone.{name}"], name)
+        assert holds(state[f"backbone.extra_{name}"], name)
+
+
+@pytest.mark.parametrize("layers", slow_but(18, (18, 34, 50, 101, 152)))
+def test_resnets_fill_both_encoders_of_rtfnet(tmp_path: Path, layers: int) -> None:
+    tensors = resnet_file(layers)
+    model = on_paper(f"rtfnet_{layers}")
+    facts, plan = planned(model, saved(tmp_path, tensors))
+    assert facts.title == f"ImageNet ResNet (ResNet-{layers})"
+    assert facts.fits[0] == (f"model=rtfnet_{layers}",)
+    assert plan.fits
+    assert set(plan.leftover) == {"fc.weight", "fc.bias"}
+    assert len(plan.values) == 2 * (len(tensors) - 2)
+    assert all(key.startswith("deconv") for key in plan.fresh)
+    assert len(plan.fresh) + len(plan.values) == len(model.state_dict())
+
+
+def rtfnet(thermal_stem: str) -> nn.Module:
+    model = network("rtfnet_18", base_width=4, thermal_stem=thermal_stem)
+    model.thermal_stem = thermal_stem
+    return model
+
+
+def test_the_thermal_stem_of_rtfnet_is_the_mean_or_drawn_anew(tmp_path: Path) -> None:
+    tensors = resnet_file(18, counters=False, width=4)
+    stem = torch.arange(4 * 3 * 49.0).reshape(4, 3, 7, 7)
+    tensors["conv1.weight"] = stem
+    path = saved(tmp_path, tensors)
+    released_stem, drawn = rtfnet("rgb_mean"), rtfnet("xavier")
+    before = drawn.state_dict()["encoder_thermal_conv1.weight"].clone()
+    report = load_weights(released_stem, path)
+    load_weights(drawn, path)
+    assert torch.equal(
+        released_stem.state_dict()["encoder_thermal_conv1.weight"], stem.mean(1, keepdim=True)
+    )
+    assert torch.equal(released_stem.state_dict()["encoder_rgb_conv1.weight"], stem)
+    assert torch.equal(drawn.state_dict()["encoder_thermal_conv1.weight"], before)
+    assert torch.equal(drawn.state_dict()["encoder_rgb_conv1.weight"], stem)
+    counters = [key for key in released_stem.state_dict() if key.endswith("num_batches_tracked")]
+    assert report.num_zeros == sum(key.startswith("encoder_") for key in counters)
+
+
+@pytest.mark.parametrize("modalities", ["late_fusion", "early_fusion", "rgb", "thermal"])
+def test_a_resnet_fills_the_encoder_of_pspnet(tmp_path: Path, modalities: str) -> None:
+    tensors = resnet_file(50, width=8)
+    stem = torch.arange(8 * 3 * 49.0).reshape(8, 3, 7, 7)
+    tensors["conv1.weight"] = stem
+    model = network("heatnet", 13, modalities=modalities, base_width=8)
+    path = saved(tmp_path, tensors)
+    _, plan = planned(model, path)
+    assert plan.fits
+    load_weights(model, path)
+    state = model.state_dict()
+    mean = stem.mean(1, keepdim=True)
+    expected = {
+        "late_fusion": (stem, mean),
+        "early_fusion": (torch.cat([stem, mean], 1),),
+        "rgb": (stem,),
+        "thermal": (mean,),
+    }[modalities]
+    for end, value in zip(("", "_2"), expected, strict=False):
+        assert torch.equal(state[f"feats.conv1{end}.weight"], value)
+        name = "layer2.3.conv2.weight"
+        assert holds(state[f"feats.layer2{end}.3.conv2.weight"], name)
+    assert holds(state["feats.layer4.2.bn3.running_var"], "layer4.2.bn3.running_var")
+    two = modalities == "late_fusion"
+    projection = {name for name in plan.leftover if name.startswith("layer3.0.")}
+    assert len(projection) == (7 if two else 0)  # conv1, and 6 of the projection
+    assert ("feats.layer3.0.conv1.weight" in plan.fresh) == two
+
+
+def test_resnets_fill_the_backbone_of_deeplab(tmp_path: Path) -> None:
+    model = on_paper("deeplabv2", 14)
+    facts, plan = planned(model, saved(tmp_path, resnet_file(101)))
+    assert ("model=deeplabv2",) in facts.fits
+    assert plan.fits
+    assert len(plan.values) == len([k for k in model.state_dict() if k.startswith("backbone.")])
+
+    tensors = resnet_file(101, counters=False, prefix="Scale.")
+    classifier = {f"Scale.layer5.conv2d_list.{n}.weight": (21, 2048, 3, 3) for n in range(4)}
+    facts, plan = planned(model, saved(tmp_path, {**tensors, **named(classifier)}))
+    assert facts.title == "DeepLab v2 start of AdaptSegNet and ADVENT (ResNet-101)"
+    assert facts.fits == (("model=deeplabv2", "model/inputs=caffe"),)
+    assert plan.fits
+    assert set(plan.leftover) == set(classifier)
+    assert plan.values["backbone.layer3.22.conv3.weight"] == "Scale.layer3.22.conv3.weight"
+    assert all(key.startswith("heads.") for key in plan.fresh)
+
+
+WHOLE = [
+    ("mask2former_tiny", "network.", "checkpoint of CRM or SpatialSeg"),
+    ("cmx_tiny", "", "CMX checkpoint"),
+    ("rtfnet_tiny", "", "RTFNet checkpoint"),
+    ("mfnet_tiny", "", "MFNet checkpoint"),
+    ("heatnet_tiny", "module.trgb_segnet.", "HeatNet checkpoint"),
+]
+
+
+@pytest.mark.parametrize(("yaml", "prefix", "what"), WHOLE)
+def test_whole_networks_of_any_size_are_loaded_equal(
+    tmp_path: Path, yaml: str, prefix: str, what: str
+) -> None:
+    model = network(yaml)
+    path = saved(tmp_path, {"state_dict": like(model.state_dict(), prefix)})
+    report = load_weights(model, path)
+    assert report.facts.what == what
+    assert report.facts.classes == 9
+    assert report.num_set == report.num_entries
+    for key, value in model.state_dict().items():
+        assert holds(value, prefix + key), key
+
+
+def test_what_a_configuration_in_the_file_says_is_suggested(tmp_path: Path) -> None:
+    import argparse
+
+    shapes = {
+        f"network.backbone.{branch}_branch.{name}": shape
+        for branch in ("RGB", "THR")
+        for name, shape in swin_shapes().items()
+    }
+    tensors = {
+        **named(shapes),
+        "network.sem_seg_head.predictor.class_embed.weight": torch.ones(13, 2),
+    }
+    hyper = {"cfg": argparse.Namespace(MODEL={"FUSION": {"AGGREGATION": "ADD"}})}
+    path = saved(tmp_path, {"state_dict": tensors, "hyper_parameters": hyper})
+    facts = recognise(read(path))
+    assert facts.classes == 12
+    assert facts.fits == (("model=mask2former_swin_t", "model.fusion=add"),)
+
+
+def swin_shapes() -> dict[str, Any]:
+    tensors = swin_file(96, (2, 2, 6, 2), (3, 6, 12, 24), 7)
+    return {name: tuple(value.shape) for name, value in tensors.items()}
+
+
+def test_shared_stages_are_seen_in_the_file(tmp_path: Path) -> None:
+    model = network("mask2former_tiny", share_start=2)
+    path = saved(
+        tmp_path, {"state_dict": {f"network.{k}": v for k, v in model.state_dict().items()}}
+    )
+    assert mask2former.share_start(read(path)) == 2

@@ -1,0 +1,82 @@
+"""What a mistake on the command line is told as: what was meant, and what to type."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rgbt.checks import InputError, split_list
+from rgbt.config.command import composing
+from rgbt.config.compose import compose
+from rgbt.config.hydra_messages import check_words
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("experiment=grbm",), "'experiment=grbm' needs a plus: +experiment=grbm."),
+        (("debug=smoke",), "'debug=smoke' needs a plus: +debug=smoke."),
+        (("search=grbm",), "'search=grbm' needs a plus: +search=grbm."),
+        (("+dataset=mfnet",), "'+dataset=mfnet' is written without plus: dataset=mfnet."),
+        (
+            ("+experiment=grbm", "+experiment=crm"),
+            "+experiment= may be given once; leave one of them out.",
+        ),
+        (("experiment",), "'experiment' is no override; expected +experiment=NAME."),
+        (("crm_kp",), "'crm_kp' is no override; expected +experiment=crm_kp."),
+        (("nothing",), "'nothing' is no override; expected key=value"),
+        (("seed=0,1",), "'seed=0,1' names several values, which is a grid: add -m"),
+        (("lr=1",), "'lr' is not a key of the configuration; did you mean optimizer.lr?"),
+        (("dataset.root=/x",), "name the data set that lies there: dataset=mfnet (or"),
+        (("dataset.num_trian=1",), "did you mean 'num_train'?"),
+    ],
+)
+def test_what_hydra_refuses_says_what_to_type(words: tuple[str, ...], sentence: str) -> None:
+    with pytest.raises(InputError) as told, composing(words):
+        compose(words)
+    assert sentence in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("--experiment", "'--experiment' is no option; a setting is written as +experiment=..."),
+        ("--seed=1", "'--seed=1' is no option; a setting is written as seed=1."),
+        ("seed=[0, 1]", "'seed=[0, 1]': a run has one seed; several are a grid: -m seed=0,1."),
+        ("hydra.searchpath=[file:///no/where]", "there is no folder /no/where; name an existing"),
+        ("hydra.searchpath=[/no/where]", "there is no folder /no/where; name an existing"),
+    ],
+)
+def test_what_hydra_would_take_for_something_else_is_refused(word: str, sentence: str) -> None:
+    with pytest.raises(InputError) as told:
+        check_words([word])
+    assert sentence in str(told.value)
+
+
+def test_what_hydra_understands_passes(tmp_path: Path) -> None:
+    check_words(["-m", "--cfg", "job", "seed=0,1", "+experiment=grbm", "--multirun"])
+    check_words([f"hydra.searchpath=[file://{tmp_path},pkg://somewhere,{tmp_path}]"])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a", ["a"]),
+        ("a, b", ["a", "b"]),
+        ("[a,b]", ["a", "b"]),
+        ("[a]", ["a"]),
+        ("crm sizes=[240,480],grbm", ["crm sizes=[240,480]", "grbm"]),
+        ("[crm sizes=[240,480], grbm]", ["crm sizes=[240,480]", "grbm"]),
+        ("x=[1,2],y=[3,4]", ["x=[1,2]", "y=[3,4]"]),
+    ],
+)
+def test_lists_are_read_in_one_way(text: str, expected: list[str]) -> None:
+    assert split_list(text, "runs") == expected
+
+
+@pytest.mark.parametrize("text", ["", "a,", ",a", "a,,b", "[]", "[a,]"])
+def test_empty_entries_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="expected runs, with commas between them"):
+        split_list(text, "runs")

@@ -1,0 +1,221 @@
+"""What comes from a store or a folder is data: nothing of it is imported or called unasked."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from rgbt.checks import InputError
+from rgbt.config.command import plain_command
+from rgbt.config.compose import compose, conf_dir
+from rgbt.config.schema import NODES, build, check_node
+from rgbt.config.stored_config import (
+    check_targets,
+    load_config,
+    parse_trust,
+    read_settings,
+    settings_of,
+    shipped_targets,
+    targets,
+)
+from tests.commands import Call, assert_one_sentence
+
+LAB = "import os\nfrom pathlib import Path\nPath(__file__).with_suffix('.imported').touch()\n" + (
+    "from lab_base import Base\nclass Plain:\n    def __init__(self, *, width: int = 1) -> None:\n"
+    "        self.width = width\n"
+)
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Modules of a user's; `my_lab` leaves a file behind when it is imported."""
+    (tmp_path / "my_lab.py").write_text(LAB)
+    (tmp_path / "lab_base.py").write_text("class Base:\n    pass\n")
+    (tmp_path / "rgbt_evil.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("my_lab", "lab_base"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return tmp_path
+
+
+def node(target: Any) -> dict[str, Any]:
+    return {"_target_": target}
+
+
+OTHERS = [
+    *("os.system", "posix.system", "builtins.eval", "subprocess.Popen", "hydra.utils.get_object"),
+    *(
+        "rgbt.files.atomic.os.system",
+        "rgbt.config.schema.get_object",
+        "rgbt.config.schema.instantiate",
+    ),
+    *("rgbt.files.atomic.write_atomic", "rgbt.tracking.folder.RunFolder", "rgbt"),
+    *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
+    *("rgbt.maskers.masker.Masker.", "rgbt.maskers.masker.Masker.__init__", "Rgbt.maskers.masker"),
+    *("rgbt.maskers.masker.Masker ", "rgbt.maskers.masker.Maske\u0433", "rgbt.maskers.masker"),
+    *("hydra_plugins.rgbt_study.StudySweeper", "\x1b[2Jos.system", "x" * 5000),
+    *(3, None, True, 1.5, ["os.system"], {"a": "os.system"}, 10**30),
+]
+
+
+@pytest.mark.parametrize("target", OTHERS, ids=[str(each)[:40] for each in OTHERS])
+def test_others_targets_are_refused_before_they_are_imported(lab: Path, target: Any) -> None:
+    assert (lab / "rgbt_evil.py").is_file()
+    for settings in (
+        {"masker": node(target)},
+        {"a": [{"b": [node(target)]}]},
+        {"model": {**node("rgbt.models.mfnet.MFNet"), "inputs": node(target)}},
+        {"model": {"_args_": [node(target)], "_partial_": True}},
+    ):
+        with pytest.raises(InputError, match=r"^store: '.*_target_' names ") as refused:
+            check_targets(settings, (), "store")
+        assert_printable(str(refused.value))
+
+
+def assert_printable(text: str) -> None:
+    assert text.isprintable()
+    assert len(text) < 450
+
+
+def test_what_shipped_configurations_name_is_allowed() -> None:
+    config = OmegaConf.to_container(compose(["+experiment=grbm"]), resolve=True)
+    check_targets(config, (), "store")
+    assert len(list(targets(config))) > 15
+    assert "rgbt.data.synth.dataset.synth" in shipped_targets()
+    assert shipped_targets("masker") == {"rgbt.maskers.masker.Masker"}
+    with pytest.raises(InputError, match="which no file of conf/masker names"):
+        check_targets({"masker": node("rgbt.data.kp.KP")}, (), "store", "masker")
+    assert all(name.startswith("rgbt.") for name in shipped_targets())
+    assert shipped_targets() >= {
+        str(target) for path in conf_dir().rglob("l*/*.yaml") for _, target in found_in(path)
+    }
+
+
+def found_in(path: Path) -> Any:
+    plain = OmegaConf.to_container(OmegaConf.load(path))
+    return [pair for pair in targets(plain) if str(pair[1]).startswith("rgbt.")]
+
+
+def test_own_code_needs_trust_and_only_its_own_is_run(lab: Path) -> None:
+    marker = lab / "my_lab.imported"
+    with pytest.raises(InputError, match=r"add trust=my_lab\.$"):
+        check_targets({"model": node("my_lab.Plain")}, ("my_la", "other"), "store")
+    assert not marker.exists()
+    check_targets({"model": node("my_lab.Plain")}, ("other", "my_lab"), "store")
+    assert marker.exists()
+    check_targets({"model": node("my_lab.Plain")}, ("my_lab.Plain",), "store")
+    with pytest.raises(InputError, match=r"blocklisted"):
+        check_targets({"model": node("my_lab.os.system")}, ("my_lab",), "store")
+    with pytest.raises(InputError, match=r"defined in posix, a module that is not trusted"):
+        check_targets({"model": node("my_lab.os.getpid")}, ("my_lab",), "store")
+    with pytest.raises(InputError, match=r"defined in lab_base.* add lab_base to trust"):
+        check_targets({"model": node("my_lab.Base")}, ("my_lab",), "store")
+    check_targets({"model": node("my_lab.Base")}, ("my_lab", "lab_base"), "store")
+
+
+def test_trust_is_a_list_of_dotted_names() -> None:
+    assert parse_trust("") == ()
+    assert parse_trust("[my_lab, other.models]") == ("my_lab", "other.models")
+    for text in ("my lab", "a/b.py", "a..b", "a;b", "*"):
+        with pytest.raises(InputError, match="expected names of your own modules"):
+            parse_trust(text)
+
+
+@pytest.mark.parametrize(
+    ("plain", "reason"),
+    [
+        ([1], "expected a mapping"),
+        ("text", "expected a mapping"),
+        ({"a": "${oc.env:HOME}"}, r"'a' is \$\{oc.env:HOME\}; .* no interpolations"),
+        ({"a": [{"b": "x ${px:64}"}]}, "'a.0.b'"),
+        ({"a": {1: 2}}, "keys are text"),
+        ({"model": "os.system"}, "'model' must be a mapping"),
+        ({"data": None}, "'data' must be a mapping"),
+    ],
+)
+def test_a_stored_configuration_holds_resolved_values(plain: Any, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        settings_of(plain, "store")
+
+
+@pytest.mark.parametrize("experiment", ["grbm", "heatnet", "temporal_con", "cmx"])
+def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None:
+    config = compose([f"+experiment={experiment}", "scale=paper"])
+    (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True))
+    expected = OmegaConf.to_container(config, resolve=True)
+    assert read_settings(tmp_path / "config.yaml") == expected
+    assert load_config(tmp_path / "config.yaml") == expected
+
+
+@pytest.mark.parametrize("target", ["os.system", "posix.system", "builtins.eval", "yaml.load"])
+def test_composed_configurations_follow_hydras_policy(target: str, tmp_path: Path) -> None:
+    loud = OmegaConf.create({"x": {"_target_": target, "command": f"touch {tmp_path / 'marker'}"}})
+    for use in (build, lambda each: check_node(each, "x")):
+        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as said:
+            use(loud.x)
+        assert_printable(str(said.value))
+    hidden = {"_target_": "hydra.utils.get_object", "path": target}
+    with pytest.raises(InputError, match="is blocklisted"):
+        build(OmegaConf.create({"x": hidden}).x)
+    assert not (tmp_path / "marker").exists()
+
+
+def test_a_module_that_is_imported_anew_is_built_anew(lab: Path) -> None:
+    own = OmegaConf.create({"x": node("my_lab.Plain")}).x
+    first = type(build(own))
+    del sys.modules["my_lab"]
+    second = build(own)
+    assert type(second) is sys.modules["my_lab"].Plain is not first
+
+
+def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path) -> None:
+    from rgbt import consistency, evaluate, predict, robustness
+
+    marker, run = tmp_path / "marker", tmp_path / "run"
+    run.mkdir()
+    settings: Any = OmegaConf.to_container(compose(["+experiment=crm"]), resolve=True)
+    evil = {"_target_": "os.system", "command": f"touch {marker}"}
+    commands: list[tuple[Any, tuple[str, ...]]] = [
+        (plain_command(evaluate.OWN, evaluate.main), (f"run={run}",)),
+        (
+            plain_command(predict.OWN, predict.main),
+            (f"run={run}", "input=test", f"out={tmp_path / 'out'}"),
+        ),
+        (plain_command(robustness.OWN, robustness.main), (f"run={run}", "degradations=noise")),
+        (plain_command(consistency.OWN, consistency.main), (f"run={run}",)),
+    ]
+    for name in ("transform", "model", "scheme"):
+        assert name in NODES
+        (run / "config.yaml").write_text(json.dumps({**settings, name: evil}))
+        for entry, words in commands:
+            code, _, err = call(entry, *words)
+            assert code == 2
+            assert_one_sentence(err, f"'{name}._target_' names os.system")
+    (run / "config.yaml").write_text(json.dumps({**settings, "loss": node("my_lab.Plain")}))
+    code, _, err = call(commands[0][0], f"run={run}")
+    assert_one_sentence(err, "add trust=my_lab.")
+    assert not (lab / "my_lab.imported").exists()
+    code, _, err = call(commands[0][0], f"run={run}", "trust=my_lab")
+    assert_one_sentence(err, "best.pt")  # the next thing that this folder lacks
+    assert (lab / "my_lab.imported").exists()
+    assert not marker.exists()
+
+
+def test_a_degradation_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> None:
+    from rgbt.evaluation.corrupted import choose
+
+    path = tmp_path / "fog.yaml"
+    path.write_text(f"_target_: os.system\ncommand: touch {tmp_path / 'marker'}\n")
+    with pytest.raises(InputError, match=r"fog.yaml: '_target_' names os.system"):
+        choose(str(path))
+    path.write_text("_target_: my_lab.Plain\nwidth: 2\n")
+    with pytest.raises(InputError, match="add trust=my_lab"):
+        choose(str(path))
+    with pytest.raises(InputError, match="Plain has no attribute"):  # it was built
+        choose(str(path), trust=("my_lab",))
+    assert not (tmp_path / "marker").exists()

@@ -1,0 +1,253 @@
+"""Failures of pixels, each by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.corruptions.blur import Blur
+from rgbt.corruptions.corruption import OfPixels, OfTime
+from rgbt.corruptions.misregistered import DIRECTIONS, Misregistered, moved
+from rgbt.corruptions.noise import Noise
+from rgbt.corruptions.occluded import Occluded
+from rgbt.corruptions.removed import Removed
+from rgbt.randomness import numpy_generator
+from rgbt.types import Sample
+from tests.corruptions.recorded import sample
+
+
+def rng_of(seed: int = 0, name: str = "00001D") -> Callable[[str], np.random.Generator]:
+    return lambda purpose: numpy_generator(seed, f"{purpose} {name}")
+
+
+def occluded(image: Any = "thermal", block: int = 32) -> Occluded:
+    return Occluded(image=image, block=block, severities=(0.5,))
+
+
+def flat(hw: tuple[int, int], rgb: int, thermal: int) -> Sample:
+    return Sample(np.full((*hw, 3), rgb, np.uint8), np.full(hw, thermal, np.uint8), None, "flat")
+
+
+EVERY: dict[str, OfPixels] = {
+    "removed": Removed(image="rgb"),
+    "occluded": occluded("both"),
+    "noise": Noise(image="both", severities=(8.0,)),
+    "blur": Blur(image="both", severities=(8.0,)),
+    "misregistered": Misregistered(severities=(8.0,)),
+}
+
+
+@pytest.mark.parametrize("kind", EVERY.values(), ids=EVERY)
+def test_sizes_types_label_and_the_source_stay(kind: OfPixels) -> None:
+    source = sample()
+    before = (source.rgb.copy(), source.thermal.copy())
+    for image in (source.rgb, source.thermal):  # as of a map of decoded frames
+        image.setflags(write=False)
+    found = kind(source, 1.0 if isinstance(kind, Removed | Occluded) else 8.0, rng_of())
+    assert isinstance(kind, OfPixels)
+    assert not isinstance(kind, OfTime)
+    for old, new in zip(before, (found.rgb, found.thermal), strict=True):
+        assert (new.shape, new.dtype) == (old.shape, np.uint8)
+    assert found.label is source.label
+    assert found.name == source.name
+    np.testing.assert_array_equal(source.rgb, before[0])
+    np.testing.assert_array_equal(source.thermal, before[1])
+
+
+def changed(found: Sample, source: Sample) -> tuple[bool, bool]:
+    return (
+        not np.array_equal(found.rgb, source.rgb),
+        not np.array_equal(found.thermal, source.thermal),
+    )
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda image: occluded(image),
+        lambda image: Noise(image=image, severities=(8.0,)),
+        lambda image: Blur(image=image, severities=(8.0,)),
+    ],
+    ids=["occluded", "noise", "blur"],
+)
+def test_the_image_that_is_named_fails_alone(make: Callable[[str], OfPixels]) -> None:
+    source = sample()
+    found = {}
+    for image, expected in {
+        "rgb": (True, False),
+        "thermal": (False, True),
+        "both": (True, True),
+    }.items():
+        kind = make(image)
+        found[image] = kind(source, kind.severities[0], rng_of())
+        assert changed(found[image], source) == expected
+    # Of both at once each fails as it does alone.
+    np.testing.assert_array_equal(found["both"].rgb, found["rgb"].rgb)
+    np.testing.assert_array_equal(found["both"].thermal, found["thermal"].thermal)
+
+
+def test_removed_is_black() -> None:
+    source = sample()
+    no_rgb, no_thermal = (
+        Removed(image=image)(source, 1.0, rng_of()) for image in ("rgb", "thermal")
+    )
+    assert (no_rgb.rgb.max(), no_thermal.thermal.max()) == (0, 0)
+    np.testing.assert_array_equal(no_rgb.thermal, source.thermal)
+    np.testing.assert_array_equal(no_thermal.rgb, source.rgb)
+
+
+@pytest.mark.parametrize(
+    ("share", "blocks"), [(0.1, 30), (0.25, 75), (0.75, 225), (0.0984, 30), (0.098, 29), (1, 300)]
+)
+def test_occluded_hides_exactly_that_share_of_whole_blocks(share: float, blocks: int) -> None:
+    # 32 pixels of 480 rows are 8 of 120: a grid of 15 x 20 = 300 blocks of 8 x 8 pixels.
+    found = occluded("both")(sample(), share, rng_of())
+    by_block = (found.thermal == 0).reshape(15, 8, 20, 8).transpose(0, 2, 1, 3).reshape(300, 64)
+    assert (by_block.all(1) == by_block.any(1)).all()
+    assert by_block.all(1).sum() == blocks
+    np.testing.assert_array_equal(found.thermal == 0, (found.rgb == 0).all(2))
+    np.testing.assert_array_equal((found.rgb == 0).any(2), (found.rgb == 0).all(2))
+
+
+def test_occluded_counts_blocks_that_are_cut_at_the_edge() -> None:
+    # 10 x 12 pixels at block 4: 3 x 3 blocks, of which those below are 2 rows high.
+    hidden = occluded(block=192).hidden((10, 12), 1.0, np.random.default_rng(0))
+    assert hidden.shape == (10, 12)
+    assert hidden.all()
+    one = occluded(block=192).hidden((10, 12), 1 / 9, np.random.default_rng(0))
+    assert one.sum() in (16, 8)
+
+
+def test_a_larger_share_hides_the_same_blocks_and_more() -> None:
+    few, many = (
+        occluded().hidden((120, 160), share, np.random.default_rng(3)) for share in (0.1, 0.5)
+    )
+    assert (many | few).sum() == many.sum()
+    assert few.sum() == 30 * 64
+
+
+def test_noise_has_its_deviation_and_no_bias() -> None:
+    grey = Sample(
+        np.full((120, 160, 3), 128, np.uint8), np.full((120, 160), 128, np.uint8), None, "a"
+    )
+    found = Noise(image="both", severities=(16.0,))(grey, 16.0, rng_of())
+    for image in (found.rgb, found.thermal):
+        differences = image.astype(float) - 128
+        # 19,200 pixels: the standard error of the deviation is 16 / sqrt(38,400) = 0.08.
+        assert differences.std() == pytest.approx(16, abs=0.4)
+        assert abs(differences.mean()) < 0.5
+    channels = found.rgb.reshape(-1, 3).astype(float).T
+    assert abs(np.corrcoef([*channels, found.thermal.ravel()]) - np.eye(4)).max() < 0.03
+
+
+def test_noise_is_cut_at_black_and_white_and_not_wrapped() -> None:
+    ends = flat((40, 40), 0, 255)
+    found = Noise(image="both", severities=(20.0,))(ends, 20.0, rng_of())
+    assert found.rgb.max() < 128 < found.thermal.min()
+    assert 0.4 < (found.rgb == 0).mean() < 0.6
+
+
+def test_noise_of_a_higher_severity_is_the_same_noise_stronger() -> None:
+    grey = flat((60, 60), 128, 128)
+    kind = Noise(image="thermal", severities=(8.0, 16.0))
+    low, high = (kind(grey, each, rng_of()).thermal.astype(float) - 128 for each in (8.0, 16.0))
+    assert np.abs(high - 2 * low).max() <= 1.5
+
+
+def test_blur_of_a_step_is_the_normal_distribution_of_that_width() -> None:
+    step = np.zeros((120, 160), np.uint8)
+    step[:, 80:] = 255
+    source = Sample(np.repeat(step[..., None], 3, 2), step, None, "a")
+    # 8 pixels of 480 rows are 2 of 120.
+    found = Blur(image="thermal", severities=(8.0,))(source, 8.0, rng_of()).thermal
+    for column in range(74, 86):
+        expected = 255 * 0.5 * (1 + math.erf((column + 0.5 - 80) / 2 / math.sqrt(2)))
+        assert found[60, column] == pytest.approx(expected, abs=2)
+
+
+def test_blur_leaves_a_flat_image_as_it_is_up_to_its_edges() -> None:
+    found = Blur(image="both", severities=(16.0,))(flat((30, 40), 77, 33), 16.0, rng_of())
+    assert (np.unique(found.rgb).tolist(), np.unique(found.thermal).tolist()) == ([77], [33])
+
+
+def test_moved_by_hand() -> None:
+    image = np.arange(1, 13, dtype=np.uint8).reshape(3, 4)
+    right_and_down = [[1, 1, 2, 3], [1, 1, 2, 3], [5, 5, 6, 7]]
+    np.testing.assert_array_equal(moved(image, 1, 1), right_and_down)
+    np.testing.assert_array_equal(
+        moved(image, -1, 0), [[5, 6, 7, 8], [9, 10, 11, 12], [9, 10, 11, 12]]
+    )
+    np.testing.assert_array_equal(
+        moved(image, 0, -2), [[3, 4, 4, 4], [7, 8, 8, 8], [11, 12, 12, 12]]
+    )
+
+
+@pytest.mark.parametrize(("severity", "pixels"), [(4, 1), (8, 2), (32, 8), (6, 2), (5, 1)])
+def test_misregistered_by_exactly_so_many_pixels_in_one_direction(
+    severity: int, pixels: int
+) -> None:
+    source, drawn = sample(), set()
+    for number in range(24):
+        found = Misregistered(severities=(4.0,))(source, severity, rng_of(name=str(number)))
+        np.testing.assert_array_equal(found.rgb, source.rgb)
+        fitting = [
+            (down, right)
+            for down, right in DIRECTIONS
+            if np.array_equal(found.thermal, moved(source.thermal, down * pixels, right * pixels))
+        ]
+        assert len(fitting) == 1
+        drawn.add(fitting[0])
+    assert drawn == set(DIRECTIONS)
+
+
+def test_the_direction_is_the_same_at_every_severity() -> None:
+    kind, source = Misregistered(severities=(4.0,)), sample()
+    near, far = (kind(source, severity, rng_of()).thermal for severity in (4, 8))
+    (direction,) = [d for d in DIRECTIONS if np.array_equal(near, moved(source.thermal, *d))]
+    np.testing.assert_array_equal(far, moved(source.thermal, 2 * direction[0], 2 * direction[1]))
+
+
+@pytest.mark.parametrize("kind", [occluded("both"), EVERY["noise"], EVERY["misregistered"]])
+def test_what_is_drawn_follows_from_seed_and_name(kind: OfPixels) -> None:
+    images = [
+        kind(sample(), kind.severities[0], rng_of(seed, name)).thermal
+        for seed, name in ((0, "a"), (0, "a"), (1, "a"), (0, "b"), (0, "c"), (0, "d"))
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert any(not np.array_equal(images[0], each) for each in images[2:])
+
+
+def noise(*severities: float) -> Noise:
+    return Noise(image="rgb", severities=severities)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Occluded(image="rgb", block=8, severities=(0.5, 2.0)), r"in \[0, 1\], got 2"),
+        (lambda: Occluded(image="rgb", block=8, severities=()), r"rise from above 0 .*got \[\]"),
+        (lambda: noise(8.0, 8.0), r"must rise from above 0"),
+        (lambda: noise(0.0, 8.0), r"0 is the clean image"),
+        (lambda: noise(-8.0, 8.0), r"must rise from above 0"),
+        (lambda: noise(300.0), r"grey levels\) must lie in \[0, 255\]"),
+        (lambda: Blur(image="rgb", severities=(121.0,)), r"sigma .* lie in \[0, 120\]"),
+        (lambda: Misregistered(severities=(241.0,)), r"pixels\) must lie in \[0, 240\]"),
+        (lambda: Removed(image="rgb").check(0.5), r"can only be 1, got 0.5"),
+        (lambda: noise(8.0).check(float("nan")), r"got nan"),
+    ],
+)
+def test_bad_settings_are_told(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        make()
+
+
+def test_a_severity_that_changes_nothing_of_a_small_image_is_refused() -> None:
+    with pytest.raises(InputError, match=r"half a pixel of an image of 24 rows; .* at least 10"):
+        Misregistered(severities=(4.0,))(sample(hw=(24, 32)), 4.0, rng_of())
+    with pytest.raises(InputError, match=r"share of 0.1 of 1 x 2 blocks is none; .* least 0.25"):
+        occluded(block=480)(sample(), 0.1, rng_of())

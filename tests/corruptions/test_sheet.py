@@ -1,0 +1,74 @@
+"""The picture of degradations: its data, that it is drawn, and the command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbt.config.command import plain_command
+from rgbt.corruptions.__main__ import OWN, main
+from rgbt.corruptions.late import Delayed
+from rgbt.corruptions.noise import Noise
+from rgbt.corruptions.removed import Removed
+from rgbt.corruptions.sheet import draw, sheet, side_by_side
+from tests.commands import Call
+from tests.conftest import WriteMFNet
+from tests.corruptions.recorded import Recorded, sample
+
+ENTRY = plain_command(OWN, main)
+KINDS = (
+    Noise(image="rgb", severities=(8.0, 16.0)),
+    Delayed(severities=(1.0,)),
+    Removed(image="thermal"),
+)
+
+
+def test_a_line_per_degradation_with_the_clean_pair_first() -> None:
+    lines = sheet(Recorded(), KINDS, "00004D", "test")
+    assert [[severity for severity, _ in line.pairs] for line in lines] == [
+        *([0.0, 8.0, 16.0], [0.0, 1.0], [0.0, 1.0])
+    ]
+    for line in lines:
+        np.testing.assert_array_equal(line.pairs[0][1].rgb, sample("00004D").rgb)
+    np.testing.assert_array_equal(lines[1].pairs[1][1].thermal, sample("00003D").thermal)
+    assert lines[2].pairs[1][1].thermal.max() == 0
+
+
+def test_pairs_are_drawn_side_by_side_with_titles() -> None:
+    pair = side_by_side(sample())
+    assert pair.shape == (120, 320, 3)
+    np.testing.assert_array_equal(pair[:, 160:, 1], sample().thermal)
+    figure = draw(sheet(Recorded(), KINDS, "00004D", "test"))
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == [
+        *("noise, RGB", "8 grey levels (std)", "16 grey levels (std)"),
+        *("delayed thermal", "1 frames", "", "thermal removed (zeroed)", "", ""),
+    ]
+
+
+def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_path: Path) -> None:
+    root = write_mfnet({"test": ["00001D", "00002D"]})
+    out = tmp_path / "a" / "sheet.png"
+    where = (f"dataset.root={root}", "dataset=mfnet", f"out={out}")
+    code, said, err = call(ENTRY, "degradations=noise,rgb_removed", *where)
+    assert (code, said.strip()) == (0, str(out)), err
+    assert cv2.imread(str(out)).shape[1] > 500
+    code, _, err = call(ENTRY, "name=00003D", *where)
+    assert code == 2
+    assert "split 'test' has no such sample; did you mean" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["out=x.pdf"], "out must name the picture to write, .png or .jpg, got 'x.pdf'"),
+        (["out=x.png", "degradations=nois"], "did you mean 'noise"),
+    ],
+)
+def test_bad_input(call: Call, words: list[str], sentence: str) -> None:
+    code, out, err = call(ENTRY, *words)
+    assert (code, out) == (2, "")
+    assert sentence in err

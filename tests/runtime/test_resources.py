@@ -1,0 +1,203 @@
+"""A full disk and exhausted memory: one sentence, exit code 1, nothing that was saved is lost."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.config.command import plain_command
+from rgbt.data.files import decode
+from rgbt.files.atomic import write_atomic
+from rgbt.metrics.archive import Archive
+from tests.commands import Call, assert_one_sentence, only_run, short, train
+
+SMALL_MB = 2
+RESUME = "rerun the command to resume from the last checkpoint."
+
+
+def full() -> OSError:
+    return OSError(errno.ENOSPC, "No space left on device")
+
+
+def raising(error: Callable[[], BaseException]) -> Callable[[], None]:
+    def main(arguments: dict[str, str], overrides: list[str]) -> None:
+        raise error()
+
+    return plain_command({"out": ""}, main)
+
+
+def hidden() -> BaseException:
+    """As PyTorch's writer has it: an error of its own, raised while the disk's was handled."""
+    try:
+        try:
+            raise full()
+        except OSError:
+            raise RuntimeError("unexpected pos 2680384 vs 2680304")  # noqa: B904 - as there
+    except RuntimeError as error:
+        return error
+
+
+def of_a_named_file() -> BaseException:
+    return OSError(errno.EDQUOT, "Disk quota exceeded", str(Path.cwd() / "none" / "a.png"))
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (full, "is full ("),
+        (hidden, "is full ("),
+        (of_a_named_file, f"the disk of {Path.cwd()} has no space left for this user (quota) ("),
+        (lambda: OSError(errno.EROFS, "Read-only file system"), "it is mounted read-only ("),
+    ],
+)
+def test_a_full_disk_is_one_sentence(call: Call, tmp_path: Path, error, words: str) -> None:
+    code, _, err = call(raising(error), f"out={tmp_path / 'none'}")
+    assert code == 1
+    assert_one_sentence(err, words)
+    assert " MB free, after the unfinished file was removed); free some space, or name a" in err
+    assert err.endswith(f"{RESUME}\n")
+
+
+def test_a_reader_that_names_the_setting_keeps_its_sentence(call: Call) -> None:
+    def refused() -> BaseException:
+        error = InputError("data.cache: the disk of /a filled up.")
+        error.__cause__ = full()
+        return error
+
+    code, _, err = call(raising(refused))
+    assert code == 1
+    assert_one_sentence(err, "data.cache: the disk of /a filled up; the disk of ")
+
+
+def test_a_sentence_that_hides_its_cause_stays_as_it_is(call: Call) -> None:
+    def refused() -> None:
+        try:
+            raise full()
+        except OSError:
+            raise InputError("no shared memory in /dev/shm.") from None
+
+    code, _, err = call(plain_command({}, lambda _, __: refused()))
+    assert (code, err) == (2, "rgbt: no shared memory in /dev/shm.\n")
+
+
+def of_torch() -> BaseException:
+    with pytest.raises(RuntimeError) as told:
+        torch.empty(2**52, dtype=torch.uint8)
+    return told.value
+
+
+def of_numpy() -> BaseException:
+    with pytest.raises(MemoryError) as told:
+        np.empty(2**52, np.uint8)
+    return told.value
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError, "the memory of this machine is exhausted (MemoryError); lower scale.batch"),
+        (of_numpy, "exhausted (Unable to allocate 4.00 PiB"),
+        (of_torch, "exhausted ("),
+        (
+            lambda: torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nSee"),
+            "the memory of the GPU is exhausted (CUDA out of memory. Tried to allocate 2 GiB);",
+        ),
+        (lambda: OSError(errno.ENOMEM, "Cannot allocate memory"), "exhausted ([Errno 12] Cannot"),
+    ],
+)
+def test_exhausted_memory_is_one_sentence(call: Call, error, words: str) -> None:
+    code, _, err = call(raising(error))
+    assert code == 1
+    assert_one_sentence(err, words)
+    assert "scale.crop_hw or data.num_workers; " in err
+    assert err.endswith(f"{RESUME}\n")
+
+
+def test_other_errors_stay_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["rgbt"])
+    with pytest.raises(RuntimeError, match="mat1 and mat2"):
+        raising(lambda: RuntimeError("mat1 and mat2 shapes cannot be multiplied"))()
+
+
+def test_sentences_hold_no_codes_of_the_terminal(call: Call) -> None:
+    code, _, err = call(raising(lambda: InputError("\x1b[31mfolder\x07/a: is missing.")))
+    assert (code, err) == (2, "rgbt: ?[31mfolder?/a: is missing.\n")
+
+
+def test_an_image_that_does_not_fit_into_memory_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((8000, 8000, 3), np.uint8))
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = pages * resource.getpagesize() + 50 * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        with pytest.raises(MemoryError, match=r"a.png cannot be decoded, its pixels do not fit"):
+            decode(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of a few megabytes."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount a file system")
+    place = tmp_path / "small"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={SMALL_MB}m", "tmpfs", str(place)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("this container may not mount a file system")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def test_what_was_whole_before_the_disk_was_full_stays_whole(small_disk: Path) -> None:
+    kind = Archive("things 1", "things", "make it", {"numbers": "u N"})
+    noise = np.random.default_rng(0).integers(0, 256, SMALL_MB * 2**20, np.uint8)
+    kind.save(small_disk / "a.npz", {"numbers": noise[:1000]})
+    write_atomic(small_disk / "a.json", b"old")
+    with pytest.raises(OSError, match="No space left"):
+        kind.save(small_disk / "a.npz", {"numbers": noise})
+    with pytest.raises(OSError, match="No space left"):
+        write_atomic(small_disk / "a.json", noise.tobytes() * 2)
+    np.testing.assert_array_equal(kind.load(small_disk / "a.npz")["numbers"], noise[:1000])
+    assert (small_disk / "a.json").read_bytes() == b"old"
+
+
+@pytest.mark.slow
+def test_a_training_whose_disk_fills_up_resumes_when_there_is_space(
+    call: Call, data: Path, small_disk: Path, tmp_path: Path
+) -> None:
+    runs = small_disk / "runs"
+    words = ("+experiment=grbm", "scale.max_steps=4", *short(4))
+    # Room for the first checkpoint, and not for the next one beside it.
+    subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
+    code, _, err = train(call, data, runs, *words)
+    assert code == 1
+    assert_one_sentence(err, f"the disk of {runs} is full (")
+    (folder,) = runs.iterdir()
+    assert (folder / "last.pt").is_file()
+    assert not (folder / "result.json").exists()
+    subprocess.run(["mount", "-o", "remount,size=300m", str(small_disk)], check=True)
+    code, _, err = train(call, data, runs, *words)
+    assert (code, "continues at step 2" in err) == (0, True), err
+    straight = tmp_path / "straight"
+    assert train(call, data, straight, *words)[0] == 0
+    first, second = (only_run(each) / "counts_test.npz" for each in (runs, straight))
+    np.testing.assert_array_equal(np.load(first)["counts"], np.load(second)["counts"])

@@ -1,0 +1,304 @@
+"""Signals: between two steps of a training, at once elsewhere, and what is left afterwards."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from torch.utils.data import DataLoader
+
+from rgbt.config.command import plain_command
+from rgbt.data.reader import start_worker
+from rgbt.engine.checkpoint import State
+from rgbt.engine.trainer import Trainer
+from rgbt.runtime.signals import Stopped, answered, at_once, deferred
+from rgbt.types import Batch
+from tests.commands import Call, assert_one_sentence
+from tests.engine.test_trainer import batches, make
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def send(number: signal.Signals) -> None:
+    os.kill(os.getpid(), number)
+
+
+@pytest.fixture(autouse=True)
+def answering() -> Iterator[None]:
+    with answered():
+        yield
+
+
+def sending(number: signal.Signals, step: int, times: int = 1) -> Iterator[Batch]:
+    """Batches; the signal comes while one is made."""
+    for done, batch in enumerate(batches(0)):
+        for _ in range(times if done == step else 0):
+            send(number)
+        yield batch
+
+
+def train(folder: Path, **changes: object) -> tuple[Trainer, list]:
+    return make(folder, max_steps=6, checkpoint_every=100, eval_every=3, log_every=4, **changes)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_the_step_in_progress_is_finished_and_saved(
+    tmp_path: Path, number: signal.Signals, step: int
+) -> None:
+    """In the steps 2, 3 (an evaluation is due after it) and 5; the rest equals a whole run."""
+    whole, log = train(tmp_path / "whole")
+    whole.fit(batches(0), State(seed=7))
+    first, first_log = train(tmp_path / "run")
+    with pytest.raises(Stopped, match=f"at step {step + 1}, which is saved; rerun") as stop:
+        first.fit(sending(number, step), State(seed=7))
+    assert (stop.value.step, stop.value.code) == (step + 1, 128 + number)
+    second, second_log = train(tmp_path / "run")
+    state = State(seed=7)
+    assert second.resume(state)
+    assert state.step == step + 1
+    second.fit(batches(state.step), state)
+    ends = [tmp_path / where / "last.pt" for where in ("whole", "run")]
+    assert ends[0].read_bytes() == ends[1].read_bytes()
+    names = [[sorted(values) for _, values in each] for each in (log, first_log + second_log)]
+    losses = [[(n, v["loss"]) for n, v in each] for each in (log, first_log + second_log)]
+    assert names[0] == names[1]
+    assert losses[0] == losses[1]
+
+
+class Freed:
+    """Gets a signal while it is freed, where Python drops exceptions."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        send(self.number)
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_that_comes_while_an_object_is_freed_is_not_lost(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def work() -> None:
+        freed = Freed(number)
+        del freed
+        time.sleep(5)
+        raise AssertionError("the signal was lost")
+
+    with pytest.raises(Stopped) as stop:
+        work()
+    assert stop.value.number == number
+    assert capfd.readouterr().err == ""
+
+
+def test_one_that_was_dropped_waits_where_signals_wait() -> None:
+    reached = []
+
+    def work() -> None:
+        with deferred():
+            with at_once():
+                Freed(signal.SIGTERM)
+            time.sleep(0.1)
+            reached.append(True)
+
+    with pytest.raises(Stopped):
+        work()
+    assert reached
+
+
+def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> None:
+    def stopped(step: int) -> float:
+        (trainer.checkpoints.begin_evaluation(step) / "counts_val.npz").touch()
+        send(signal.SIGTERM)
+        raise AssertionError("the signal waits")
+
+    trainer, _ = train(tmp_path)
+    trainer.validate = stopped
+    with pytest.raises(Stopped) as stop:
+        trainer.fit(batches(0), State(seed=7))
+    assert stop.value.step == 3
+    again, _ = train(tmp_path)
+    evaluated: list[int] = []
+    again.validate = lambda step: evaluated.append(step) or float(step)  # type: ignore[func-returns-value]
+    state = State(seed=7)
+    assert again.resume(state)
+    assert (state.step, state.evaluated_step) == (3, 0)
+    again.fit(batches(3), state)
+    assert evaluated == [3, 6]
+
+
+def test_a_second_ctrl_c_stops_in_the_middle_of_a_step(tmp_path: Path) -> None:
+    trainer, _ = train(tmp_path)
+    with pytest.raises(KeyboardInterrupt) as interrupt:
+        trainer.fit(sending(signal.SIGINT, 1, times=2), State(seed=7))
+    assert not isinstance(interrupt.value, Stopped)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_clusters_signal_more_than_once(tmp_path: Path, number: signal.Signals) -> None:
+    trainer, _ = train(tmp_path)
+    with pytest.raises(Stopped, match="at step 2"):
+        trainer.fit(sending(number, 1, times=3), State(seed=7))
+
+
+def test_an_error_after_a_signal_is_its_consequence() -> None:
+    def failing() -> None:
+        with deferred():
+            send(signal.SIGTERM)
+            raise RuntimeError("DataLoader worker exited unexpectedly")
+
+    with pytest.raises(Stopped):
+        failing()
+
+
+def test_a_signal_between_two_evaluations_is_raised_at_the_next() -> None:
+    reached = []
+
+    def signalled() -> None:
+        with deferred():
+            with at_once():
+                reached.append(1)
+            send(signal.SIGHUP)
+            reached.append(2)
+            with at_once():
+                reached.append(3)
+
+    with pytest.raises(Stopped):
+        signalled()
+    assert reached == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGHUP, 129, "stopped by SIGHUP; rerun the command to resume."),
+        (signal.SIGINT, 130, "interrupted; rerun the command to resume."),
+        (signal.SIGTERM, 143, "stopped by SIGTERM; rerun the command to resume."),
+    ],
+)
+def test_commands_end_with_the_code_of_the_signal(
+    call: Call, number: signal.Signals, code: int, said: str
+) -> None:
+    def main(arguments: dict[str, str], overrides: list[str]) -> int:
+        del arguments, overrides
+        send(number)
+        raise AssertionError("the signal waits")
+
+    before = signal.getsignal(number)
+    found, _, err = call(plain_command({}, main))
+    assert found == code
+    assert_one_sentence(err, said)
+    assert signal.getsignal(number) is before
+
+
+def test_what_the_process_ignores_stays_ignored() -> None:
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with answered():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            send(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_closed_terminal_is_no_error(tmp_path: Path) -> None:
+    """The other end of a pseudo-terminal closes: SIGHUP, and every write fails from then on."""
+    import pty
+
+    script = (
+        "import sys, time\n"
+        "from rgbt.runtime.signals import Stopped, answered, at_once, deferred\n"
+        "with answered():\n"
+        "    try:\n"
+        "        with deferred():\n"
+        "            print('ready', flush=True)\n"
+        "            while True:\n"
+        "                time.sleep(0.02)\n"
+        "                with at_once():\n"
+        "                    pass\n"
+        "    except Stopped as stop:\n"
+        "        print(stop, flush=True)\n"
+        f"        open({str(tmp_path / 'code')!r}, 'w').write(str(stop.code))\n"
+    )
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", script])
+    assert b"ready" in os.read(terminal, 100)
+    os.close(terminal)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
+    assert (tmp_path / "code").read_text() == "129"
+
+
+def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
+    """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
+    loader = DataLoader(
+        range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
+    )
+    found = iter(loader)
+    assert next(found) == 0
+    (worker,) = found._workers  # type: ignore[attr-defined]
+    for number in SIGNALS:
+        subprocess.run(["kill", f"-{int(number)}", str(worker.pid)], check=True)
+    assert list(found) == list(range(1, 40))
+    fresh = iter(loader)
+    assert next(fresh) == 0
+    (worker,) = fresh._workers  # type: ignore[attr-defined]
+    worker.terminate()
+    worker.join(5)
+    assert worker.exitcode == 0, "the main process ends them"
+
+
+SERVED = """
+import multiprocessing, os, sys
+from torch.utils.data import DataLoader
+from rgbt.data.reader import start_worker
+
+if __name__ == "__main__":
+    loader = DataLoader(
+        range(9),
+        batch_size=None,
+        num_workers=1,
+        worker_init_fn=start_worker,
+        multiprocessing_context="forkserver",
+    )
+    found = iter(loader)
+    next(found)
+    (worker,) = found._workers
+    print(worker.pid, flush=True)
+    if sys.argv[1] == "die":
+        os.kill(os.getpid(), 9)
+    worker.terminate()
+    worker.join(10)
+    print(worker.exitcode, flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["die", "terminate"])
+def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end: str) -> None:
+    """As inside a sweep: the parent of such a worker is the server, which lives on."""
+    script = tmp_path / "served.py"
+    script.write_text(SERVED)
+    process = subprocess.Popen(
+        [sys.executable, str(script), end], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
+    )
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    if end == "terminate":
+        assert process.stdout.readline() == "0\n"
+    process.wait(60)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{worker}").exists()

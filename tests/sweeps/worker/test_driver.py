@@ -1,0 +1,604 @@
+"""Drivers: one, several at once, killed ones; nothing lost, nothing run twice."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import optuna
+import pytest
+
+from rgbt.spec.naming import TAGS
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import attributes as names
+from sweeps.settings import Objective
+from sweeps.worker import driver as drivers
+from sweeps.worker.owner import Owner
+from sweeps.worker.storage import open_storage
+from tests.sweeps.fakes import (
+    DEAD,
+    GONE,
+    Behaviour,
+    Call,
+    Desk,
+    FakeView,
+    PickyPlanner,
+    Process,
+    fail,
+    finish,
+    first,
+    hang,
+    held_by_another,
+    interrupt_when,
+    leave,
+    let_go,
+    list_desk,
+    memory,
+    only,
+    plans,
+    quick,
+    search_desk,
+    silent,
+    succeed,
+)
+
+__all__ = ["quick"]
+pytestmark = pytest.mark.usefixtures("quick")
+
+UP = (Objective("val/mIoU", "maximize"),)
+ALIVE = Owner("another-host", 7, "7")
+"""A driver on another machine that was heard of a moment ago."""
+
+
+def trial(desk: Desk, number: int) -> Any:
+    return desk.ledger.study.get_trials(deepcopy=False)[number]
+
+
+def test_a_list_is_run_once_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
+    storage = memory()
+    desk = list_desk(tmp_path, plans(4), storage=storage, workers=2).run()
+    assert sorted(desk.executor.started()) == [(f"x={x}",) for x in range(4)]
+    assert desk.states() == {f"x={x}": ["COMPLETE"] for x in range(4)}
+    assert trial(desk, 0).values == [25.0]
+    assert trial(desk, 0).user_attrs[names.RESULTS]["test/Var"] == 9.0
+    assert trial(desk, 0).user_attrs[names.SECONDS] >= 0
+    assert [how for _, how, _ in desk.view.ends] == ["finished"] * 4
+    again = list_desk(tmp_path, plans(4), storage=storage).run()
+    assert again.executor.calls == []
+    assert len(again.ledger.trials()) == 4
+
+
+def test_no_more_processes_at_a_time_than_workers(tmp_path: Path) -> None:
+    most: list[int] = []
+    view = FakeView(lambda works: most.append(len(works)))
+    list_desk(tmp_path, plans(7), workers=3, view=view).run()
+    assert max(most) == 3
+
+
+def test_what_is_finished_already_needs_neither_a_process_nor_a_slot(tmp_path: Path) -> None:
+    points = plans(5)
+    for plan in points[1:]:
+        finish(tmp_path / plan.key)
+    done: list[int] = []
+    view = FakeView(lambda works: done.append(len(desk.numbers("COMPLETE"))))
+    desk = list_desk(tmp_path, points, view=view, workers=2)
+    desk.run()
+    assert desk.executor.started() == [("x=0",)]
+    assert done[0] == 4, "all four in the first round, while x=0 trains"
+
+
+def test_a_point_that_fails_harms_no_other_and_keeps_its_reason(tmp_path: Path) -> None:
+    storage = memory()
+    behaviour = only("x=1", fail, only("x=2", leave(-9)))
+    desk = list_desk(tmp_path, plans(4), behaviour, storage=storage).run()
+    assert desk.states() == {
+        "x=0": ["COMPLETE"],
+        "x=1": ["FAIL"],
+        "x=2": ["FAIL"],
+        "x=3": ["COMPLETE"],
+    }
+    assert trial(desk, 1).user_attrs[names.REASON] == "ValueError: a bad day"
+    assert "SIGKILL" in trial(desk, 2).user_attrs[names.REASON]
+    assert list_desk(tmp_path, plans(4), storage=storage).run().executor.calls == []
+    again = list_desk(tmp_path, plans(4), storage=storage, retry="failed").run()
+    assert sorted(again.executor.started()) == [("x=1",), ("x=2",)]
+    assert again.states()["x=1"] == ["FAIL", "COMPLETE"]
+
+
+def test_retries_try_a_point_again_in_the_same_call(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(2), only("x=1", first(fail, succeed)), retries=1).run()
+    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["FAIL", "COMPLETE"]}
+    desk = list_desk(tmp_path / "2", plans(1), fail, retries=1).run()
+    assert desk.states() == {"x=0": ["FAIL", "FAIL"]}
+
+
+@pytest.mark.parametrize("score", [None, float("inf")])
+def test_a_score_that_is_no_number_is_a_failure(tmp_path: Path, score: float | None) -> None:
+    def no_score(call: Call) -> Process:
+        yield
+        finish(call.folder, test={"mIoU": score, "Var": 1.0})
+        return 0
+
+    desk = list_desk(tmp_path, plans(1), no_score).run()
+    assert desk.states() == {"x=0": ["FAIL"]}
+    assert "no test/mIoU that is a number" in trial(desk, 0).user_attrs[names.REASON]
+
+
+def test_consistency_that_was_not_measured_says_how_to_get_it(tmp_path: Path) -> None:
+    objectives = (Objective("val/TC/aligned", "maximize"),)
+    desk = search_desk(tmp_path, objectives=objectives, trials=1).run()
+    assert (
+        "no val/TC/aligned that is a number; python -m rgbt.consistency run=... split=val"
+        in trial(desk, 0).user_attrs[names.REASON]
+    )
+
+
+def test_a_configuration_that_changed_meanwhile_is_a_failure_that_says_so(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(1), leave(0)).run()
+    assert desk.states() == {"x=0": ["FAIL"]}
+    assert "was changed during the sweep" in trial(desk, 0).user_attrs[names.REASON]
+
+
+def test_after_too_many_failures_no_point_is_begun(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(6), fail, max_failures=1).run()
+    assert len(desk.executor.calls) == 1
+    assert len(list_desk(tmp_path / "2", plans(3), fail, max_failures=9).run().executor.calls) == 3
+
+
+def test_max_failures_is_the_number_of_failures_that_ends_a_call(tmp_path: Path) -> None:
+    assert len(list_desk(tmp_path, plans(6), fail, max_failures=2).run().executor.calls) == 2
+
+
+def test_a_run_that_takes_too_long_is_stopped_and_the_next_one_begun(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(2), only("x=0", hang), timeout_minutes=0.02).run()
+    assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
+    assert "timeout_minutes" in trial(desk, 0).user_attrs[names.REASON]
+    assert desk.executor.calls[0].stops == 1
+
+
+def test_when_the_hours_are_spent_what_runs_is_finished_and_nothing_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    clock = type("Clock", (), {"monotonic": lambda: now[0], "sleep": lambda s: None})
+    monkeypatch.setattr(drivers, "time", clock)
+
+    def late(call: Call) -> Process:
+        now[0] += 1800.1
+        return (yield from succeed(call))
+
+    desk = search_desk(tmp_path, late, hours=1.0)
+    desk.driver._began = desk.driver._beaten = 0.0
+
+    def tick(works: Any) -> None:
+        now[0] += 0.01
+
+    desk.view._look = tick
+    desk.run()
+    assert len(desk.executor.calls) == 2
+    assert desk.numbers("COMPLETE") == [0, 1]
+
+
+def test_processes_get_their_tags_and_gpu(tmp_path: Path) -> None:
+    points = plans(2, tags={"rgbt.table/one": "row"})
+    desk = list_desk(tmp_path, points, workers=2, gpus=(3, 5)).run()
+    environments = [call.environment for call in desk.executor.calls]
+    assert [env["CUDA_VISIBLE_DEVICES"] for env in environments] == ["3", "5"]
+    # Threads are a setting of the run: two workers give the bits of one.
+    assert not any("OMP_NUM_THREADS" in env for env in environments)
+    assert json.loads(environments[0][TAGS]) == {"rgbt.table/one": "row"}
+
+
+def together(desks: list[Desk]) -> None:
+    """Run all drivers at the same time; what one raises is raised."""
+    errors: list[BaseException] = []
+
+    def run(desk: Desk) -> None:
+        try:
+            desk.run()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=run, args=(desk,)) for desk in desks]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+
+
+def owners(count: int) -> list[Owner]:
+    return [Owner("host", number, str(number)) for number in range(count)]
+
+
+def test_two_drivers_on_one_journal_run_twelve_points_once(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    desks = [
+        list_desk(runs, plans(12), storage=open_storage(None, runs), me=me, workers=2, wait=True)
+        for me in owners(2)
+    ]
+    together(desks)
+    started = Counter(words for desk in desks for words in desk.executor.started())
+    assert started == {(f"x={x}",): 1 for x in range(12)}
+    assert all(desk.executor.calls for desk in desks), "the work was shared"
+    for desk in desks:
+        assert desk.states() == {f"x={x}": ["COMPLETE"] for x in range(12)}
+
+
+def test_three_drivers_of_a_search_make_twenty_trials_with_parameters_of_their_own(
+    tmp_path: Path,
+) -> None:
+    runs = tmp_path / "runs"
+    desks = [
+        search_desk(runs, storage=open_storage(None, runs), me=me, trials=20) for me in owners(3)
+    ]
+    together(desks)
+    trials = desks[0].ledger.trials()
+    assert [each.state.name for each in trials] == ["COMPLETE"] * 20
+    assert len({each.params["x"] for each in trials}) == 20
+    assert sum(len(desk.executor.calls) for desk in desks) == 20
+
+
+PROCESS = """
+import sys
+from pathlib import Path
+from sweeps.worker import driver
+from sweeps.worker.storage import open_storage
+from tests.sweeps.fakes import list_desk, plans
+driver.POLL_S, driver.LOOK_S = 0.001, 0.002
+runs = Path(sys.argv[1])
+storage = open_storage(None, runs)
+print("ready", flush=True)
+sys.stdin.readline()
+desk = list_desk(runs, plans(12), storage=storage, wait=True).run()
+print(*(words[0] for words in desk.executor.started()))
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_that_begin_a_list_together_run_it_once(tmp_path: Path) -> None:
+    every = [
+        subprocess.Popen(
+            [sys.executable, "-c", PROCESS, str(tmp_path / "runs")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    for process in every:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    for process in every:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    told = [process.communicate()[0] for process in every]
+    assert [process.returncode for process in every] == [0, 0]
+    assert sorted(" ".join(told).split()) == sorted(f"x={x}" for x in range(12))
+
+
+def killed(desk: Desk) -> None:
+    """A driver whose process goes away at its first work, without a word."""
+
+    def gone(works: Any) -> None:
+        if works:
+            raise KeyboardInterrupt
+
+    desk.view._look = gone
+    desk.driver._give_back = lambda: None  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        desk.run()
+
+
+@pytest.mark.parametrize(
+    ("owner", "seconds", "taken_over"),
+    [(GONE, 0.0, True), (DEAD, 9999.0, True), (DEAD, 1.0, False)],
+    ids=["its process is gone", "silent on another machine", "heard of on another machine"],
+)
+def test_points_of_a_driver_that_is_gone_are_run_by_the_next(
+    tmp_path: Path, owner: Owner, seconds: float, taken_over: bool
+) -> None:
+    storage = memory()
+    killed(list_desk(tmp_path, plans(2), hang, storage=storage, me=owner))
+    silent(storage, 0, seconds)
+    desk = list_desk(tmp_path, plans(2), storage=storage).run()
+    ran = [("x=0",), ("x=1",)] if taken_over else [("x=1",)]
+    assert desk.executor.started() == ran
+    assert desk.states()["x=0"] == (["COMPLETE"] if taken_over else ["RUNNING"])
+
+
+@pytest.mark.parametrize("owner", [GONE, DEAD])
+def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
+    tmp_path: Path, owner: Owner
+) -> None:
+    storage = memory()
+    before = search_desk(tmp_path, hang, storage=storage, me=owner, trials=3)
+    killed(before)
+    if owner == DEAD:
+        silent(storage, 0)
+    lost = trial(before, 0).params
+    desk = search_desk(tmp_path, storage=storage, trials=3).run()
+    done = [each for each in desk.ledger.trials() if each.state.name == "COMPLETE"]
+    assert len(done) == len(desk.ledger.trials()) == 3
+    assert desk.executor.started()[0] == before.executor.started()[0]
+    assert [each.params for each in done].count(lost) == 1
+
+
+def test_an_orphan_that_still_trains_is_adopted_and_not_started_twice(tmp_path: Path) -> None:
+    storage = memory()
+    points = plans(1)
+    killed(list_desk(tmp_path, points, hang, storage=storage, me=GONE))
+    folder = tmp_path / points[0].key
+    seen: list[str] = []
+    with held_by_another(folder) as process:
+
+        def look(works: Any) -> None:
+            seen.extend(work.status for work in works)
+            if len(seen) == 3 and process.poll() is None:
+                finish(folder)
+                let_go(process)
+
+        desk = list_desk(tmp_path, points, storage=storage, view=FakeView(look)).run()
+    assert set(seen) == {"adopted"}
+    assert desk.executor.calls == []
+    assert desk.states() == {"x=0": ["COMPLETE"]}
+
+
+def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = memory()
+    killed(search_desk(tmp_path, hang, storage=storage, me=GONE, trials=1))
+    a, b = (search_desk(tmp_path, storage=storage, me=me, trials=1) for me in owners(2))
+    seen = [list(b.ledger.orphans(())), []]
+    assert len(seen[0]) == 1
+    monkeypatch.setattr(b.ledger, "orphans", lambda mine: seen.pop(0) if seen else [])
+    a.run()
+    b.run()
+    assert a.numbers("COMPLETE") == [1]
+    assert a.numbers("WAITING") == []
+    assert len(a.executor.calls) + len(b.executor.calls) == 1
+
+
+def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: Path) -> None:
+    storage = memory()
+    points = plans(2)
+    other = list_desk(tmp_path, points, storage=storage, me=ALIVE)
+    task = other.driver.source.next()
+    assert task is not None
+    rounds: list[int] = []
+
+    def look(works: Any) -> None:
+        rounds.append(len(works))
+        if len(rounds) == 30:
+            finish(tmp_path / points[0].key)
+            other.ledger.complete(task.number, [1.0], {})
+
+    desk = list_desk(tmp_path, points, storage=storage, wait=True, view=FakeView(look)).run()
+    assert len(rounds) >= 30
+    assert desk.executor.started() == [("x=1",)]
+    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["COMPLETE"]}
+
+
+def test_a_driver_says_that_it_is_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drivers, "BEAT_S", 0.0)
+    beats: list[list[int]] = []
+    desk = list_desk(tmp_path, plans(1))
+    monkeypatch.setattr(desk.ledger, "beat", lambda numbers: beats.append(list(numbers)))
+    desk.run()
+    assert [0] in beats
+
+
+def test_ctrl_c_stops_the_processes_and_gives_the_points_back(tmp_path: Path) -> None:
+    storage = memory()
+    view = interrupt_when(lambda works: len(works) == 2)
+    desk = list_desk(tmp_path, plans(3), hang, storage=storage, view=view, workers=2)
+    with pytest.raises(KeyboardInterrupt):
+        desk.run()
+    assert [call.stops for call in desk.executor.calls] == [1, 1]
+    assert desk.executor.running() == []
+    assert desk.ledger.trials() == []
+    again = list_desk(tmp_path, plans(3), storage=storage).run()
+    assert len(again.executor.calls) == 3
+    assert again.states() == {f"x={x}": ["COMPLETE"] for x in range(3)}
+
+
+def test_ctrl_c_puts_the_trials_of_a_search_into_its_queue(tmp_path: Path) -> None:
+    storage = memory()
+    view = interrupt_when(lambda works: bool(works))
+    desk = search_desk(tmp_path, hang, storage=storage, view=view, trials=2)
+    with pytest.raises(KeyboardInterrupt):
+        desk.run()
+    assert desk.numbers("WAITING") == [1]
+    again = search_desk(tmp_path, storage=storage, trials=2).run()
+    assert again.executor.started()[0] == desk.executor.started()[0]
+    assert len(again.numbers("COMPLETE")) == len(again.ledger.trials()) == 2
+
+
+def test_ctrl_c_while_a_process_is_being_started_gives_the_point_back(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(1), hang)
+    start = desk.executor.start
+
+    def interrupted(*arguments: Any) -> Any:
+        start(*arguments)
+        raise KeyboardInterrupt
+
+    desk.executor.start = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        desk.run()
+    assert desk.ledger.trials() == []
+
+
+def test_a_process_that_cannot_be_started_fails_its_point_alone(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(2))
+    start = desk.executor.start
+
+    def full(command: Any, environment: Any, log: Path) -> Any:
+        if "x=0" in command:
+            raise OSError(28, "No space left on device")
+        return start(command, environment, log)
+
+    desk.executor.start = full  # type: ignore[method-assign]
+    desk.run()
+    assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
+
+
+def scored(*scores: float, end: Behaviour = hang) -> Behaviour:
+    """A run with these validations that then finishes or hangs."""
+
+    def process(call: Call) -> Process:
+        run = RunFolder(call.folder)
+        for index, score in enumerate(scores):
+            yield
+            run.append(2 * index + 2, "val", {"mIoU": score})
+        return (yield from end(call))
+
+    return process
+
+
+def ending(score: float) -> Behaviour:
+    def process(call: Call) -> Process:
+        yield
+        finish(call.folder, val={"mIoU": score})
+        return 0
+
+    return process
+
+
+def test_a_hopeless_trial_is_stopped_and_booked_as_pruned(tmp_path: Path) -> None:
+    pruner = optuna.pruners.ThresholdPruner(lower=20.0)
+    good = scored(0.5, 0.75, end=ending(0.75))
+
+    def nth(call: Call) -> Process:
+        return [good, scored(0.5, 0.1), good][len(desk.executor.calls) - 1](call)
+
+    def described(call: Call) -> Process:
+        NoTracking().start(RunFolder(call.folder), "fake", {"rgbt.key": "k"}, {})
+        return (yield from nth(call))
+
+    desk = search_desk(tmp_path, described, pruner=pruner, objectives=UP, trials=3)
+    desk.run()
+    assert [each.state.name for each in desk.ledger.trials()] == ["COMPLETE", "PRUNED", "COMPLETE"]
+    pruned = trial(desk, 1)
+    assert pruned.intermediate_values == {2: 50.0, 4: 10.0}
+    assert pruned.user_attrs[names.REASON] == "pruned at step 4"
+    assert trial(desk, 0).values == [75.0]
+    assert [call.stops for call in desk.executor.calls] == [0, 1, 0]
+    description = RunFolder(desk.executor.calls[1].folder).description()
+    assert description is not None
+    assert description.tags["rgbt.stopped"] == "pruned at step 4"
+    assert ("pruned", "pruned at step 4") in [end[1:] for end in desk.view.ends]
+    assert desk.driver.failures == 0
+
+
+def test_the_mean_over_replicates_is_the_value_and_the_first_seed_reports(tmp_path: Path) -> None:
+    values = {"seed=0": 0.5, "seed=1": 0.25, "seed=2": 0.75}
+
+    def by_seed(call: Call) -> Process:
+        score = values[call.words[-1]]
+        return (yield from scored(score, end=ending(score))(call))
+
+    desk = search_desk(tmp_path, by_seed, objectives=UP, trials=1, replicates=3).run()
+    (one,) = desk.ledger.trials()
+    assert one.values == [50.0]
+    assert one.intermediate_values == {2: 50.0}
+    assert [call.words[-1] for call in desk.executor.calls] == list(values)
+    assert len(one.user_attrs[names.RUNS]) == 3
+
+
+def test_two_objectives_are_told_in_their_order(tmp_path: Path) -> None:
+    both = (Objective("test/Var", "minimize"), Objective("test/mIoU", "maximize"))
+    desk = search_desk(tmp_path, objectives=both, trials=2).run()
+    assert [each.values for each in desk.ledger.trials()] == [[9.0, 25.0]] * 2
+
+
+def test_duplicates_of_finished_points_are_answered_without_a_run(tmp_path: Path) -> None:
+    space = {"x": {"type": "categorical", "choices": [1, 2]}}
+    desk = search_desk(tmp_path, space=space, trials=8, workers=2).run()
+    trials = desk.ledger.trials()
+    assert [each.state.name for each in trials] == ["COMPLETE"] * 8
+    assert len(desk.executor.calls) == len({each.params["x"] for each in trials}) == 2
+
+
+def test_a_search_finds_runs_that_other_studies_have_made(tmp_path: Path) -> None:
+    desk = search_desk(tmp_path, trials=5).run()
+    other = search_desk(tmp_path, trials=5).run()  # another storage, the same seed
+    assert len(desk.executor.calls) == 5
+    assert other.executor.calls == []
+    assert other.numbers("COMPLETE") == [0, 1, 2, 3, 4]
+
+
+def test_a_search_that_was_cut_in_two_asks_the_same_points(tmp_path: Path) -> None:
+    whole = search_desk(tmp_path / "a", trials=6).run()
+    storage = memory()
+    search_desk(tmp_path / "b", storage=storage, trials=2).run()
+    rest = search_desk(tmp_path / "b", storage=storage, trials=6).run()
+    assert len(rest.executor.calls) == 4
+    parameters = [each.params for each in rest.ledger.trials()]
+    assert parameters == [each.params for each in whole.ledger.trials()]
+
+
+def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+    """This machine slept; the other driver took the trial for an orphan's."""
+    storage = memory()
+    other = list_desk(tmp_path, plans(1), storage=storage, me=ALIVE)
+
+    def taken_over(call: Call) -> Process:
+        other.ledger.complete(0, [99.0], {})
+        return (yield from succeed(call))
+
+    desk = list_desk(tmp_path, plans(1), taken_over, storage=storage).run()
+    assert trial(desk, 0).values == [99.0]
+
+
+def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_path: Path) -> None:
+    storage = memory()
+    other = search_desk(tmp_path, storage=storage, me=ALIVE, objectives=UP)
+
+    def taken_over(call: Call) -> Process:
+        if len(desk.executor.calls) == 1:
+            other.ledger.release(0, "its driver was gone", again=False)
+        return (yield from succeed(call))
+
+    desk = search_desk(tmp_path, taken_over, storage=storage, trials=1, objectives=UP)
+    desk.run()
+    assert len(desk.numbers("COMPLETE")) == 1
+
+
+def test_points_that_cannot_be_composed_count_as_failures(tmp_path: Path) -> None:
+    desk = search_desk(tmp_path, planner=PickyPlanner(), trials=5, max_failures=1).run()
+    assert len(desk.view.refusals) == 1
+
+
+def test_a_search_tries_a_failed_point_again_too(tmp_path: Path) -> None:
+    desk = search_desk(tmp_path, first(fail, succeed), trials=1, retries=1).run()
+    assert len(desk.executor.calls) == 2
+    assert len(desk.numbers("COMPLETE")) == 1
+
+
+def test_a_storage_that_is_away_for_a_moment_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drivers, "PAUSE_S", 0.0, raising=False)
+    desk = list_desk(tmp_path, plans(2))
+    complete = desk.ledger.complete
+    tries: list[int] = []
+
+    def away(*arguments: Any) -> None:
+        tries.append(1)
+        if len(tries) < 3:
+            raise optuna.exceptions.StorageInternalError("no route to host")
+        complete(*arguments)
+
+    monkeypatch.setattr(desk.ledger, "complete", away)
+    desk.run()
+    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["COMPLETE"]}
+    assert len(desk.executor.calls) == 2

@@ -1,0 +1,339 @@
+"""Real processes of a tiny module, started as runs are."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing import forkserver
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt.checks import InputError
+from sweeps.points import Evaluation
+from sweeps.worker import executors
+from sweeps.worker.executors import Job, LocalExecutor, check_gpus
+from tests.sweeps.fakes import DEADLINE_S, until
+
+MODULE = """
+import json, os, signal, subprocess, sys, time
+from pathlib import Path
+
+assert __name__ == "__main__"
+what, place = sys.argv[1], Path(sys.argv[2])
+print("said", what, flush=True)
+print("complained", file=sys.stderr, flush=True)
+if what == "tell":
+    facts = {
+        "argv": sys.argv[1:],
+        "command": sys.orig_argv[1:],
+        "given": os.environ.get("GIVEN"),
+        "folder": os.getcwd(),
+        "session": os.getsid(0) == os.getpid(),
+        "interrupt": signal.getsignal(signal.SIGINT) is signal.default_int_handler,
+    }
+    place.write_text(json.dumps(facts))
+if what == "leave":
+    sys.exit(int(sys.argv[3]))
+if what == "raise":
+    raise ValueError("a bad day")
+if what == "kill":
+    os.kill(os.getpid(), int(sys.argv[3]))
+if what in ("stay", "stubborn"):
+    quiet = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)"
+    code = quiet if what == "stubborn" else "import time; time.sleep(600)"
+    if what == "stubborn":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen([sys.executable, "-c", code])
+    place.with_suffix(".new").write_text(f"{os.getpid()} {child.pid}")
+    place.with_suffix(".new").rename(place)
+    time.sleep(600)
+if what == "wait":
+    place.with_suffix(".new").write_text(str(os.getpid()))
+    place.with_suffix(".new").rename(place)
+    while not place.with_suffix(".go").exists():
+        time.sleep(0.01)
+    place.with_suffix(".done").touch()
+"""
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with the module ``tiny_run``, which processes can import."""
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "tiny_run.py").write_text(MODULE)
+    sys.path.insert(0, str(folder))
+    yield folder
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture(scope="module")
+def executor(module: Path) -> Iterator[LocalExecutor]:
+    # Nothing here needs torch. The server is one of the whole process: later tests start their own.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executors, "PRELOADED", ())
+        patch.setattr(executors, "own_modules", list)
+        yield LocalExecutor()
+    forkserver._forkserver._stop()
+
+
+Start = Callable[..., Job]
+
+
+@pytest.fixture
+def start(executor: LocalExecutor, tmp_path: Path) -> Iterator[Start]:
+    """Start the module; what is left of its processes is ended after the test."""
+    jobs: list[Any] = []
+
+    def run(*words: str, environment: dict[str, str] | None = None) -> Job:
+        job = executor.start(("tiny_run", *words), environment or {}, tmp_path / "logs" / "log")
+        jobs.append(job)
+        return job
+
+    yield run
+    for job in jobs:
+        if job.poll() is None:
+            job._signal(signal.SIGKILL)
+            code(job)
+
+
+def code(job: Job) -> int:
+    found: list[int | None] = []
+
+    def ended() -> bool:
+        found.append(job.poll())
+        return found[-1] is not None
+
+    until(ended, "the end of a process")
+    assert found[-1] is not None
+    return found[-1]
+
+
+def log(tmp_path: Path) -> str:
+    return (tmp_path / "logs" / "log").read_text()
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"
+
+
+def pids(place: Path) -> tuple[int, ...]:
+    until(place.exists, "the process to say who it is")
+    return tuple(map(int, place.read_text().split()))
+
+
+def test_a_command_runs_as_its_own_with_its_words_and_environment(
+    start: Start, tmp_path: Path
+) -> None:
+    place = tmp_path / "facts"
+    assert code(start("tell", str(place), "a b=[1,2]", environment={"GIVEN": "it"})) == 0
+    facts = json.loads(place.read_text())
+    assert facts == {
+        "argv": ["tell", str(place), "a b=[1,2]"],
+        "command": ["-m", "tiny_run", "tell", str(place), "a b=[1,2]"],
+        "given": "it",
+        "folder": str(Path.cwd()),
+        "session": True,
+        "interrupt": True,
+    }
+    assert "GIVEN" not in os.environ
+    assert code(start("tell", str(place))) == 0
+    assert json.loads(place.read_text())["given"] is None, "nothing stays from run to run"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("leave", "x", "0"), 0),
+        (("leave", "x", "3"), 3),
+        (("raise", "x"), 1),
+        (("kill", "x", str(int(signal.SIGKILL))), -9),
+        (("kill", "x", str(int(signal.SIGSEGV))), -11),
+    ],
+    ids=["in order", "exit code", "exception", "killed", "crash"],
+)
+def test_how_a_process_ended_is_known(
+    start: Start, tmp_path: Path, words: tuple[str, ...], expected: int
+) -> None:
+    job = start(*words)
+    assert code(job) == expected
+    assert job.poll() == expected
+    job.stop()  # too late, and no harm
+    assert job.poll() == expected
+    said = log(tmp_path)
+    assert said.startswith(f"said {words[0]}\n")
+    assert "complained\n" in said
+    assert ("ValueError: a bad day" in said) == (words[0] == "raise")
+
+
+def test_the_log_is_appended_to(start: Start, tmp_path: Path) -> None:
+    for number in "12":
+        code(start("leave", "x", number))
+    assert log(tmp_path).count("said leave") == 2
+
+
+def test_a_module_that_is_not_there_is_told_in_the_log(
+    executor: LocalExecutor, tmp_path: Path
+) -> None:
+    assert code(executor.start(("no_such_module",), {}, tmp_path / "log")) == 1
+    assert "No module named no_such_module" in (tmp_path / "log").read_text()
+
+
+def test_a_stop_ends_a_process_with_its_children(start: Start, tmp_path: Path) -> None:
+    job = start("stay", str(tmp_path / "pids"))
+    mine, child = pids(tmp_path / "pids")
+    assert job.poll() is None
+    job.stop()
+    assert code(job) == -signal.SIGTERM
+    until(lambda: not is_alive(mine) and not is_alive(child), "the end of both")
+
+
+def test_what_does_not_stop_is_killed_with_its_children(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = start("stubborn", str(tmp_path / "pids"))
+    _, child = pids(tmp_path / "pids")
+    job.stop()
+    assert job.poll() is None, "it has its time of grace"
+    monkeypatch.setattr(executors, "GRACE_S", 0.0)
+    job.stop()
+    assert code(job) == -signal.SIGKILL
+    until(lambda: not is_alive(child), "the end of the child")
+
+
+def test_a_second_stop_gives_no_more_time(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = start("stubborn", str(tmp_path / "pids"))
+    pids(tmp_path / "pids")
+    monkeypatch.setattr(executors, "GRACE_S", 0.05)
+    job.stop()
+    monkeypatch.setattr(executors, "GRACE_S", 10 * DEADLINE_S)
+    job.stop()
+    assert code(job) == -signal.SIGKILL
+
+
+def test_processes_are_no_part_of_the_terminal_that_gets_ctrl_c(
+    start: Start, tmp_path: Path
+) -> None:
+    start("stay", str(tmp_path / "pids"))
+    mine, _ = pids(tmp_path / "pids")
+    assert os.getsid(mine) == os.getpgid(mine) == mine
+    assert os.getpgid(mine) != os.getpgid(0)
+
+
+DRIVER = textwrap.dedent("""
+    import sys, time
+    from pathlib import Path
+    from sweeps.worker import executors
+
+    if __name__ == "__main__":
+        sys.path.insert(0, sys.argv[1])
+        executors.PRELOADED, executors.own_modules = (), list
+        folder = Path(sys.argv[2])
+        job = executors.LocalExecutor().start(("tiny_run", "wait", str(folder / "pid")), {},
+                                              folder / "log")
+        try:
+            while True:
+                job.poll()
+                time.sleep(0.01)
+        except KeyboardInterrupt:
+            print("interrupted", job.poll(), flush=True)
+            job.stop()
+            while job.poll() is None:
+                time.sleep(0.01)
+            print("stopped", job.poll(), flush=True)
+""")
+
+
+@pytest.fixture
+def driver(module: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A driver in a process group of its own, as a shell starts it."""
+    (tmp_path / "a_driver.py").write_text(DRIVER)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "a_driver.py"), str(module), str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(Path(executors.__file__).parents[2])},
+        # Where the suite itself runs in the background of a shell, Ctrl-C is ignored and inherited.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    yield process
+    process.kill()
+    (tmp_path / "pid.go").touch()  # its orphan holds the pipe that is read here
+    process.communicate()
+
+
+def test_ctrl_c_reaches_the_driver_alone(driver: subprocess.Popen[str], tmp_path: Path) -> None:
+    (pid,) = pids(tmp_path / "pid")
+    os.killpg(driver.pid, signal.SIGINT)  # what a terminal does
+    told, _ = driver.communicate(timeout=DEADLINE_S)
+    assert told.splitlines() == ["interrupted None", "stopped -15"]
+    assert not is_alive(pid)
+
+
+def test_a_run_goes_on_when_its_driver_is_killed(
+    driver: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    (pid,) = pids(tmp_path / "pid")
+    os.killpg(driver.pid, signal.SIGKILL)  # the fork server goes with it
+    driver.wait()
+    time.sleep(0.2)
+    assert is_alive(pid)
+    (tmp_path / "pid.go").touch()
+    until((tmp_path / "pid.done").exists, "the orphan to finish its work")
+    until(lambda: not is_alive(pid), "its end")
+
+
+def test_what_is_loaded_beforehand_can_be_loaded() -> None:
+    """A misspelt name would be left out in silence, and every run would take seconds longer."""
+    import importlib.util
+
+    assert all(importlib.util.find_spec(name) is not None for name in executors.PRELOADED)
+    assert "forkserver" in multiprocessing.get_all_start_methods()
+
+
+def test_every_command_that_is_called_of_a_run_is_loaded_by_its_process_alone() -> None:
+    evaluations = (Evaluation(), Evaluation(frames="aligned"), Evaluation(frames="next"))
+    called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
+    assert called == set(executors.COMMANDS)
+    assert not called & set(executors.own_modules())
+
+
+@pytest.mark.parametrize(
+    ("shown", "gpus", "sentence"),
+    [
+        ("2,3", (3, 5), "gpus=[3, 5]: there is no GPU 5, CUDA_VISIBLE_DEVICES=2,3 shows the GPUs"),
+        ("", (0,), "there is no GPU 0, CUDA_VISIBLE_DEVICES= shows no GPU; omit gpus."),
+        (None, (0, 99), "there is no GPU "),
+    ],
+)
+def test_gpus_that_are_not_there_are_refused(
+    monkeypatch: pytest.MonkeyPatch, shown: str | None, gpus: tuple[int, ...], sentence: str
+) -> None:
+    if shown is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    else:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
+    with pytest.raises(InputError) as told:
+        check_gpus(gpus)
+    assert sentence in str(told.value)
+    check_gpus(None)
+
+
+def test_gpus_that_are_shown_may_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
+    check_gpus((3, 2))

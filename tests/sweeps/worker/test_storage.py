@@ -1,0 +1,192 @@
+"""Opening storages and studies: by one process, by several at once, and by a preview."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt.checks import InputError
+from sweeps import attributes as names
+from sweeps.settings import Objective
+from sweeps.worker import storage as stores
+from sweeps.worker.storage import (
+    begin_study,
+    existing_study,
+    load_study,
+    open_storage,
+    study_names,
+)
+
+UP = (Objective("test/mIoU", "maximize"),)
+BOTH = (*UP, Objective("test/Var", "minimize"))
+
+
+def test_the_default_is_a_journal_in_the_folder_of_runs(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path / "runs")
+    begin_study("study", storage, UP, {})
+    assert (tmp_path / "runs" / "studies.journal").is_file()
+    assert study_names(open_storage(None, tmp_path / "runs")) == ["study"]
+
+
+@pytest.mark.parametrize("named", ["{}/deep/one.journal", "sqlite:///{}/two.db"])
+def test_a_study_is_there_again_in_a_named_storage(tmp_path: Path, named: str) -> None:
+    where = named.format(tmp_path)
+    begin_study("study", open_storage(where, tmp_path), BOTH, {names.KIND: "list"})
+    study = load_study("study", open_storage(where, tmp_path))
+    assert study.user_attrs[names.KIND] == "list"
+    assert study.user_attrs[names.METRICS] == ["test/mIoU", "test/Var"]
+    assert study.metric_names == ["test/mIoU", "test/Var"]
+    assert [direction.name for direction in study.directions] == ["MAXIMIZE", "MINIMIZE"]
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        ("studies.txt", "studies.txt: expected a file that ends in .journal"),
+        ("nonsense://user:secret@host/x", "nonsense"),
+    ],
+)
+def test_a_storage_that_is_none_is_refused_in_one_sentence(
+    tmp_path: Path, named: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stores, "PAUSE_S", 0.0)
+    with pytest.raises(InputError) as error:
+        open_storage(named, tmp_path)
+    assert said in str(error.value)
+    assert "secret" not in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_database_that_cannot_be_opened_is_told_without_its_password(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stores, "PAUSE_S", 0.0)
+    with pytest.raises(InputError, match="its folder does not exist"):
+        open_storage(f"sqlite:///{tmp_path}/no/such/folder.db", tmp_path)
+    with pytest.raises(InputError) as error:
+        open_storage("postgresql://me:secret@127.0.0.1:9/x", tmp_path)
+    assert "cannot be opened" in str(error.value)
+    assert "secret" not in str(error.value)
+
+
+def test_a_database_whose_tables_another_process_is_making_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stores, "PAUSE_S", 0.0)
+    tries: list[int] = []
+
+    def opening() -> str:
+        tries.append(1)
+        if len(tries) < 3:
+            raise RuntimeError("table studies already exists")
+        return "open"
+
+    assert stores._patiently(opening, "sqlite:///x") == "open"
+    assert len(tries) == 3
+
+
+OPEN = """
+import sys
+from pathlib import Path
+import optuna, sqlalchemy  # loaded before the start, so that all open at the same time
+from sweeps.settings import Objective
+from sweeps.worker.storage import begin_study, open_storage
+print("ready", flush=True)
+sys.stdin.readline()
+storage = open_storage(sys.argv[1], Path("."))
+study = begin_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
+study.add_trial(optuna.trial.create_trial(value=1.0))
+"""
+
+
+@pytest.mark.parametrize(
+    ("named", "processes"), [("sqlite:///{}/fresh.db", 3), ("{}/fresh.journal", 2)]
+)
+def test_several_processes_open_a_fresh_storage_at_the_same_time(
+    tmp_path: Path, named: str, processes: int
+) -> None:
+    where = named.format(tmp_path)
+    every = [
+        subprocess.Popen(
+            [sys.executable, "-c", OPEN, where],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(processes)
+    ]
+    for process in every:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    for process in every:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    ends = [(process.communicate()[1], process.returncode) for process in every]
+    assert [code for _, code in ends] == [0] * processes, ends
+    study = load_study("study", open_storage(where, tmp_path))
+    assert [trial.number for trial in study.trials] == list(range(processes))
+
+
+def test_a_study_with_other_objectives_or_another_space_is_refused(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path)
+    begin_study("study", storage, UP, {names.SIGNATURE: "a"})
+    begin_study("study", storage, UP, {names.SIGNATURE: "a"})
+    with pytest.raises(InputError, match="'study' with other objectives"):
+        begin_study("study", storage, BOTH, {names.SIGNATURE: "a"})
+    with pytest.raises(InputError, match="'study' with another space"):
+        begin_study("study", storage, UP, {names.SIGNATURE: "b"})
+    with pytest.raises(InputError, match="'study' with another space"):
+        begin_study("study", storage, UP, {names.KIND: "list"})
+
+
+def test_a_search_under_the_name_of_a_list_is_refused(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path)
+    begin_study("study", storage, UP, {names.KIND: "list"})
+    with pytest.raises(InputError, match="study"):
+        begin_study("study", storage, UP, {names.KIND: "search", names.SIGNATURE: "a"})
+
+
+def test_a_study_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path)
+    with pytest.raises(InputError, match="no study 'x'; the storage holds none"):
+        load_study("x", storage)
+    begin_study("table/one", storage, UP, {})
+    with pytest.raises(InputError, match="did you mean 'table/one'"):
+        load_study("table/on", storage)
+
+
+def test_looking_for_a_study_makes_nothing(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
+        assert existing_study("study", named, runs) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_looking_for_a_study_finds_it_in_every_kind_of_storage(tmp_path: Path) -> None:
+    for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
+        begin_study("study", open_storage(named, tmp_path), UP, {})
+        found: Any = existing_study("study", named, tmp_path)
+        assert found.study_name == "study"
+        assert existing_study("another", named, tmp_path) is None
+
+
+def test_a_journal_in_the_home_folder_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    begin_study("study", open_storage("~/one.journal", tmp_path), UP, {})
+    assert (tmp_path / "one.journal").is_file()
+    assert existing_study("study", "~/one.journal", tmp_path) is not None
+
+
+def test_a_name_that_mlflow_cannot_show_is_refused(tmp_path: Path) -> None:
+    storage = open_storage(None, tmp_path)
+    with pytest.raises(InputError, match="MLflow takes names"):
+        begin_study('a "b"', storage, UP, {})
+    begin_study("table/my-1: x_2.0", storage, UP, {})

@@ -1,0 +1,119 @@
+"""What a run tells of itself, without a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rgbt.engine.checkpoint import State
+from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.training.train import Run, _show_again
+
+
+def told(
+    capsys: pytest.CaptureFixture[str], lines: list[tuple[str, dict[str, float]]], cache: str | None
+) -> str:
+    """What a run with these lines in its log says of waiting."""
+    kept = [SimpleNamespace(kind=kind, values=values) for kind, values in lines]
+    folder: Any = SimpleNamespace(lines=lambda: kept)
+    nothing: Any = None
+    session: Any = SimpleNamespace(loading=SimpleNamespace(cache=cache))
+    capsys.readouterr()
+    Run(nothing, folder, nothing, nothing)._tell_waiting(session)
+    return capsys.readouterr().err
+
+
+def steps(*shares: float) -> list[tuple[str, dict[str, float]]]:
+    return [("train", {"loss": 1.0, "wait_share": share}) for share in shares]
+
+
+def test_much_waiting_is_told_with_what_helps(capsys: pytest.CaptureFixture[str]) -> None:
+    # The median of 0.1, 0.5 and 0.9: one slow step, as the first always is, says nothing.
+    assert told(capsys, steps(0.9, 0.1, 0.5), None) == (
+        "rgbt: 50% of the time of a step was waiting for images; data.cache=auto decodes every "
+        "image once, and data.num_workers=... gives more processes to reading them.\n"
+    )
+    assert told(capsys, steps(0.9, 0.1, 0.5), "auto") == (
+        "rgbt: 50% of the time of a step was waiting for images; data.num_workers=... gives more "
+        "processes to reading them.\n"
+    )
+
+
+def test_little_waiting_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, steps(0.3, 0.3), None) == "", "no more than the limit"
+    assert told(capsys, steps(0.99, 0.1, 0.2), None) == ""
+    assert told(capsys, [], None) == ""
+    earlier = [("train", {"loss": 1.0}), ("val", {"wait_share": 0.9})]
+    assert told(capsys, earlier, None) == "", "lines of before it was measured, and of no step"
+    assert "31%" in told(capsys, [*earlier, *steps(0.31)], None)
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [("grbm", "grbm sigma_div=2 seed=0"), ("grbm sigma_div=2", "grbm sigma_div=2 seed=0")],
+)
+def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
+    tmp_path: Path, group: str, name: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
+    asked = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
+    _show_again(folder, NoTracking(), asked)
+    kept = folder.description()
+    assert kept is not None
+    assert (kept.name, kept.tags["row"]) == (name, "a")
+
+    more = Description("lr=1 · grbm", {"rgbt.group": "grbm sigma_div=2 lr=1"}, {})
+    _show_again(folder, NoTracking(), more)
+    kept = folder.description()
+    assert kept is not None
+    assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
+
+
+def test_a_run_that_is_stopped_while_its_tracking_begins_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow(NoTracking):
+        """A store that a signal comes before."""
+
+        ended = ""
+
+        def update(self) -> None:
+            raise KeyboardInterrupt
+
+        def start(self, *arguments: Any) -> None:
+            super().start(*arguments)
+            self.update()
+
+        def finish(self, status: str) -> None:
+            self.ended = status
+
+    tracking, prepared = Slow(), cast(Any, SimpleNamespace(session=None))
+    monkeypatch.setattr(Run, "_claim", lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        Run(prepared, RunFolder(tmp_path), tracking, Description("a", {}, {})).complete()
+    assert tracking.ended == "KILLED"
+
+
+@pytest.mark.parametrize(
+    ("saved", "said"),
+    [
+        (2, "rgbt: steps 3 to 5 were not saved before and are repeated.\n"),
+        (5, ""),
+    ],
+)
+def test_steps_that_were_not_saved_are_named_on_resuming(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], saved: int, said: str
+) -> None:
+    folder, nothing = RunFolder(tmp_path), cast(Any, None)
+    for step in range(1, 6):
+        folder.append(step, "train", {"loss": 1.0})
+    trainer = SimpleNamespace(log_every=1)
+    prepared: Any = SimpleNamespace(session=SimpleNamespace(trainer=trainer))
+    state = State(seed=0, step=saved, evaluated_step=saved)
+    Run(prepared, folder, nothing, nothing)._truncate(state)
+    assert capsys.readouterr().err == said
