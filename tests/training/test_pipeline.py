@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 from omegaconf import DictConfig, OmegaConf
+from rgbt.config.schema import check
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import check
 from rgbt.files.atomic import holding
 from rgbt.metrics.counts import Counts
 from rgbt.spec import run_key as identity
