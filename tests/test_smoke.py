@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from rgbt.config import check, compose
-from rgbt.identity import run_key
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run
 from tests.conftest import write_data
 from tests.data.folder_files import PATTERNS, write_folder
@@ -76,10 +75,3 @@ def test_the_smoke_test_fits_every_data_set(dataset: str) -> None:
     sizes = {key: config.dataset[key] for key in config.dataset if key.startswith("num_tr")}
     assert all(size == 6 for size in sizes.values())
     assert bool(sizes) == dataset.startswith("synth")
-
-
-def test_keys_of_smoke_runs_are_what_they_were() -> None:
-    """Also of those that smoke_freiburg made."""
-    known = {"grbm": "2af865ec1d57", "crm_pst900": "39681806fb79", "heatnet": "4ce4547558c9"}
-    found = {name: run_key(compose([f"+experiment={name}", "+debug=smoke"])) for name in known}
-    assert found == known
