@@ -55,7 +55,8 @@ MEASURED = ("images_per_s", "wait_share", "peak_memory_mib")
 """Logged values that are measured of the machine."""
 
 REL_TOL, ABS_TOL = 1e-4, 1e-6
-"""Of losses on another kind of machine than that of the recording."""
+"""Of first losses on another kind of machine. Later losses differ more: one thread in place of two
+moves the tenth by up to 4%."""
 
 
 # The adapter: the only lines that name modules of the product.
@@ -136,7 +137,7 @@ def composition(experiment: str, setting: str) -> dict[str, Any]:
 
 
 def training(experiment: str, runs_dir: Path) -> dict[str, Any]:
-    """Run key, logged values by name (one per step that has it) and digests of counts of ten steps."""
+    """Run key, logged values by name and digests of counts of a run of ten steps."""
     overrides = [f"+experiment={experiment}", *TEN_STEPS, f"runs_dir={runs_dir}"]
     run(overrides)
     name = key(overrides)
@@ -203,7 +204,7 @@ def training_differences(old: dict[str, Any], new: dict[str, Any], is_exact: boo
     """What differs between two results of `training`.
 
     Args:
-        is_exact: False compares losses with a tolerance, and neither gradients nor counts.
+        is_exact: False compares the first value of every loss with a tolerance, and no counts.
     """
     if old["key"] != new["key"]:
         yield f"ten steps: key {old['key']} became {new['key']}"
@@ -213,7 +214,7 @@ def training_differences(old: dict[str, Any], new: dict[str, Any], is_exact: boo
             yield f"{part} was logged {len(before)} times, now {len(after)} times"
             continue
         for number, pair in enumerate(zip(before, after, strict=True), 1):
-            if not (pair[0] == pair[1] if is_exact else is_close(part, *pair)):
+            if pair[0] != pair[1] and (is_exact or not is_rounding(part, number, *pair)):
                 first, other = map(float.fromhex, pair)
                 yield f"{part} differs from value {number}: {first:.9g} became {other:.9g}"
                 break
@@ -223,19 +224,20 @@ def training_differences(old: dict[str, Any], new: dict[str, Any], is_exact: boo
             yield f"{name} differs"
 
 
-def is_close(part: str, old: str, new: str) -> bool:
-    """Whether a value agrees as far as it does between two kinds of machine."""
+def is_rounding(part: str, number: int, old: str, new: str) -> bool:
+    """Whether two kinds of machine may differ so in a logged value, counted from 1."""
+    if number > 1 or not part.startswith("loss"):
+        return True
     first, other = float.fromhex(old), float.fromhex(new)
-    return not part.startswith("loss") or math.isclose(
-        first, other, rel_tol=REL_TOL, abs_tol=ABS_TOL
-    )
+    return math.isclose(first, other, rel_tol=REL_TOL, abs_tol=ABS_TOL)
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> int:
     """Print one line per experiment; the number of experiments that differ."""
     is_exact = old["machine"] == new["machine"]
     if not is_exact:
-        print(f"Losses within {REL_TOL:g}, no counts: {old['machine']}, {new['machine']}")
+        print(f"Two kinds of machine: {old['machine']}, {new['machine']}.")
+        print(f"First losses are compared within {REL_TOL:g}, later ones and counts are not.")
     differing = 0
     for name in sorted(old["experiments"].keys() | new["experiments"].keys()):
         if not (name in old["experiments"] and name in new["experiments"]):
