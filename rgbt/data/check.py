@@ -17,9 +17,9 @@ from rich.table import Table
 
 from rgbt.config.command import command
 from rgbt.config.schema import build
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.report.dataset import check_dataset, layout_of, num_listed
 from rgbt.data.report.values import Report, SplitReport
+from rgbt.dataset import LabelledDataset
 
 WIDTH_WITHOUT_TERMINAL = 120
 

@@ -18,11 +18,11 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_counts, read_label, read_label_array, within
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
 from rgbt.data.integrity import is_there
+from rgbt.data.named_files import check_lengths
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 

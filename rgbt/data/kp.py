@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
@@ -23,6 +22,7 @@ from rgbt.data.kp_names import FORM, MODALITY, NAME, SPLITS, TIMES, parts_of, se
 from rgbt.data.kp_names import is_night as is_night
 from rgbt.data.kp_names import sets_of as sets_of
 from rgbt.data.named_files import (
+    check_lengths,
     hash_of_files,
     names_in,
     root_nearby,

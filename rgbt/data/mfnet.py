@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label, read_thermal, within
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
-from rgbt.data.named_files import hash_of_files, with_label
+from rgbt.data.named_files import check_lengths, hash_of_files, with_label
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 

@@ -97,6 +97,18 @@ def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
     return next(filter(is_one, (root.absolute().parent, *sorted(root.iterdir()))), None)
 
 
+def check_lengths(
+    num_classes: int, classes: tuple[str, ...], palette: tuple[tuple[int, int, int], ...]
+) -> None:
+    """Refuse names or colours that are not one per class, naming the key."""
+    for key, length in (("classes", len(classes)), ("palette", len(palette))):
+        if length != num_classes:
+            raise InputError(
+                f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                "make them agree."
+            )
+
+
 def _size(path: Path) -> int:
     # A name that leads through a file instead of a folder is missing as well.
     try:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.cache.dataset import Decoded
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.files import read_array
 from rgbt.data.mfnet import MFNet
+from rgbt.dataset import LabelledDataset, reader_of
 
 FOLDER = "next"
 
@@ -38,7 +37,7 @@ class NextFrames:
     """
 
     def __init__(self, first: LabelledDataset) -> None:
-        first = first.source if isinstance(first, Decoded) else first
+        first = reader_of(first)
         if not isinstance(first, MFNet):
             raise InputError(
                 f"{first.name} ({first.root}) cannot hold second frames: they are read in MFNet's "

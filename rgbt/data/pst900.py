@@ -16,12 +16,12 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
 from rgbt.data.named_files import (
+    check_lengths,
     hash_of_files,
     names_in,
     root_nearby,

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.cache.dataset import Decoded
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.images import Images, ReadsPairs
 from rgbt.data.new_images import find_pairs
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
 
 ENDINGS = (".png", "_overlay.png")
@@ -77,10 +76,10 @@ class ToPredict:
 
 
 def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
-    """The images of a split; labels are not read where the data set can leave them."""
+    """The images of a split; labels are not read if the data set can read pairs alone."""
     names = dataset.names(split)
-    plain = _plain(dataset)
-    read = plain.pair if isinstance(plain, ReadsPairs) else plain.read
+    reader = reader_of(dataset)
+    read = reader.pair if isinstance(reader, ReadsPairs) else reader.read
     folders = {path.parent for name in names for path in dataset.files(name)}
     return ToPredict(names, read, frozenset(folders))
 
@@ -135,16 +134,11 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
 
 def images_of(dataset: LabelledDataset) -> Images:
     """How a data set reads images that are in no split; InputError where it does not say."""
-    plain = _plain(dataset)
-    if not isinstance(plain, ReadsPairs):
+    reader = reader_of(dataset)
+    if not isinstance(reader, ReadsPairs):
         raise InputError(
-            f"{type(plain).__name__} does not say how new images are read; name one of its splits "
-            f"({', '.join(plain.splits)}), or give it `images` and `pair` "
+            f"{type(reader).__name__} does not say how new images are read; name one of its splits "
+            f"({', '.join(reader.splits)}), or give it `images` and `pair` "
             "(docs/extending.md, data set)."
         )
-    return plain.images
-
-
-def _plain(dataset: LabelledDataset) -> LabelledDataset:
-    """The data set without the cache before it, which holds splits alone."""
-    return dataset.source if isinstance(dataset, Decoded) else dataset
+    return reader.images

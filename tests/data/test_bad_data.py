@@ -20,12 +20,12 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.kp import KP
 from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
 from rgbt.data.report.dataset import check_dataset
+from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.conftest import write_data
 from tests.data import folder_files, freiburg_files, kp_files, pst900_files

@@ -9,10 +9,10 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.data import freiburg
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.freiburg import CLASSES, CROP, PALETTE, THERMAL_RANGE, Freiburg
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
+from rgbt.dataset import LabelledDataset
 from tests.conftest import write_png
 from tests.data import freiburg_files as files
 from tests.data.freiburg_files import reader, write_freiburg

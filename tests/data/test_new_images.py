@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.data.cache.dataset import Decoded
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.freiburg_images import FreiburgImages
 from rgbt.data.images import PairPattern
 from rgbt.data.kp import KP
@@ -220,7 +220,7 @@ def test_a_split_is_predicted_without_its_labels(write_mfnet: WriteMFNet, tmp_pa
     root = write_mfnet({"new": ["00001D"]})
     (root / "labels" / "00001D.png").unlink()
     dataset = MFNet(str(root), splits={"new": "new.txt"})
-    for each in (dataset, Decoded(dataset, tmp_path / "cache", num_threads=1)):
+    for each in (dataset, CachedDataset(dataset, tmp_path / "cache", num_threads=1)):
         (sample,) = of_split(each, "new").samples("raise")
         assert sample.label is None
 

@@ -60,7 +60,7 @@ def test_labels_and_confidences_are_read(folder: Path) -> None:
 
 
 def test_folders_that_cannot_be_used_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not there"):
+    with pytest.raises(InputError, match="does not exist"):
         PseudoLabels(tmp_path / "nowhere")
     say(folder, format="rgbt pseudo-labels 9")
     with pytest.raises(InputError, match=r"expected the format .* got 'rgbt pseudo-labels 9'"):
@@ -69,7 +69,7 @@ def test_folders_that_cannot_be_used_are_refused(folder: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="is damaged"):
         PseudoLabels(folder)
     (folder / "pseudo_labels.json").unlink()
-    with pytest.raises(InputError, match="is not finished"):
+    with pytest.raises(InputError, match="is not complete"):
         PseudoLabels(folder)
 
 

@@ -19,7 +19,6 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import within
 from rgbt.data.folder.frames import Frame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.images import FolderImages
@@ -35,7 +34,7 @@ from rgbt.data.folder.values import (
 )
 from rgbt.data.images import PairPattern
 from rgbt.data.integrity import is_there
-from rgbt.data.named_files import hash_of_files, with_label
+from rgbt.data.named_files import check_lengths, hash_of_files, with_label
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 from rgbt.types import Sample
 

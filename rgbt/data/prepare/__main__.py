@@ -22,7 +22,6 @@ from rich.progress import Progress
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.check import print_report
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
@@ -32,6 +31,7 @@ from rgbt.data.prepare.plans import Given, plan_freiburg, plan_mfnet, plan_pst90
 from rgbt.data.prepare.source import Source
 from rgbt.data.pst900 import PST900
 from rgbt.data.report.dataset import check_dataset, num_listed
+from rgbt.dataset import LabelledDataset
 
 OWN = {"dataset": None, "source": None, "out": None, "labels": "", "lists": ""}
 OPTIONAL = ("labels", "lists")

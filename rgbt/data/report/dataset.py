@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from rgbt.checks import InputError
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
@@ -27,6 +26,7 @@ from rgbt.data.report.kp import KPLayout
 from rgbt.data.report.mfnet import MFNetLayout
 from rgbt.data.report.pst900 import PST900Layout
 from rgbt.data.report.values import Counts, Layout, Lists, Report, SplitReport, Thermal
+from rgbt.dataset import LabelledDataset
 from rgbt.types import IGNORE
 
 
