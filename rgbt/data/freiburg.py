@@ -23,6 +23,8 @@ from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
 from rgbt.data.integrity import is_there
 from rgbt.data.named_files import check_lengths
+from rgbt.data.prepare.freiburg import PREPARATION
+from rgbt.data.report.freiburg import FreiburgChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
@@ -101,6 +103,8 @@ class Freiburg:
         InputError: no such root, neither part in it, a crop, range or class that cannot be, or
             numbers of classes, names and colours that differ.
     """
+
+    preparation = PREPARATION
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -221,6 +225,10 @@ class Freiburg:
             sizes = [_size(path) for path in self.files(name)]
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
+
+    def checks(self) -> FreiburgChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return FreiburgChecks(self)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError where there is no such frame."""

@@ -18,9 +18,18 @@ from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
-from rgbt.data.kp_names import FORM, MODALITY, NAME, SPLITS, TIMES, parts_of, set_of
-from rgbt.data.kp_names import is_night as is_night
-from rgbt.data.kp_names import sets_of as sets_of
+from rgbt.data.kp_layout import (
+    FORM,
+    LABELS_OF,
+    MODALITY,
+    NAME,
+    SPLITS,
+    TIMES,
+    is_night,
+    parts_of,
+    set_of,
+    sets_of,
+)
 from rgbt.data.named_files import (
     check_lengths,
     hash_of_files,
@@ -28,6 +37,8 @@ from rgbt.data.named_files import (
     root_nearby,
     with_label,
 )
+from rgbt.data.prepare.kp import PREPARATION
+from rgbt.data.report.kp import KPChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
@@ -48,9 +59,6 @@ MOST_TINT = 8
 """Grey levels by which the channels of a thermal image may differ at a pixel."""
 
 ADVICE = "use the original file of the folder lwir"
-
-LABELS_OF = {False: "val_day", True: "val_night"}
-"""Folders of MS-UDA by whether they hold nights."""
 
 
 class KP:
@@ -104,6 +112,8 @@ class KP:
         ),
         thermal=partial(read_grey, advice=ADVICE, most_tint=MOST_TINT),
     )
+
+    preparation = PREPARATION
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -225,6 +235,10 @@ class KP:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files."""
         splits = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(splits, self.files)
+
+    def checks(self) -> KPChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return KPChecks(self)
 
     @cached_property
     def has_images(self) -> bool:

@@ -15,14 +15,14 @@ from rgbt.checks import InputError, nearest
 from rgbt.data.files import read_label, read_thermal, within
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
+from rgbt.data.mfnet_layout import FOLDERS, MIRRORED, SPLITS, base_name, either_layout
 from rgbt.data.named_files import check_lengths, hash_of_files, with_label
+from rgbt.data.prepare.mfnet import PREPARATION
+from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
 Layout = Literal["auto", "packed", "folders"]
-
-LAYOUTS = {"packed": ("images", "labels"), "folders": ("RGB", "Thermal", "Label")}
-"""Folders of each layout, beside the split lists; the last one holds the labels."""
 
 CLASSES = (
     *("unlabeled", "car", "person", "bike", "curve"),
@@ -32,14 +32,6 @@ PALETTE = (
     *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
     *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
 )
-SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
-FLIPPED = "_flip"
-"""Ending of the names of mirrored copies, which some copies of the data set write to disk."""
-
-
-def base_name(name: str) -> str:
-    """`name` without the ending of mirrored copies: "00001D_flip" -> "00001D"."""
-    return name.removesuffix(FLIPPED)
 
 
 class MFNet:
@@ -71,11 +63,13 @@ class MFNet:
     images = GreyImages(
         layouts=tuple(
             PairPattern(f"{folders[0]}/{{name}}.png", f"{folders[-2]}/{{name}}.png")
-            for folders in LAYOUTS.values()
+            for folders in FOLDERS.values()
         ),
         thermal=read_thermal,
         packed_advice="dataset.layout=folders for separate images",
     )
+
+    preparation = PREPARATION
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -100,7 +94,7 @@ class MFNet:
         if not self.root.is_dir():
             raise InputError(
                 f"dataset.root: there is no folder '{root}'; give the one that holds "
-                f"{_either_layout()} and the split lists."
+                f"{either_layout()} and the split lists."
             )
         check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
@@ -160,7 +154,7 @@ class MFNet:
         if letter not in ("D", "N"):
             raise InputError(
                 f"'{name}' does not say whether it is day or night: expected a name that ends in D "
-                f"or N (before '{FLIPPED}'); rename it in the split lists of {self.root}."
+                f"or N (before '{MIRRORED}'); rename it in the split lists of {self.root}."
             )
         return letter == "N"
 
@@ -183,6 +177,10 @@ class MFNet:
         listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(listed, self.files)
 
+    def checks(self) -> MFNetChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return MFNetChecks(self)
+
     def list_path(self, split: str) -> Path:
         """The list file of `split`; InputError where the split is unknown."""
         if split not in self.splits:
@@ -193,16 +191,16 @@ class MFNet:
 
     def image_paths(self, name: str) -> tuple[Path, ...]:
         """The packed image of `name`, or its RGB and its thermal image."""
-        *folders, _ = LAYOUTS[self.layout]
+        *folders, _ = FOLDERS[self.layout]
         return tuple(self.root / folder / f"{name}.png" for folder in folders)
 
     def label_path(self, name: str) -> Path:
         """The label of `name`."""
-        return self.root / LAYOUTS[self.layout][-1] / f"{name}.png"
+        return self.root / FOLDERS[self.layout][-1] / f"{name}.png"
 
     def names_on_disk(self) -> frozenset[str]:
         """Names of all PNG files in the folders of images and labels, listed or not."""
-        folders = [self.root / folder for folder in LAYOUTS[self.layout]]
+        folders = [self.root / folder for folder in FOLDERS[self.layout]]
         return frozenset(path.stem for folder in folders for path in folder.glob("*.png"))
 
     def _read_list(self, split: str) -> tuple[str, ...]:
@@ -217,15 +215,11 @@ class MFNet:
 
 def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:
     for layout in ("packed", "folders"):
-        folders_exist = all((root / folder).is_dir() for folder in LAYOUTS[layout])
+        folders_exist = all((root / folder).is_dir() for folder in FOLDERS[layout])
         if wanted in ("auto", layout) and folders_exist:
             return layout
-    expected = _either_layout() if wanted == "auto" else "+".join(LAYOUTS[wanted])
+    expected = either_layout() if wanted == "auto" else "+".join(FOLDERS[wanted])
     raise InputError(
         f"dataset.root: '{root}' does not hold the folders {expected}; give the folder of the "
         "data set itself."
     )
-
-
-def _either_layout() -> str:
-    return " or ".join("+".join(folders) for folders in LAYOUTS.values())

@@ -5,7 +5,6 @@ A reader only: it never resizes, augments or remaps, and it refuses what it cann
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
@@ -27,29 +26,20 @@ from rgbt.data.named_files import (
     root_nearby,
     with_label,
 )
+from rgbt.data.prepare.pst900 import PREPARATION
+from rgbt.data.pst900_layout import FOLDERS, PARTS, SPLITS, bag_of
+from rgbt.data.report.pst900 import PST900Checks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
 CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
 PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
-FOLDERS = ("rgb", "thermal", "labels")
-PARTS = ("train", "test")
-SPLITS = ("train", "val", "test")
-
-BAG = re.compile(r"(?:^|_)bag(\d+)_")
-"""Which recording a picture was taken from: 58_bag21_rect_rgb_frame0000000440 is of bag 21."""
 
 ADVICE = (
     "the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the counts of "
     "the camera and is not read"
 )
-
-
-def bag_of(name: str) -> int | None:
-    """Number of the recording that `name` says; None where it says none."""
-    found = BAG.search(name)
-    return int(found[1]) if found else None
 
 
 class PST900:
@@ -96,6 +86,8 @@ class PST900:
         ),
         thermal=partial(read_grey, advice=ADVICE),
     )
+
+    preparation = PREPARATION
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -230,6 +222,10 @@ class PST900:
                 path for folder in self._folders(name) for path in _files_in(folder, name)
             ],
         )
+
+    def checks(self) -> PST900Checks:
+        """What `rgbt.data.check` checks of this data set."""
+        return PST900Checks(self)
 
     def folders(self) -> tuple[Path, ...]:
         """Every folder that holds rgb, thermal and labels."""

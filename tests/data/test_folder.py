@@ -17,7 +17,7 @@ from rgbt.config.schema import build, check_node
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import grey, label_codes, painted
 from rgbt.data.freiburg_images import _grey_levels
-from rgbt.data.report.dataset import check_dataset, layout_of
+from rgbt.data.report.dataset import check_dataset, checks_of
 from tests.conftest import write_png
 from tests.data.folder_files import (
     CLASSES,
@@ -154,7 +154,7 @@ def test_packed_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sample.thermal, image[..., 3])
     assert dataset.files("train_7") == (tmp_path / "train/7.png", tmp_path / "train/7_mask.png")
     assert dataset.decoding()["packed"]
-    assert layout_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
+    assert checks_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
     write_png(tmp_path / "train" / "7.png", image[..., :3])
     assert "got 3; use the original file, or give dataset.thermal its own pattern" in refused(
         lambda: dataset.read("train_7")

@@ -9,7 +9,7 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.data.kp import CLASSES, KP, PALETTE
-from rgbt.data.kp_names import SPLITS, is_night
+from rgbt.data.kp_layout import SPLITS, is_night
 from tests.conftest import write_png
 from tests.data.kp_files import (
     HW,

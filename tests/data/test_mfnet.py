@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.mfnet import CLASSES, PALETTE, SPLITS, MFNet, base_name
+from rgbt.data.mfnet import CLASSES, PALETTE, MFNet
+from rgbt.data.mfnet_layout import SPLITS, base_name
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))

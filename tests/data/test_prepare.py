@@ -15,15 +15,16 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
-from rgbt.data.kp_names import SPLITS
+from rgbt.data.kp_layout import SPLITS
 from rgbt.data.mfnet import MFNet
 from rgbt.data.prepare import __main__ as prepare
 from rgbt.data.prepare import copying as prepare_copy
 from rgbt.data.prepare.__main__ import main
+from rgbt.data.prepare.download import SourceFile, SourceFiles
 from rgbt.data.prepare.kp import plan_kp
-from rgbt.data.prepare.plans import Given
-from rgbt.data.prepare.source import Entry, Source
+from rgbt.data.prepare.plans import Download
 from rgbt.data.pst900 import PST900
 from tests.conftest import write_data, write_png
 from tests.data import freiburg_files, kp_files, pst900_files
@@ -55,6 +56,21 @@ def zipped(folder: Path, archive: Path, top: str = "") -> Path:
 
 def state(root: Path) -> dict[str, tuple[int, bytes]]:
     return {p: ((root / p).stat().st_mtime_ns, (root / p).read_bytes()) for p in files_in(root)}
+
+
+@pytest.fixture
+def small_freiburg(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader of the images of the tests, which are smaller than those of Freiburg."""
+
+    def read(root: str) -> Freiburg:
+        return freiburg_files.reader(Path(root))
+
+    read.preparation = Freiburg.preparation  # type: ignore[attr-defined]
+    monkeypatch.setattr(prepare, "preparable", lambda: {"freiburg": read})
+
+
+def test_preparable_data_sets_are_those_that_declare_it() -> None:
+    assert set(prepare.preparable()) == {"freiburg", "kp", "mfnet", "pst900"}
 
 
 @pytest.fixture
@@ -291,7 +307,7 @@ def test_lists_of_kp_are_those_of_the_release(tmp_path: Path) -> None:
         for n in (published / f"{s}.txt").read_text().split()
     ]
     assert len(names) == 950
-    source = Source.__new__(Source)
+    source = SourceFiles.__new__(SourceFiles)
     source.path, source.key = tmp_path, "source"
     paths = [f"labels/{name}.png" for name in names]
     paths += [
@@ -299,8 +315,8 @@ def test_lists_of_kp_are_those_of_the_release(tmp_path: Path) -> None:
         for name in names
         for kind in ("visible", "lwir")
     ]
-    source.entries = {path: Entry(path, 1, tmp_path / path) for path in paths}
-    items = {item.target: item.content for item in plan_kp(Given(source))}
+    source.entries = {path: SourceFile(path, 1, tmp_path / path) for path in paths}
+    items = {item.target: item.content for item in plan_kp(Download(source))}
     assert len(items) == 3 * 950 + 9
     for path in sorted(published.glob("*.txt")):
         assert items[path.name].split() == path.read_bytes().split()
@@ -308,7 +324,7 @@ def test_lists_of_kp_are_those_of_the_release(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["zips", "zips without a folder in them", "folders"])
-def test_freiburg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) -> None:
+def test_freiburg(tmp_path: Path, small_freiburg: None, form: str) -> None:
     root = freiburg_files.write_freiburg(tmp_path / "in")
     shutil.copytree(
         root / "train" / "seq_00_day" / "00" / "fl_rgb",
@@ -320,8 +336,6 @@ def test_freiburg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) ->
         for part in ("train", "test"):
             top = part if form == "zips" else ""
             zipped(root / part, source / f"{part}.zip", top)
-    reads = lambda out: freiburg_files.reader(Path(out))  # noqa: E731
-    monkeypatch.setitem(prepare.KINDS, "freiburg", prepare.KINDS["freiburg"]._replace(reads=reads))
     out = tmp_path / "out"
     assert call("freiburg", source, out) == 0
     made = freiburg_files.reader(out)
@@ -334,12 +348,10 @@ def test_freiburg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) ->
                 np.testing.assert_array_equal(made.label(name), expected.label(name))
 
 
-def test_freiburg_in_other_capitals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_freiburg_in_other_capitals(tmp_path: Path, small_freiburg: None) -> None:
     freiburg_files.write_test(
         tmp_path / "in", "day", "157_0010", folders=("ImagesRgb", "ImagesIr", "SegmentationClass")
     )
-    reads = lambda out: freiburg_files.reader(Path(out))  # noqa: E731
-    monkeypatch.setitem(prepare.KINDS, "freiburg", prepare.KINDS["freiburg"]._replace(reads=reads))
     call("freiburg", zipped(tmp_path / "in" / "test", tmp_path / "test.zip"), tmp_path / "out")
     assert len(freiburg_files.reader(tmp_path / "out").names("test")) == 1
     with pytest.raises(InputError, match=r"holds neither train/seq_\*/\*/fl_rgb nor"):
@@ -546,7 +558,7 @@ def test_links_in_an_archive_are_left_out(tmp_path: Path) -> None:
         writer.writestr("__MACOSX/._x.png", b"1")
         writer.writestr("train/.DS_Store", b"1")
         writer.writestr("train/x.png", b"1")
-    with Source(tmp_path / "a.zip", "source") as source:
+    with SourceFiles(tmp_path / "a.zip", "source") as source:
         assert list(source.entries) == ["a/train/x.png"]
         assert source.folders() == {"", "a", "a/train"}
 
@@ -555,7 +567,7 @@ def test_links_in_a_folder_are_copied_as_files(mfnet: Path, tmp_path: Path) -> N
     shutil.move(mfnet / "images", tmp_path / "elsewhere")
     (mfnet / "images").symlink_to(tmp_path / "elsewhere")
     (mfnet / "loop").symlink_to(mfnet)
-    with Source(mfnet, "source") as source:
+    with SourceFiles(mfnet, "source") as source:
         assert source.folders() == {"", "images", "labels"}
     assert call("mfnet", mfnet, tmp_path / "out") == 0
     assert files_in(tmp_path / "out") == MF_OUT
@@ -565,10 +577,10 @@ def test_links_in_a_folder_are_copied_as_files(mfnet: Path, tmp_path: Path) -> N
 def test_files_come_before_those_of_an_archive_beside_them(mfnet: Path, tmp_path: Path) -> None:
     archive = zipped(mfnet, mfnet.parent / "ir_seg_dataset.zip", "ir_seg_dataset")
     (mfnet / "train.txt").write_text("00001D\n")
-    with Source(mfnet.parent, "source", r"ir_seg_dataset\.zip") as source:
+    with SourceFiles(mfnet.parent, "source", r"ir_seg_dataset\.zip") as source:
         assert source.entries["ir_seg_dataset/train.txt"].lines() == ("00001D",)
         assert len(source.entries) == len(files_in(mfnet)) + 1
-    with Source(archive, "source") as source:
+    with SourceFiles(archive, "source") as source:
         assert source.entries["ir_seg_dataset/train.txt"].lines() == tuple(MF["train"])
 
 
@@ -614,7 +626,7 @@ def test_words_that_mean_nothing(mfnet: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(InputError, match=r"dataset: 'mfnt' is not a choice; did you mean 'mfnet'"):
         call("mfnt", mfnet, out)
-    with pytest.raises(InputError, match=r"labels has no meaning for dataset=mfnet"):
+    with pytest.raises(InputError, match=r"labels has no effect for dataset=mfnet"):
         call("mfnet", mfnet, out, labels=mfnet)
     with pytest.raises(InputError, match=r"lists has no meaning for dataset=pst900"):
         call("pst900", mfnet, out, lists=mfnet)

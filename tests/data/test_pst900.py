@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.pst900 import CLASSES, PALETTE, PST900, bag_of
+from rgbt.data.pst900 import CLASSES, PALETTE, PST900
+from rgbt.data.pst900_layout import bag_of
 from tests.conftest import write_png
 from tests.data.pst900_files import (
     HW,

@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.compose import compose, conf_dir
 from rgbt.config.schema import build, check_node
-from rgbt.data.kp import CLASSES, KP, set_of
+from rgbt.data.kp import CLASSES, KP
+from rgbt.data.kp_layout import set_of
 from rgbt.data.synth import kp, people
 from rgbt.data.synth.classes import ids_in
 from rgbt.data.synth.factors import SceneFactors

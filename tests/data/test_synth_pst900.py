@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.compose import compose, conf_dir
 from rgbt.config.schema import build, check_node
-from rgbt.data.pst900 import CLASSES, PST900, bag_of
+from rgbt.data.pst900 import CLASSES, PST900
+from rgbt.data.pst900_layout import bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.pst900 import cached, synth_pst900

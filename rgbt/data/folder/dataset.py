@@ -35,6 +35,7 @@ from rgbt.data.folder.values import (
 from rgbt.data.images import PairPattern
 from rgbt.data.integrity import is_there
 from rgbt.data.named_files import check_lengths, hash_of_files, with_label
+from rgbt.data.report.folder import FolderChecks
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 from rgbt.types import Sample
 
@@ -229,6 +230,10 @@ class Folder:
         meaning = json.dumps([sorted(self.codes.codes.items()), self.codes.of_colours])
         files = hash_of_files(listed, self.files)
         return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
+
+    def checks(self) -> FolderChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return FolderChecks(self)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError where there is no such frame."""

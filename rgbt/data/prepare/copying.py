@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError
-from rgbt.data.prepare.source import Entry
+from rgbt.data.prepare.download import SourceFile
 from rgbt.files.budgets import read_json
 
 PLAN = ".prepare.json"
@@ -34,7 +34,7 @@ class Item(NamedTuple):
     """
 
     target: str
-    content: Entry | bytes
+    content: SourceFile | bytes
 
     @property
     def size(self) -> int:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import plain
 from rgbt.data.report.lists import listed_twice, shared
-from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalCounts
+
+if TYPE_CHECKING:
+    from rgbt.data.folder.dataset import Folder
 
 MOST_CLIPPED = 0.5
 """Share of the thermal values of a split that may lie outside the range that is read."""
@@ -24,8 +26,8 @@ class _Clipped(NamedTuple):
     highest: float
 
 
-class FolderLayout:
-    """See `rgbt.data.report.values.Layout`."""
+class FolderChecks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: Folder) -> None:
         self.dataset = dataset
@@ -42,12 +44,12 @@ class FolderLayout:
         """Parts of a split by time of day need not be there."""
         return split.endswith(("_day", "_night"))
 
-    def times(self, names: tuple[str, ...]) -> Times:
+    def times(self, names: tuple[str, ...]) -> DayNight:
         """By `dataset.night`; none where it is not given."""
         nights = self.dataset.nights(names)
-        return Times(0, 0) if nights is None else Times(len(names) - sum(nights), sum(nights))
+        return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
 
-    def thermal(self, name: str) -> Thermal | None:
+    def thermal(self, name: str) -> ThermalCounts | None:
         """Values before they are grey levels; None where they are grey levels already."""
         limits = self.dataset.thermal_range
         if limits is None:
@@ -59,7 +61,7 @@ class FolderLayout:
         )
         lowest, highest = (float(end(filled)) if filled.size else 0.0 for end in (np.min, np.max))
         self._clipped[name] = _Clipped(filled.size, below + above, lowest, highest)
-        return Thermal(
+        return ThermalCounts(
             pixels=values.size,
             empty=values.size - filled.size,
             below=below,
@@ -68,7 +70,7 @@ class FolderLayout:
             highest=int(np.ceil(highest)),
         )
 
-    def problems(self, lists: Lists) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:
         """Names given twice, files that no RGB image goes with, a range that misses the values."""
         splits = self.dataset.splits
         return [
@@ -99,7 +101,7 @@ class FolderLayout:
             f"split, the first is {unused[0]}."
         ]
 
-    def _missed(self, lists: Lists) -> list[str]:
+    def _missed(self, lists: SplitNames) -> list[str]:
         problems = []
         for split, names in lists.items():
             read = [self._clipped[name] for name in set(names) if name in self._clipped]

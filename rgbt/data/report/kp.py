@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from rgbt.data.kp import KP
-from rgbt.data.kp_names import NAME, TIMES, is_night, set_of
+from typing import TYPE_CHECKING
+
+from rgbt.data.kp_layout import NAME, TIMES, is_night, set_of
 from rgbt.data.report.lists import listed_twice, other_sizes, other_times, shared
-from rgbt.data.report.values import Lists, SplitReport, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport
+
+if TYPE_CHECKING:
+    from rgbt.data.kp import KP
 
 OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 """Day and night images of each split of the CRM release: 499, 140 and 311."""
@@ -13,8 +17,8 @@ OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 HW = (512, 640)
 
 
-class KPLayout:
-    """See `rgbt.data.report.values.Layout`."""
+class KPChecks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: KP) -> None:
         self.dataset = dataset
@@ -30,15 +34,15 @@ class KPLayout:
         """Splits by time of day only repeat names of others."""
         return split.endswith(("_day", "_night"))
 
-    def times(self, names: tuple[str, ...]) -> Times:
+    def times(self, names: tuple[str, ...]) -> DayNight:
         """By the sets."""
         nights = sum(self.dataset.nights(names))
-        return Times(len(names) - nights, nights)
+        return DayNight(len(names) - nights, nights)
 
     def thermal(self, name: str) -> None:
         """Thermal images come as grey levels."""
 
-    def problems(self, lists: Lists) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice, in two splits or at the wrong time; labels that are in no split."""
         return [
             *listed_twice(lists),
@@ -84,7 +88,7 @@ class KPLayout:
         sets = {set_of(name) for name in self.dataset.names("train")} if is_divided else set()
         return not sets.isdisjoint({6, 7, 8})
 
-    def _unlisted(self, lists: Lists) -> list[str]:
+    def _unlisted(self, lists: SplitNames) -> list[str]:
         listed = set().union(*lists.values())
         unlisted = [name for name in self.dataset.labels_on_disk if name not in listed]
         strange = [name for name in unlisted if NAME.fullmatch(name) is None]
@@ -103,7 +107,7 @@ class KPLayout:
         return problems
 
 
-def _wrong_times(lists: Lists) -> list[str]:
+def _wrong_times(lists: SplitNames) -> list[str]:
     problems = []
     for split, names in lists.items():
         time = split.rpartition("_")[2]
@@ -116,7 +120,7 @@ def _wrong_times(lists: Lists) -> list[str]:
     return problems
 
 
-def _lists_that_disagree(lists: Lists) -> list[str]:
+def _lists_that_disagree(lists: SplitNames) -> list[str]:
     """Where all three are listed, a split is its day and its night."""
     problems = []
     for split, names in lists.items():

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from itertools import combinations
 
-from rgbt.data.report.values import Lists, SplitReport
+from rgbt.data.report.values import SplitNames, SplitReport
 
 
-def listed_twice(lists: Lists) -> list[str]:
+def listed_twice(lists: SplitNames) -> list[str]:
     """Names that one split lists several times."""
     return [
         f"split {split} lists '{name}' {count} times."
@@ -19,7 +19,9 @@ def listed_twice(lists: Lists) -> list[str]:
     ]
 
 
-def shared(lists: Lists, may_share: Callable[[str, str], bool] = lambda *_: False) -> list[str]:
+def shared(
+    lists: SplitNames, may_share: Callable[[str, str], bool] = lambda *_: False
+) -> list[str]:
     """Names in two splits, unless one is a part of the other by name.
 
     Args:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.kp import is_night as is_night_name
-from rgbt.data.kp import sets_of
+from rgbt.data.kp_layout import is_night as is_night_name
+from rgbt.data.kp_layout import sets_of
 from rgbt.data.synth.kp_classes import class_ids
 from rgbt.data.synth.light import is_night
 from rgbt.data.synth.scene import render_scene

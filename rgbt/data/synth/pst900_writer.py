@@ -13,7 +13,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from rgbt.data.pst900 import CLASSES, FOLDERS, PARTS
+from rgbt.data.pst900 import CLASSES
+from rgbt.data.pst900_layout import FOLDERS, PARTS
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.shapes import BUMP, CAR_STOP, COLOR_CONE, PERSON
 from rgbt.data.synth.writer import Plan, write_each, write_png

@@ -28,7 +28,7 @@ ENCRYPTED = 1
 
 
 @dataclass(frozen=True)
-class Entry:
+class SourceFile:
     """A file of the download.
 
     Attributes:
@@ -72,7 +72,7 @@ class Entry:
         return archive.open(self.member)  # type: ignore[return-value]
 
 
-class Source:
+class SourceFiles:
     """Everything that a download holds, listed once. A context: archives are closed at its end.
 
     Hidden files and what archivers of other systems leave (__MACOSX) are left out. A file that lies
@@ -97,7 +97,7 @@ class Source:
         self.path = path
         self.key = key
         self._opened = ExitStack()
-        found: dict[str, Entry] = {}
+        found: dict[str, SourceFile] = {}
         if path.is_dir():
             self._add_folder(path, re.compile(archives, re.IGNORECASE), found)
         elif path.is_file():
@@ -109,7 +109,7 @@ class Source:
             )
         self.entries = dict(sorted(found.items()))
 
-    def __enter__(self) -> Source:
+    def __enter__(self) -> SourceFiles:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -120,12 +120,14 @@ class Source:
         parents = {parent for path in self.entries for parent in PurePosixPath(path).parents}
         return frozenset("" if str(parent) == "." else str(parent) for parent in parents)
 
-    def _add_folder(self, root: Path, archives: re.Pattern[str], found: dict[str, Entry]) -> None:
+    def _add_folder(
+        self, root: Path, archives: re.Pattern[str], found: dict[str, SourceFile]
+    ) -> None:
         packed = []
         try:
             for file in _files(root):
                 relative = file.relative_to(root).as_posix()
-                found[relative] = Entry(relative, file.stat().st_size, file)
+                found[relative] = SourceFile(relative, file.stat().st_size, file)
                 if archives.fullmatch(file.name):
                     packed.append(file)
         except OSError as error:
@@ -137,7 +139,7 @@ class Source:
             inside = file.relative_to(root).parent.as_posix()
             self._add_archive(file, "" if inside == "." else f"{inside}/", found)
 
-    def _add_archive(self, file: Path, place: str, found: dict[str, Entry]) -> None:
+    def _add_archive(self, file: Path, place: str, found: dict[str, SourceFile]) -> None:
         """List an archive as if it were unpacked into `place`, into a folder of its own name."""
         try:
             archive = self._opened.enter_context(zipfile.ZipFile(file))
@@ -153,7 +155,7 @@ class Source:
         for path, member in paths.items():
             is_link = stat.S_ISLNK(member.external_attr >> 16)
             if not (member.is_dir() or is_link or _is_hidden(path)):
-                entry = Entry(own + path, member.file_size, file, archive, member.filename)
+                entry = SourceFile(own + path, member.file_size, file, archive, member.filename)
                 found.setdefault(entry.path, entry)
 
     def _checked(self, member: zipfile.ZipInfo, file: Path) -> str:
