@@ -108,7 +108,7 @@ def _check_label(returned: str, label: np.ndarray, num_classes: int) -> None:
 
 
 def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) -> None:
-    """Refuse a transform whose examples are not those of `rgbt.data.batches.Example`.
+    """Refuse a transform whose examples are not those of `rgbt.data.batches.TransformedSample`.
 
     Raises:
         InputError: naming the method and what it returned.

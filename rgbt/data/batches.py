@@ -27,7 +27,7 @@ class Dataset(Protocol):
         ...
 
 
-class Example(Protocol):
+class TransformedSample(Protocol):
     """A sample after the transform (see `rgbt.transforms.example.Example`)."""
 
     @property
@@ -74,11 +74,11 @@ class Example(Protocol):
 class Transform(Protocol):
     """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
 
-    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+    def train(self, sample: Sample, rng: np.random.Generator) -> TransformedSample:
         """Augmented example; every draw comes from `rng`."""
         ...
 
-    def test(self, sample: Sample) -> Example:
+    def test(self, sample: Sample) -> TransformedSample:
         """Example for evaluation, the same every time."""
         ...
 
@@ -100,7 +100,7 @@ class BatchTransform(Protocol):
         ...
 
 
-def collate(examples: Sequence[Example], advice: str = "") -> Batch:
+def collate(examples: Sequence[TransformedSample], advice: str = "") -> Batch:
     """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
 
     Args:
@@ -129,7 +129,7 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     )
 
 
-def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
+def _confidences(examples: Sequence[TransformedSample]) -> list[NDArray[np.float32]]:
     """Those of all examples, or none."""
     found = [each.confidence for each in examples if each.confidence is not None]
     if 0 < len(found) < len(examples):
@@ -145,7 +145,7 @@ def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
     return found
 
 
-def _check_sizes(examples: Sequence[Example], advice: str) -> None:
+def _check_sizes(examples: Sequence[TransformedSample], advice: str) -> None:
     first = examples[0]
     for example in examples[1:]:
         for what in ("rgb", "label"):

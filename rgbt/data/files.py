@@ -23,7 +23,7 @@ from rgbt.files.budgets import check_array
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
-Counts = NDArray[np.uint16]
+CountImage = NDArray[np.uint16]
 
 
 def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
@@ -66,7 +66,7 @@ def read_thermal(path: Path) -> Array:
     return one_channel(_decode(path), path)
 
 
-def read_counts(path: Path) -> Counts:
+def read_counts(path: Path) -> CountImage:
     """Counts of a thermal camera, (H, W) uint16, at their full depth.
 
     Raises:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.files import read_counts, read_label, read_label_array, within
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
-from rgbt.data.freiburg_layout import Frame, find_frames, inside
+from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
 from rgbt.data.integrity import is_there
 from rgbt.data.named_files import check_lengths
 from rgbt.data.prepare.freiburg import PREPARATION
@@ -49,7 +49,7 @@ SPLITS = {
 CROP = (5, 645, 360, 1640)
 THERMAL_RANGE = (21800, 23700)
 Count = Annotated[int, Interval(ge=0, lt=2**16)]
-Counts = tuple[Count, Count]
+CountRange = tuple[Count, Count]
 Edge = Annotated[int, Interval(ge=0, le=8192)]
 Crop = tuple[Edge, Edge, Edge, Edge]
 
@@ -116,7 +116,7 @@ class Freiburg:
         palette: tuple[Colour, ...] = PALETTE,
         unscored: Names = ("background", "ignore"),
         crop: Crop | None = CROP,
-        thermal_range: Counts = THERMAL_RANGE,
+        thermal_range: CountRange = THERMAL_RANGE,
         ignored_test: Names = ("ignore",),
         val_sequences: Names = ("seq_04_day",),
     ) -> None:
@@ -131,7 +131,7 @@ class Freiburg:
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences
         self.splits = SPLITS
-        self._split_frames: dict[str, tuple[Frame, ...]] = {}
+        self._split_frames: dict[str, tuple[FreiburgFrame, ...]] = {}
         _check_root(self.root, root)
         check_lengths(num_classes, classes, palette)
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
@@ -230,27 +230,27 @@ class Freiburg:
         """What `rgbt.data.check` checks of this data set."""
         return FreiburgChecks(self)
 
-    def frame(self, name: str) -> Frame:
+    def frame(self, name: str) -> FreiburgFrame:
         """The files of `name`; InputError where there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self._frames[name]
 
     @cached_property
-    def frames(self) -> tuple[Frame, ...]:
+    def frames(self) -> tuple[FreiburgFrame, ...]:
         """Every frame, listed once: later changes of the folder are not seen."""
         return find_frames(self.root)
 
     @cached_property
-    def _frames(self) -> dict[str, Frame]:
+    def _frames(self) -> dict[str, FreiburgFrame]:
         return {frame.name: frame for frame in self.frames}
 
-    def _of(self, split: str) -> tuple[Frame, ...]:
+    def _of(self, split: str) -> tuple[FreiburgFrame, ...]:
         if split not in self._split_frames:
             self._split_frames[split] = self._select(split)
         return self._split_frames[split]
 
-    def _select(self, split: str) -> tuple[Frame, ...]:
+    def _select(self, split: str) -> tuple[FreiburgFrame, ...]:
         if split not in self.splits:
             raise InputError(
                 f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
@@ -263,7 +263,7 @@ class Freiburg:
             if self._place(frame) == place and time in ("", "night" if frame.night else "day")
         )
 
-    def _place(self, frame: Frame) -> str:
+    def _place(self, frame: FreiburgFrame) -> str:
         if frame.is_test:
             return "test"
         held_out = not frame.night and not set(frame.sequences).isdisjoint(self.val_sequences)
@@ -290,7 +290,7 @@ class Freiburg:
             f"{self.root}; {hint}."
         )
 
-    def _image_paths(self, frame: Frame) -> tuple[Path, Path]:
+    def _image_paths(self, frame: FreiburgFrame) -> tuple[Path, Path]:
         if not is_there(frame.thermal):
             raise InputError(
                 f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
@@ -298,7 +298,7 @@ class Freiburg:
             )
         return within(frame.rgb, self.root), within(frame.thermal, self.root)
 
-    def _label(self, frame: Frame, hw: tuple[int, ...]) -> Array:
+    def _label(self, frame: FreiburgFrame, hw: tuple[int, ...]) -> Array:
         """The label at the size of the frame, at the nearest pixel."""
         assert frame.label is not None, "only frames with a label are asked for it"
         if not is_there(frame.label):

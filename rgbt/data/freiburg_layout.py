@@ -15,7 +15,7 @@ TEST_RGB, TEST_THERMAL, TEST_LABEL = "ImagesRGB", "ImagesIR", "SegmentationClass
 """Folders of the test part; copies spell them differently, so capitals do not count."""
 
 
-class Frame(NamedTuple):
+class FreiburgFrame(NamedTuple):
     """One pair of images and its label.
 
     Attributes:
@@ -48,7 +48,7 @@ class Frame(NamedTuple):
         return sequence, "/".join([sequence, *piece])
 
 
-def find_frames(root: Path) -> tuple[Frame, ...]:
+def find_frames(root: Path) -> tuple[FreiburgFrame, ...]:
     """Every frame of which there is an RGB image: training sequences, test by day, test by night.
 
     In a folder frames are sorted by file name, so that the order is the same everywhere.
@@ -71,7 +71,7 @@ def find_frames(root: Path) -> tuple[Frame, ...]:
     return tuple(frames)
 
 
-def unused_files(root: Path, frames: tuple[Frame, ...]) -> tuple[Path, ...]:
+def unused_files(root: Path, frames: tuple[FreiburgFrame, ...]) -> tuple[Path, ...]:
     """Thermal images and labels that no frame of `find_frames` names, sorted."""
     used = {path for frame in frames for path in (frame.thermal, frame.label)}
     train, test = inside(root, "train"), inside(root, "test")
@@ -111,7 +111,7 @@ def _pieces(train: Path) -> Iterator[Path]:
         yield from _folders(sequence)
 
 
-def _training(train: Path) -> Iterator[Frame]:
+def _training(train: Path) -> Iterator[FreiburgFrame]:
     for piece in _pieces(train):
         sequence = piece.parent.name
         night = _at_night(piece.parent)
@@ -120,7 +120,7 @@ def _training(train: Path) -> Iterator[Frame]:
             stamp = rgb.stem.removeprefix(f"{RGB}_")
             if stamp == rgb.stem:
                 continue
-            yield Frame(
+            yield FreiburgFrame(
                 name=f"{sequence}_{piece.name}_{stamp}",
                 part=f"train/{sequence}/{piece.name}",
                 stamp=stamp,
@@ -141,7 +141,7 @@ def _at_night(sequence: Path) -> bool:
     return words == ["night"]
 
 
-def _test(test: Path) -> Iterator[Frame]:
+def _test(test: Path) -> Iterator[FreiburgFrame]:
     for time in ("day", "night"):
         folder = inside(test, time)
         thermals = _by_stamp(inside(folder, TEST_THERMAL), "_ir", ".png")
@@ -159,7 +159,7 @@ def _test(test: Path) -> Iterator[Frame]:
                     "image; remove or rename the wrong one."
                 )
             partners[thermal] = rgb
-            yield Frame(
+            yield FreiburgFrame(
                 name=f"test_{time}_{stamp}",
                 part=f"test/{time}",
                 stamp=stamp,

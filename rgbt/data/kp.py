@@ -42,7 +42,7 @@ from rgbt.data.report.kp import KPChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
-Lists = Literal["auto", "files", "sets"]
+ListSource = Literal["auto", "files", "sets"]
 
 CLASSES = (
     *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic_light", "traffic_sign"),
@@ -127,7 +127,7 @@ class KP:
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         splits: dict[Text, Text] = SPLITS,
-        lists: Lists = "auto",
+        lists: ListSource = "auto",
     ) -> None:
         self.root = Path(root).expanduser()
         self.name = name
@@ -349,7 +349,7 @@ def _check_root(root: Path, given: str) -> None:
         )
 
 
-def _find_lists(root: Path, splits: dict[str, str], wanted: Lists) -> Literal["files", "sets"]:
+def _find_lists(root: Path, splits: dict[str, str], wanted: ListSource) -> Literal["files", "sets"]:
     """Who says what a split is made of; a changed `splits` asks for files."""
     changed = dict(splits) != SPLITS
     if wanted == "sets":

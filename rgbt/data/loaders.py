@@ -25,8 +25,8 @@ from rgbt.data.cache.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
-    Loaded,
-    Source,
+    LoadedBatch,
+    SplitReader,
     TrainExamples,
     no_shared_memory,
     start_worker,
@@ -107,7 +107,7 @@ class Batches(Iterator[Kind]):
             # Without one of its own, the loader draws a seed for its workers from the global one.
             generator=torch.Generator(),
         )
-        self._loaded = cast(Iterator[Loaded], _started(loader, settings.num_workers))
+        self._loaded = cast(Iterator[LoadedBatch], _started(loader, settings.num_workers))
 
     def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
@@ -126,7 +126,7 @@ class Batches(Iterator[Kind]):
             if loaded.batch is not None:
                 return cast(Kind, loaded.batch)
 
-    def _wait(self) -> Loaded:
+    def _wait(self) -> LoadedBatch:
         try:
             return next(self._loaded)
         except RuntimeError as error:
@@ -196,7 +196,7 @@ def train_batches(
     """
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
-    source = Source(dataset, names, transform, settings.on_error == "skip")
+    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     if settings.augment == "device":
         work = cast(BatchTransform, transform)
         reader = BatchReader(TrainExamples(source, work.drawn, seed), work.stack)
@@ -219,7 +219,7 @@ def eval_batches(
         settings: evaluation batch size, workers, what to do about unreadable files.
     """
     names = dataset.names(split)
-    source = Source(dataset, names, transform, settings.on_error == "skip")
+    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     return Batches(
         BatchReader(EvalExamples(source), partial(collate, advice=EVAL_ADVICE)),

@@ -22,7 +22,7 @@ from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
-Layout = Literal["auto", "packed", "folders"]
+LayoutName = Literal["auto", "packed", "folders"]
 
 CLASSES = (
     *("unlabeled", "car", "person", "bike", "curve"),
@@ -83,7 +83,7 @@ class MFNet:
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         splits: dict[Text, Text] = SPLITS,
-        layout: Layout = "auto",
+        layout: LayoutName = "auto",
     ) -> None:
         self.root = Path(root).expanduser()
         self.name = name
@@ -213,7 +213,7 @@ class MFNet:
         return read_names(path, f"dataset.splits.{split}")
 
 
-def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:
+def _find_layout(root: Path, wanted: LayoutName) -> Literal["packed", "folders"]:
     for layout in ("packed", "folders"):
         folders_exist = all((root / folder).is_dir() for folder in FOLDERS[layout])
         if wanted in ("auto", layout) and folders_exist:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.data.files import channels, decode
-from rgbt.data.folder.pattern import NO_VALUES, Found, Pattern, Values, in_order, what_is_in
+from rgbt.data.folder.pattern import NO_VALUES, PathMatch, Pattern, WordValues, in_order, what_is_in
 from rgbt.data.images import PairPattern
 
 KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -127,8 +127,8 @@ def _in_tier(folder: Path, layouts: Sequence[PairPattern], *, any_kind: bool) ->
 
 
 def _files(
-    text: str | None, folder: Path, values: Values = NO_VALUES, *, any_kind: bool
-) -> Iterator[Found]:
+    text: str | None, folder: Path, values: WordValues = NO_VALUES, *, any_kind: bool
+) -> Iterator[PathMatch]:
     """Images whose paths match `text`, or match it but for their ending."""
     if text is None:
         return
@@ -138,7 +138,9 @@ def _files(
         yield from Pattern(f"{stem}{dot}{kind}", KEY).files(folder, values, any_case=True)
 
 
-def _partner(layout: PairPattern, folder: Path, values: Values, *, any_kind: bool) -> Path | None:
+def _partner(
+    layout: PairPattern, folder: Path, values: WordValues, *, any_kind: bool
+) -> Path | None:
     """The thermal image of an RGB image; the one whose name is exactly so before all others."""
     exact = Pattern(layout.thermal, KEY).path(folder, values)
     found = {path: None for path, _ in _files(layout.thermal, folder, values, any_kind=any_kind)}

@@ -20,7 +20,7 @@ from torch.utils.data import Dataset as TorchDataset
 from torch.utils.data import get_worker_info
 
 from rgbt.checks import InputError
-from rgbt.data.batches import Dataset, Example, Transform
+from rgbt.data.batches import Dataset, Transform, TransformedSample
 from rgbt.randomness import numpy_generator
 from rgbt.types import Loadable, Sample
 
@@ -38,7 +38,7 @@ LOOK_S = 2.0
 
 
 @dataclass(frozen=True)
-class Source:
+class SplitReader:
     """Samples of one split and what is done to them.
 
     Attributes:
@@ -74,7 +74,7 @@ class TrainExamples:
         seed: run seed.
     """
 
-    source: Source
+    source: SplitReader
     make: Callable[[Sample, np.random.Generator], Any]
     seed: int
 
@@ -101,16 +101,16 @@ class TrainExamples:
 class EvalExamples:
     """Examples for evaluation; a key is a name."""
 
-    source: Source
+    source: SplitReader
 
-    def __call__(self, key: str, skipped: dict[str, str]) -> Example | None:
+    def __call__(self, key: str, skipped: dict[str, str]) -> TransformedSample | None:
         """The example of `key`, or None where it cannot be read."""
         sample = self.source.read(key, skipped)
         return None if sample is None else self.source.transform.test(sample)
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedBatch:
     """What a worker hands back.
 
     Attributes:
@@ -124,12 +124,12 @@ class Loaded:
     skipped: dict[str, str] = field(default_factory=dict)
     error: str = ""
 
-    def pin_memory(self) -> Loaded:
+    def pin_memory(self) -> LoadedBatch:
         """Called by the loader's own thread, so that copies to the device need not wait."""
         return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
 
 
-class BatchReader(TorchDataset[Loaded]):
+class BatchReader(TorchDataset[LoadedBatch]):
     """Makes the batch of a list of keys.
 
     Args:
@@ -141,7 +141,7 @@ class BatchReader(TorchDataset[Loaded]):
         self.make_example = make_example
         self.stack = stack
 
-    def __getitem__(self, keys: list[Any]) -> Loaded:
+    def __getitem__(self, keys: list[Any]) -> LoadedBatch:
         """The batch of `keys`, without the samples that are left out."""
         skipped: dict[str, str] = {}
         try:
@@ -151,8 +151,8 @@ class BatchReader(TorchDataset[Loaded]):
             if batch is not None and get_worker_info() is not None:
                 batch = _each(batch, _shared)
         except InputError as error:
-            return Loaded(skipped=skipped, error=str(error))
-        return Loaded(batch, skipped)
+            return LoadedBatch(skipped=skipped, error=str(error))
+        return LoadedBatch(batch, skipped)
 
 
 def start_worker(_: int) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.images import Images, ReadsPairs
+from rgbt.data.images import PairReader, ReadsPairs
 from rgbt.data.new_images import find_pairs
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
@@ -19,7 +19,7 @@ ENDINGS = (".png", "_overlay.png")
 
 @dataclass(frozen=True)
 class ToPredict:
-    """Images to predict, in order.
+    """PairReader to predict, in order.
 
     Attributes:
         names: of the images; the names of what is written begin with them.
@@ -132,7 +132,7 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
     )
 
 
-def images_of(dataset: LabelledDataset) -> Images:
+def images_of(dataset: LabelledDataset) -> PairReader:
     """How a data set reads images that are in no split; InputError where it does not say."""
     reader = reader_of(dataset)
     if not isinstance(reader, ReadsPairs):

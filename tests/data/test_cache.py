@@ -25,7 +25,7 @@ from rgbt.data.cache.__main__ import main
 from rgbt.data.cache.dataset import CachedDataset, _cache_name, cached_dataset, default_folder
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
-from rgbt.data.reader import Source
+from rgbt.data.reader import SplitReader
 from rgbt.types import Sample
 from tests.data.pst900_files import TRAIN, write_pst900
 
@@ -681,7 +681,7 @@ def test_names_without_files_are_skipped_as_without_cache(tmp_path: Path, begun:
     found: list[dict[str, str]] = []
     for dataset in (source, cached):
         skipped: dict[str, str] = {}
-        reader = Source(dataset, names, None, skip_errors=True)  # type: ignore[arg-type]
+        reader = SplitReader(dataset, names, None, skip_errors=True)  # type: ignore[arg-type]
         read = [reader.read(name, skipped) for name in names]
         assert [sample.name for sample in read if sample] == [n for n in names if n != TRAIN[0]]
         found.append(skipped)

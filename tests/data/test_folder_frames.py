@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.frames import FolderFrame
 from rgbt.data.folder.pattern import Pattern, in_order
 from rgbt.data.folder.splits import ByShare
 from tests.conftest import write_png
@@ -234,7 +234,7 @@ def test_a_list_elsewhere(root: Path, tmp_path: Path) -> None:
     assert dataset.names("train") == ("test_1",)
 
 
-def frames_of(*paths: str) -> dict[str, Frame]:
+def frames_of(*paths: str) -> dict[str, FolderFrame]:
     """Frames of {sequence}/{name}, or {camera}/{sequence}/{name}; nothing is on the disk."""
     words = ("camera", "sequence", "name")
     frames = {}
@@ -242,11 +242,11 @@ def frames_of(*paths: str) -> dict[str, Frame]:
         pieces = path.split("/")
         values = dict(zip(words[-len(pieces) :], pieces, strict=True))
         name = "_".join(pieces)
-        frames[name] = Frame(name, values, Path(path), Path(path), None)
+        frames[name] = FolderFrame(name, values, Path(path), Path(path), None)
     return frames
 
 
-def drawn(frames: dict[str, Frame], **keys: Any) -> ByShare:
+def drawn(frames: dict[str, FolderFrame], **keys: Any) -> ByShare:
     shares = {"train": 0.5, "val": 0.25, "test": 0.25}
     return ByShare(frames, **{"shares": shares, "seed": 0, "block": None, **keys})
 

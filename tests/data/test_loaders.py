@@ -17,7 +17,7 @@ from rgbt.data import loaders
 from rgbt.data.batches import collate
 from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.reader import Loaded
+from rgbt.data.reader import LoadedBatch
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
 
@@ -310,7 +310,7 @@ def test_all_of_a_batch_is_pinned(
 
     monkeypatch.setattr(torch.Tensor, "pin_memory", lock)
     batch = next(train_batches(dataset, "train", crm(), settings(augment=augment), 0, range(1)))
-    pinned = Loaded(batch, {"x": "why"}).pin_memory()
+    pinned = LoadedBatch(batch, {"x": "why"}).pin_memory()
     assert pinned.skipped == {"x": "why"}
     assert isinstance(pinned.batch, type(batch))
     values = {each.name: getattr(pinned.batch, each.name) for each in dataclasses.fields(batch)}
@@ -318,7 +318,7 @@ def test_all_of_a_batch_is_pinned(
     assert {"rgb", "thermal", "label", "original_hw"} < tensors
     assert {name for name, value in values.items() if id(value) in locked} == tensors
     assert_equal(batch.to("cpu"), pinned.batch.to("cpu"))
-    empty = Loaded(error="why")
+    empty = LoadedBatch(error="why")
     assert empty.pin_memory() is empty
 
 

@@ -13,7 +13,7 @@ from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.writer import Plan, write
+from rgbt.data.synth.writer import SynthPlan, write
 from tests.conftest import write_data
 
 HW = (6, 8)
@@ -86,7 +86,7 @@ def test_flow_is_rows_then_columns_to_the_nearest_pixel(root: Path) -> None:
 
 def test_flow_of_the_embedded_data_set_leads_to_the_same_class(tmp_path: Path) -> None:
     factors = replace(SceneFactors(), height=48, width=64)
-    plan = Plan(
+    plan = SynthPlan(
         seed=0, num_train=1, num_val=1, num_test=3, factors=factors, motion=EgoMotion(0.5, 2.0)
     )
     write(plan, tmp_path / "synth")

@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.data.synth import cache, dataset, scene, sheet, writer
-from rgbt.data.synth.camera import Camera, camera_of, flow_between, ground_homography
+from rgbt.data.synth.camera import SynthCamera, camera_of, flow_between, ground_homography
 from rgbt.data.synth.dataset import cached, plan_key, synth
 from rgbt.data.synth.facets import sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
@@ -21,16 +21,16 @@ from rgbt.data.synth.rgb import develop, squared_radius
 from rgbt.data.synth.road import draw_road
 from rgbt.data.synth.scene import Scene, render_pair, render_scene
 from rgbt.data.synth.shapes import CAR, PERSON, box, shape_of
-from rgbt.data.synth.writer import Plan, write
+from rgbt.data.synth.writer import SynthPlan, write
 from rgbt.randomness import numpy_generator
 
 FACTORS = SceneFactors()
 DAY, NIGHT = replace(FACTORS, night_share=0.0), replace(FACTORS, night_share=1.0)
 
 
-def plan(**changes: object) -> Plan:
+def plan(**changes: object) -> SynthPlan:
     small = replace(FACTORS, height=48, width=64)
-    return replace(Plan(seed=3, num_train=4, num_val=2, num_test=4, factors=small), **changes)
+    return replace(SynthPlan(seed=3, num_train=4, num_val=2, num_test=4, factors=small), **changes)
 
 
 def images(scene: Scene) -> tuple[bytes, bytes, bytes]:
@@ -186,7 +186,7 @@ def test_thermal_contrast_zero_is_flat() -> None:
 
 def test_label_and_depth_of_one_box_follow_from_the_camera() -> None:
     # A 2 m wide, 1 m high box whose front is 10 m ahead; focal length 100, horizon in the middle.
-    camera = Camera(101, 201, focal=100.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+    camera = SynthCamera(101, 201, focal=100.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     shape = shape_of(box((-1.0, 0.0, 10.0), (1.0, 1.0, 12.0), "paint", CAR))
     ground = scene.ground_quads(draw_road(0, 0))
     placed = [scene.Placed(shape, 0.0, 0.0)]
@@ -223,7 +223,7 @@ def test_pitch_moves_the_horizon(pitch: float) -> None:
 
 
 def test_a_camera_that_stays_has_no_flow_and_one_that_turns_shifts_the_sky() -> None:
-    camera = Camera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+    camera = SynthCamera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     depth = np.full((11, 21), np.inf, np.float32)
     assert np.abs(flow_between(depth, camera, camera)).max() < 1e-5
     turned = camera.moved(EgoMotion(0.0, 2.0))
@@ -233,7 +233,7 @@ def test_a_camera_that_stays_has_no_flow_and_one_that_turns_shifts_the_sky() -> 
 
 
 def test_flow_of_a_forward_motion_by_hand() -> None:
-    camera = Camera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+    camera = SynthCamera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     flow = flow_between(np.full((11, 21), 8.0, np.float32), camera, camera.moved(EgoMotion(2.0)))
     # From depth 8 to 6 every offset from the centre grows by 8 / 6: (5, 10) becomes (6.67, 13.3).
     assert flow[10, 20] == pytest.approx([5 / 3, 10 / 3], abs=1e-4)
@@ -365,7 +365,7 @@ def test_an_interrupted_generation_leaves_nothing(
 ) -> None:
     real = writer.write_index
 
-    def interrupted(made: Plan, folder: Path, index: int) -> None:
+    def interrupted(made: SynthPlan, folder: Path, index: int) -> None:
         if index == 3:
             raise KeyboardInterrupt
         real(made, folder, index)
@@ -381,7 +381,7 @@ def test_an_interrupted_generation_leaves_nothing(
 def test_of_two_generations_at_once_the_first_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def overtaken(made: Plan, folder: Path) -> None:
+    def overtaken(made: SynthPlan, folder: Path) -> None:
         write(made, folder)
         other = tmp_path / f"synth-{plan_key(made)}"
         other.mkdir()

@@ -23,7 +23,7 @@ from rgbt.data.synth.kp_writer import names_of, write
 from rgbt.data.synth.materials import INDEX
 from rgbt.data.synth.scene import Scene, render_scene
 from rgbt.data.synth.shapes import BIKE, BUMP, CAR, CAR_STOP, CURVE, GUARDRAIL, PERSON
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 
 SMALL = {"num_train": 9, "num_val": 4, "num_test": 8, "height": 48, "width": 64}
 FACTORS = SceneFactors(height=48, width=64, night_share=0.48)
@@ -41,8 +41,8 @@ def scenes() -> list[Scene]:
     return [render_scene(0, index, SceneFactors()) for index in range(12)]
 
 
-def plan(**changes: object) -> Plan:
-    made = Plan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
+def plan(**changes: object) -> SynthPlan:
+    made = SynthPlan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
     return replace(made, **changes)
 
 

@@ -20,7 +20,7 @@ from rgbt.data.synth.pst900 import cached, synth_pst900
 from rgbt.data.synth.pst900_writer import CLASS_OF, shots_of, write
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.shapes import BUMP, CAR, CAR_STOP, COLOR_CONE, PERSON
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 
 SMALL = {"num_train": 6, "num_val": 2, "num_test": 5, "height": 36, "width": 64}
 FACTORS = SceneFactors(height=36, width=64, field_of_view_deg=80.0)
@@ -32,8 +32,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> PST900:
     return synth_pst900(cache_dir=str(tmp_path_factory.mktemp("cache")), **SMALL)
 
 
-def plan(**changes: object) -> Plan:
-    made = Plan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
+def plan(**changes: object) -> SynthPlan:
+    made = SynthPlan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
     return replace(made, **changes)
 
 

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.files import within
-from rgbt.data.folder.frames import Frame, check_partners, find_frames, patterns_of
+from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
-from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, Rule
+from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
 from rgbt.data.folder.values import (
     LabelValue,
     Range,
@@ -126,7 +126,7 @@ class Folder:
             )
         self.patterns = patterns_of(rgb, thermal, label)
         self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
-        self.frames: Mapping[str, Frame] = find_frames(self.root, self.patterns)
+        self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
         self._rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self._names: dict[str, tuple[str, ...]] = {}
         self.unlabelled = unlabelled
@@ -235,7 +235,7 @@ class Folder:
         """What `rgbt.data.check` checks of this data set."""
         return FolderChecks(self)
 
-    def frame(self, name: str) -> Frame:
+    def frame(self, name: str) -> FolderFrame:
         """The files of `name`; InputError where there is no such frame."""
         if name not in self.frames:
             raise InputError(
@@ -276,7 +276,7 @@ class Folder:
         lists: dict[str, str] | None,
         shares: dict[str, float] | None,
         draw: tuple[int, int | None],
-    ) -> Rule:
+    ) -> SplitRule:
         given = {"folders": folders, "lists": lists, "shares": shares}
         told = [f"dataset.{key}" for key, value in given.items() if value is not None]
         in_path = SPLIT in self.patterns.rgb.words

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.folder.pattern import NAME, Pattern, Values, in_order, what_is_in
+from rgbt.data.folder.pattern import NAME, Pattern, WordValues, in_order, what_is_in
 
 
-class Frame(NamedTuple):
+class FolderFrame(NamedTuple):
     """One pair of images and its label.
 
     Attributes:
@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     """
 
     name: str
-    values: Values
+    values: WordValues
     rgb: Path
     thermal: Path
     label: Path | None
@@ -69,7 +69,7 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     return found
 
 
-def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
+def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
     """Name -> frame, of every RGB image, in the order of the names (9 before 10).
 
     Args:
@@ -81,7 +81,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
             share a partner.
     """
     rgb, thermal, label = patterns
-    frames: dict[str, Frame] = {}
+    frames: dict[str, FolderFrame] = {}
     for frame in _candidates(root, patterns):
         if frame.name in frames:
             raise InputError(
@@ -102,7 +102,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
     return found
 
 
-def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> None:
+def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) -> None:
     """Refuse a pattern that names no file that is there, of any of some frames.
 
     Args:
@@ -122,14 +122,14 @@ def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> Non
         )
 
 
-def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
+def _candidates(root: Path, patterns: Patterns) -> list[FolderFrame]:
     """What the RGB pattern matches, but for thermal images and labels of what it matches.
 
     Where all lie in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
     """
     rgb, thermal, label = patterns
     found = [
-        Frame(
+        FolderFrame(
             name="_".join(values[word] for word in rgb.words),
             values=values,
             rgb=path,
@@ -142,7 +142,7 @@ def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
     return [frame for frame in found if frame.rgb not in partners]
 
 
-def _check_shared(pattern: Pattern, frames: dict[str, Frame], root: Path) -> None:
+def _check_shared(pattern: Pattern, frames: dict[str, FolderFrame], root: Path) -> None:
     partners: dict[Path, str] = {}
     for name, frame in frames.items():
         path = pattern.path(root, frame.values)

@@ -17,17 +17,17 @@ from rgbt.checks import InputError
 NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
 """Words that mean something: a frame, the split it is of, frames that follow one another."""
 
-Values = Mapping[str, str]
+WordValues = Mapping[str, str]
 """Word -> what stands for it in the path of a file."""
 
-NO_VALUES: Values = MappingProxyType({})
+NO_VALUES: WordValues = MappingProxyType({})
 
 
-class Found(NamedTuple):
+class PathMatch(NamedTuple):
     """A file, or a folder on the way to one, and what its path says."""
 
     path: Path
-    values: Values
+    values: WordValues
 
 
 class Pattern:
@@ -69,13 +69,13 @@ class Pattern:
                 f"such as rgb/{{{NAME}}}.png."
             )
 
-    def path(self, root: Path, values: Values) -> Path:
+    def path(self, root: Path, values: WordValues) -> Path:
         """The file of `values`, which hold every word."""
         return root / _filled(self.text, values)
 
     def files(
-        self, root: Path, values: Values = NO_VALUES, *, any_case: bool = False
-    ) -> Iterator[Found]:
+        self, root: Path, values: WordValues = NO_VALUES, *, any_case: bool = False
+    ) -> Iterator[PathMatch]:
         """What matches below `root`: files, and anything else of such a name.
 
         Files whose names begin with a dot are left out: systems write them beside others.
@@ -88,11 +88,11 @@ class Pattern:
         Raises:
             InputError: a folder may not be listed.
         """
-        return _walk(Found(root, values), self.pieces, any_case=any_case)
+        return _walk(PathMatch(root, values), self.pieces, any_case=any_case)
 
     def why_nothing(self, root: Path) -> str:
         """Where the first piece that matches nothing should be, and what is there instead."""
-        reached = [Found(root, {})]
+        reached = [PathMatch(root, {})]
         for piece in self.pieces:
             further = [found for folder in reached for found in _matching(folder, piece)]
             if not further:
@@ -120,7 +120,7 @@ def in_order(text: str) -> list[tuple[bool, int, str]]:
     ]
 
 
-def _walk(start: Found, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[Found]:
+def _walk(start: PathMatch, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[PathMatch]:
     piece, *rest = pieces
     for found in _matching(start, piece, any_case=any_case):
         if rest:
@@ -129,22 +129,22 @@ def _walk(start: Found, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[
             yield found
 
 
-def _matching(start: Found, piece: str, *, any_case: bool = False) -> Iterator[Found]:
+def _matching(start: PathMatch, piece: str, *, any_case: bool = False) -> Iterator[PathMatch]:
     folder, values = start
     filled = _filled(piece, values)
     if "{" not in filled and not any_case:
         # A link that leads nowhere is there: whoever opens it says where it should lead.
         if os.path.lexists(folder / filled):
-            yield Found(folder / filled, values)
+            yield PathMatch(folder / filled, values)
         return
     expression = re.compile(_expression(filled), re.DOTALL | (re.IGNORECASE * any_case))
     for name in _listed(folder):
         match = expression.fullmatch(name)
         if match and (not name.startswith(".") or filled.startswith(".")):
-            yield Found(folder / name, {**values, **match.groupdict()})
+            yield PathMatch(folder / name, {**values, **match.groupdict()})
 
 
-def _filled(text: str, values: Values) -> str:
+def _filled(text: str, values: WordValues) -> str:
     """`text` with words replaced whose values are known."""
     return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.frames import FolderFrame
 from rgbt.data.folder.pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
 from rgbt.data.integrity import is_there, read_names
 from rgbt.randomness import numpy_generator
@@ -22,10 +22,10 @@ from rgbt.randomness import numpy_generator
 FOLDERS = {split: split for split in ("train", "val", "test")}
 """What {split} stands for where the configuration does not say so."""
 
-Frames = Mapping[str, Frame]
+Frames = Mapping[str, FolderFrame]
 
 
-class Rule(Protocol):
+class SplitRule(Protocol):
     """How splits are told."""
 
     @property
@@ -216,7 +216,7 @@ class ByShare:
     @cached_property
     def units(self) -> list[list[str]]:
         """Names that stay together."""
-        sequences: dict[str, list[Frame]] = defaultdict(list)
+        sequences: dict[str, list[FolderFrame]] = defaultdict(list)
         for frame in self.frames.values():
             sequences[frame.values.get(SEQUENCE, "")].append(frame)
         units = []
@@ -239,11 +239,11 @@ class ByShare:
         return found
 
 
-def _moment(frame: Frame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
+def _moment(frame: FolderFrame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
     return in_order(frame.values[NAME]), in_order(frame.name)
 
 
-def _below(root: Path, frame: Frame) -> str:
+def _below(root: Path, frame: FolderFrame) -> str:
     return frame.rgb.relative_to(root).as_posix()
 
 

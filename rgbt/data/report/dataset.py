@@ -16,12 +16,12 @@ import numpy as np
 from rgbt.checks import InputError
 from rgbt.data.report.values import (
     Checkable,
-    Counts,
     DatasetChecks,
     DatasetReport,
+    PixelCounts,
     SplitNames,
     SplitReport,
-    ThermalCounts,
+    ThermalStatistics,
 )
 from rgbt.dataset import LabelledDataset
 from rgbt.types import IGNORE
@@ -32,8 +32,8 @@ class _Content:
     """Content of a sample; `pixels` is None without a label."""
 
     hw: tuple[int, int]
-    pixels: Counts | None
-    thermal: ThermalCounts | None
+    pixels: PixelCounts | None
+    thermal: ThermalStatistics | None
 
 
 def checks_of(dataset: LabelledDataset) -> DatasetChecks:
@@ -159,13 +159,13 @@ def _report_split(
     )
 
 
-def _together(images: list[ThermalCounts]) -> ThermalCounts | None:
+def _together(images: list[ThermalStatistics]) -> ThermalStatistics | None:
     if not images:
         return None
     table = np.array(images, np.int64)
     pixels, empty, below, above = table[:, :4].sum(0).tolist()
     lowest = min((image.lowest for image in images if image.lowest), default=0)
-    return ThermalCounts(
+    return ThermalStatistics(
         pixels, empty, below, above, lowest, max(image.highest for image in images)
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rgbt.data.folder.values import plain
 from rgbt.data.report.lists import listed_twice, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalCounts
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
 
 if TYPE_CHECKING:
     from rgbt.data.folder.dataset import Folder
@@ -49,7 +49,7 @@ class FolderChecks:
         nights = self.dataset.nights(names)
         return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
 
-    def thermal(self, name: str) -> ThermalCounts | None:
+    def thermal(self, name: str) -> ThermalStatistics | None:
         """Values before they are grey levels; None where they are grey levels already."""
         limits = self.dataset.thermal_range
         if limits is None:
@@ -61,7 +61,7 @@ class FolderChecks:
         )
         lowest, highest = (float(end(filled)) if filled.size else 0.0 for end in (np.min, np.max))
         self._clipped[name] = _Clipped(filled.size, below + above, lowest, highest)
-        return ThermalCounts(
+        return ThermalStatistics(
             pixels=values.size,
             empty=values.size - filled.size,
             below=below,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rgbt.data.freiburg_layout import unused_files
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalCounts
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
 
 if TYPE_CHECKING:
     from rgbt.data.freiburg import Freiburg
@@ -33,12 +33,12 @@ class FreiburgChecks:
         nights = sum(self.dataset.nights(names))
         return DayNight(len(names) - nights, nights)
 
-    def thermal(self, name: str) -> ThermalCounts:
+    def thermal(self, name: str) -> ThermalStatistics:
         """Counts of what is cut out of the frame."""
         counts = self.dataset.counts(name)
         low, high = self.dataset.thermal_range
         filled = counts[counts > 0]
-        return ThermalCounts(
+        return ThermalStatistics(
             pixels=counts.size,
             empty=counts.size - filled.size,
             below=int(np.count_nonzero(filled < low)),

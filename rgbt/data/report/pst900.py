@@ -11,7 +11,7 @@ import numpy as np
 from rgbt.data.named_files import names_in
 from rgbt.data.pst900_layout import FOLDERS, bag_of
 from rgbt.data.report.lists import listed_twice, other_sizes, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalCounts
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
 
 if TYPE_CHECKING:
     from rgbt.data.pst900 import PST900
@@ -44,11 +44,11 @@ class PST900Checks:
         """There is no day underground."""
         return DayNight(0, 0)
 
-    def thermal(self, name: str) -> ThermalCounts:
+    def thermal(self, name: str) -> ThermalStatistics:
         """Grey levels; those of 0 were not measured."""
         thermal = self.dataset.thermal(name)
         filled = thermal[thermal > 0]
-        return ThermalCounts(
+        return ThermalStatistics(
             pixels=thermal.size,
             empty=thermal.size - filled.size,
             below=0,

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-Counts = NDArray[np.int64]
+PixelCounts = NDArray[np.int64]
 
 
 class DayNight(NamedTuple):
@@ -46,12 +46,12 @@ class SplitReport:
     num_night: int
     num_flipped: int
     sizes: dict[tuple[int, int], int]
-    pixels: Counts
-    images: Counts
-    thermal: ThermalCounts | None
+    pixels: PixelCounts
+    images: PixelCounts
+    thermal: ThermalStatistics | None
 
 
-class ThermalCounts(NamedTuple):
+class ThermalStatistics(NamedTuple):
     """Pixels of thermal images by their counts.
 
     Attributes:
@@ -100,7 +100,7 @@ class DatasetChecks(Protocol):
         """Number of day and of night images."""
         ...
 
-    def thermal(self, name: str) -> ThermalCounts | None:
+    def thermal(self, name: str) -> ThermalStatistics | None:
         """Counts of one thermal image, or None; InputError if it cannot be read."""
         ...
 
