@@ -26,8 +26,12 @@ WIDTH_WITHOUT_TERMINAL = 120
 
 @command()
 def main(config: DictConfig) -> int:
-    """Check ``config.dataset``; 1 where there are problems."""
-    dataset: LabelledDataset = build(config.dataset)
+    """Check ``config.dataset``; returns 1 if there are problems."""
+    return check_and_print(build(config.dataset))
+
+
+def check_and_print(dataset: LabelledDataset) -> int:
+    """Read a data set and print the report; returns 1 if there are problems."""
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("reading", total=num_listed(dataset))
         report = check_dataset(

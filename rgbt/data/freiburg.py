@@ -21,8 +21,7 @@ from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.files import read_counts, read_label, read_label_array, within
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
-from rgbt.data.integrity import is_there
-from rgbt.data.named_files import check_lengths
+from rgbt.data.named_files import check_lengths, check_split, existing_file, existing_root, size_of
 from rgbt.data.prepare.freiburg import PREPARATION
 from rgbt.data.report.freiburg import FreiburgChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
@@ -120,7 +119,7 @@ class Freiburg:
         ignored_test: Names = ("ignore",),
         val_sequences: Names = ("seq_04_day",),
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds train and test")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
@@ -132,7 +131,7 @@ class Freiburg:
         self.val_sequences = val_sequences
         self.splits = SPLITS
         self._split_frames: dict[str, tuple[FreiburgFrame, ...]] = {}
-        _check_root(self.root, root)
+        _check_root(self.root)
         check_lengths(num_classes, classes, palette)
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
@@ -222,7 +221,7 @@ class Freiburg:
             names = [frame.name for frame in self._of(split)]
             digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
         for name in self._frames:
-            sizes = [_size(path) for path in self.files(name)]
+            sizes = [size_of(path) for path in self.files(name)]
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
@@ -251,19 +250,16 @@ class Freiburg:
         return self._split_frames[split]
 
     def _select(self, split: str) -> tuple[FreiburgFrame, ...]:
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
-        place, _, time = split.partition("_")
-        time = time or ("day" if place in ("train", "val") else "")
+        check_split(split, self.splits)
+        part, _, time = split.partition("_")
+        time = time or ("day" if part in ("train", "val") else "")
         return tuple(
             frame
             for frame in self.frames
-            if self._place(frame) == place and time in ("", "night" if frame.night else "day")
+            if self._part(frame) == part and time in ("", "night" if frame.night else "day")
         )
 
-    def _place(self, frame: FreiburgFrame) -> str:
+    def _part(self, frame: FreiburgFrame) -> str:
         if frame.is_test:
             return "test"
         held_out = not frame.night and not set(frame.sequences).isdisjoint(self.val_sequences)
@@ -291,23 +287,15 @@ class Freiburg:
         )
 
     def _image_paths(self, frame: FreiburgFrame) -> tuple[Path, Path]:
-        if not is_there(frame.thermal):
-            raise InputError(
-                f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
-                "data.on_error=skip to leave the frame out."
-            )
-        return within(frame.rgb, self.root), within(frame.thermal, self.root)
+        thermal = existing_file("thermal image", frame.thermal, frame.name, self.root)
+        return within(frame.rgb, self.root), thermal
 
     def _label(self, frame: FreiburgFrame, hw: tuple[int, ...]) -> Array:
         """The label at the size of the frame, at the nearest pixel."""
-        assert frame.label is not None, "only frames with a label are asked for it"
-        if not is_there(frame.label):
-            raise InputError(
-                f"'{frame.name}': its label {frame.label} is missing; restore it, or use "
-                "data.on_error=skip to leave the frame out."
-            )
-        read = read_label if frame.label.suffix == ".png" else read_label_array
-        label = read(within(frame.label, self.root), self.num_classes)
+        assert frame.label is not None, "the frame has a label"
+        path = existing_file("label", frame.label, frame.name, self.root)
+        read = read_label if path.suffix == ".png" else read_label_array
+        label = read(path, self.num_classes)
         if label.shape != hw:
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
@@ -320,25 +308,13 @@ class Freiburg:
             label = np.asarray(
                 cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8
             )
-        if self._place(frame) != "train" and self.ignored_test:
+        if self._part(frame) != "train" and self.ignored_test:
             ignored = [self.classes.index(word) for word in self.ignored_test]
             label = np.where(np.isin(label, ignored), np.uint8(IGNORE), label)
         return label
 
 
-def _size(path: Path) -> int:
-    # One question to the file system per file: there are sixty thousand.
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return -1
-
-
-def _check_root(root: Path, given: str) -> None:
-    if not root.is_dir():
-        raise InputError(
-            f"dataset.root: there is no folder '{given}'; give the one that holds train and test."
-        )
+def _check_root(root: Path) -> None:
     if not any(inside(root, part).is_dir() for part in ("train", "test")):
         raise InputError(
             f"dataset.root: '{root}' holds neither the folder train nor test; give the folder into "

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError, check_choice
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
@@ -32,6 +32,8 @@ from rgbt.data.kp_layout import (
 )
 from rgbt.data.named_files import (
     check_lengths,
+    check_split,
+    existing_root,
     hash_of_files,
     names_in,
     root_nearby,
@@ -129,14 +131,14 @@ class KP:
         splits: dict[Text, Text] = SPLITS,
         lists: ListSource = "auto",
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds images and labels of KP")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         check_choice("dataset.lists", lists, ("auto", "files", "sets"))
         check_lengths(num_classes, classes, palette)
-        _check_root(self.root, root)
+        _check_root(self.root)
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)
         self._names: dict[str, tuple[str, ...]] = {}
@@ -153,7 +155,7 @@ class KP:
 
     def has(self, split: str) -> bool:
         """Whether anything of `split` is there; InputError where the split is unknown."""
-        self._check_split(split)
+        check_split(split, self.splits)
         if self.lists != "files":
             return bool(self._with_labels(split))
         sources = self._sources(split)
@@ -169,7 +171,7 @@ class KP:
             InputError: unknown split, missing or empty list, a line that is no name, no label of
                 the sets.
         """
-        self._check_split(split)
+        check_split(split, self.splits)
         if split not in self._names:
             read = self._of_lists if self.lists == "files" else self._of_sets
             self._names[split] = read(split)
@@ -259,12 +261,6 @@ class KP:
         folders = [folder] if self.has_labels else [folder / each for each in LABELS_OF.values()]
         return tuple(sorted({name for each in folders for name in names_in(each)}))
 
-    def _check_split(self, split: str) -> None:
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
-
     def _sources(self, split: str) -> tuple[str, ...]:
         """Splits whose lists `split` is read from: its own, the one it is a part of, its parts."""
 
@@ -335,12 +331,7 @@ def _holds_kp(root: Path) -> bool:
     )
 
 
-def _check_root(root: Path, given: str) -> None:
-    if not root.is_dir():
-        raise InputError(
-            f"dataset.root: there is no folder '{given}'; give the one that holds images and "
-            "labels of KP."
-        )
+def _check_root(root: Path) -> None:
     if not _holds_kp(root):
         near = root_nearby(root, _holds_kp) or "the folder that does"
         raise InputError(

@@ -11,12 +11,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError
 from rgbt.data.files import read_label, read_thermal, within
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
 from rgbt.data.mfnet_layout import FOLDERS, MIRRORED, SPLITS, base_name, either_layout
-from rgbt.data.named_files import check_lengths, hash_of_files, with_label
+from rgbt.data.named_files import (
+    check_lengths,
+    check_split,
+    existing_root,
+    hash_of_files,
+    with_label,
+)
 from rgbt.data.prepare.mfnet import PREPARATION
 from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
@@ -85,17 +91,12 @@ class MFNet:
         splits: dict[Text, Text] = SPLITS,
         layout: LayoutName = "auto",
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, f"that holds {either_layout()} and the split lists")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         self.splits = dict(splits)
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that holds "
-                f"{either_layout()} and the split lists."
-            )
         check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
@@ -183,10 +184,7 @@ class MFNet:
 
     def list_path(self, split: str) -> Path:
         """The list file of `split`; InputError where the split is unknown."""
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
+        check_split(split, self.splits)
         return self.root / self.splits[split]
 
     def image_paths(self, name: str) -> tuple[Path, ...]:

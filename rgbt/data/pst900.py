@@ -21,6 +21,7 @@ from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
 from rgbt.data.named_files import (
     check_lengths,
+    existing_root,
     hash_of_files,
     names_in,
     root_nearby,
@@ -102,17 +103,12 @@ class PST900:
         palette: tuple[Colour, ...] = PALETTE,
         val_bags: Bags = (),
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds train and test of PST900")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         self.val_bags = val_bags
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that holds train and "
-                "test of PST900."
-            )
         check_lengths(num_classes, classes, palette)
         for bag in val_bags:
             if not isinstance(bag, int):

@@ -19,7 +19,6 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.files import within
 from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
@@ -33,8 +32,13 @@ from rgbt.data.folder.values import (
     painted,
 )
 from rgbt.data.images import PairPattern
-from rgbt.data.integrity import is_there
-from rgbt.data.named_files import check_lengths, hash_of_files, with_label
+from rgbt.data.named_files import (
+    check_lengths,
+    existing_file,
+    existing_root,
+    hash_of_files,
+    with_label,
+)
 from rgbt.data.report.folder import FolderChecks
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 from rgbt.types import Sample
@@ -103,7 +107,6 @@ class Folder:
         thermal_range: Range | None = None,
         night: Text | None = None,
     ) -> None:
-        self.root = Path(root).expanduser()
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
@@ -119,11 +122,7 @@ class Folder:
             check_choice("dataset.unscored", word, classes)
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that dataset.rgb='{rgb}' "
-                "begins in."
-            )
+        self.root = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
         self.patterns = patterns_of(rgb, thermal, label)
         self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
@@ -263,12 +262,7 @@ class Folder:
             check_partners(self.patterns.label, labelled, self.root)
 
     def _there(self, what: str, path: Path, name: str) -> Path:
-        if not is_there(path):
-            raise InputError(
-                f"'{name}': its {what} {path} is missing; restore it, or use data.on_error=skip to "
-                "leave the frame out."
-            )
-        return within(path, self.root)
+        return existing_file(what, path, name, self.root)
 
     def _rule_of(
         self,

@@ -10,7 +10,6 @@ Progress goes to stderr, the report of `rgbt.data.check` to stdout. The download
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,12 +21,10 @@ from rich.progress import Progress
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import conf_dir
-from rgbt.data.check import print_report
+from rgbt.data.check import check_and_print
 from rgbt.data.prepare.copying import Item, check_out, claimed, write_all
 from rgbt.data.prepare.download import SourceFiles
 from rgbt.data.prepare.plans import Download, Preparable
-from rgbt.data.report.dataset import check_dataset, num_listed
-from rgbt.dataset import LabelledDataset
 
 OWN = {"dataset": None, "source": None, "out": None, "labels": "", "lists": ""}
 OPTIONAL = ("labels", "lists")
@@ -73,24 +70,15 @@ def main(arguments: dict[str, str], others: list[str]) -> int:
         items = preparation.plan(Download(**sources))
         opened.enter_context(claimed(out, plan))
         _copy(items, out)
-    return _check(classes[name](str(out)), f"dataset={name} dataset.root={out}")
+    code = check_and_print(classes[name](str(out)))
+    sys.stdout.write(f"prepared: dataset={name} dataset.root={out}\n")
+    return code
 
 
 def _copy(items: list[Item], out: Path) -> None:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("copying", total=sum(item.size for item in items))
         write_all(items, out, lambda size: progress.advance(task, size))
-
-
-def _check(dataset: LabelledDataset, words: str) -> int:
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("reading", total=num_listed(dataset))
-        report = check_dataset(
-            dataset, num_threads=os.cpu_count() or 1, advance=lambda: progress.advance(task)
-        )
-    print_report(dataset, report)
-    sys.stdout.write(f"prepared: {words}\n")
-    return 1 if report.problems else 0
 
 
 if __name__ == "__main__":
