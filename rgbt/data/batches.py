@@ -1,4 +1,4 @@
-"""What the loader asks of a data set and a transform, and how examples become a batch."""
+"""Members of data sets and transforms that the loader uses, and stacking of examples to a batch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.types import Batch, Loadable, Sample
 
 
 class Dataset(Protocol):
-    """Where samples come from (see `rgbt.data.mfnet.MFNet`)."""
+    """The members of a data set that the loader uses (see `rgbt.data.mfnet.MFNet`)."""
 
     name: str
 
@@ -23,7 +23,7 @@ class Dataset(Protocol):
         ...
 
     def read(self, name: str) -> Sample:
-        """One sample; InputError where it cannot be read."""
+        """One sample; InputError if it cannot be read."""
         ...
 
 
@@ -67,7 +67,7 @@ class TransformedSample(Protocol):
 
     @property
     def confidence(self) -> NDArray[np.float32] | None:
-        """(H', W') how sure the labels are, or None."""
+        """(H', W') confidence of the labels, or None."""
         ...
 
 
@@ -84,7 +84,7 @@ class Transform(Protocol):
 
 
 class BatchTransform(Protocol):
-    """A transform that can leave the work to the device (see `rgbt.transforms.crm.CrmTransform`).
+    """A transform that can augment whole batches on the device.
 
     ``stack([drawn(sample, rng), ...]).to(device)`` is the batch of ``train(sample, rng)``.
     """
@@ -92,7 +92,7 @@ class BatchTransform(Protocol):
     works_on_batches: bool
 
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Any:
-        """What `train` would read and do; every draw comes from `rng`."""
+        """The sample and the draws of `train`, not yet applied; every draw comes from `rng`."""
         ...
 
     def stack(self, drawn: Sequence[Any]) -> Loadable:
@@ -105,7 +105,7 @@ def collate(examples: Sequence[TransformedSample], advice: str = "") -> Batch:
 
     Args:
         examples: at least one, images all (H, W, 3) and labels all (H', W').
-        advice: ends the message where sizes differ; says which key to change.
+        advice: end of the message if sizes differ; names the key to change.
 
     Raises:
         InputError: images or labels differ in size, naming the first two that do; labels of some

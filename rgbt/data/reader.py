@@ -1,6 +1,6 @@
-"""What a worker process does: read the samples of one batch, transform them, stack them.
+"""The work of a loader process: read the samples of one batch, transform and stack them.
 
-Part of `rgbt.data.loaders`, which decides what each batch holds.
+Part of `rgbt.data.loaders`, which chooses the samples of each batch.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from rgbt.randomness import numpy_generator
 from rgbt.types import Loadable, Sample
 
 MakeExample = Callable[[Any, dict[str, str]], Any]
-"""(key, skipped) -> example, or None where it is left out; notes unreadable names in `skipped`."""
+"""(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 
 Stack = Callable[[list[Any]], Loadable]
-"""Examples of one size -> one value; InputError where their sizes differ."""
+"""Examples of one size -> one batch; InputError if their sizes differ."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end a command (`rgbt.runtime.signals`)."""
 
 LOOK_S = 2.0
-"""How often a worker looks whether its main process is still there."""
+"""Interval at which a worker checks that its main process exists."""
 
 
 @dataclass(frozen=True)
 class SplitReader:
-    """Samples of one split and what is done to them.
+    """Reads the samples of one split.
 
     Attributes:
         dataset: reads samples.
         names: the split.
         transform: makes examples.
-        skip_errors: note a sample that cannot be read instead of raising.
+        skip_errors: record an unreadable sample instead of raising.
     """
 
     dataset: Dataset
@@ -54,7 +54,7 @@ class SplitReader:
     skip_errors: bool
 
     def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
-        """The sample; None, with the reason in `skipped`, where it is to be skipped."""
+        """The sample; None, with the reason in `skipped`, if it is skipped."""
         try:
             return self.dataset.read(name)
         except InputError as error:
@@ -69,7 +69,7 @@ class TrainExamples:
     """Augmented examples; a key is (epoch, index in the split).
 
     Attributes:
-        source: what is read.
+        source: reads samples.
         make: (sample, generator) -> example: the transform's `train` or `drawn`.
         seed: run seed.
     """
@@ -104,20 +104,19 @@ class EvalExamples:
     source: SplitReader
 
     def __call__(self, key: str, skipped: dict[str, str]) -> TransformedSample | None:
-        """The example of `key`, or None where it cannot be read."""
+        """The example of `key`, or None if it cannot be read."""
         sample = self.source.read(key, skipped)
         return None if sample is None else self.source.transform.test(sample)
 
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """What a worker hands back.
+    """The result of a worker.
 
     Attributes:
-        batch: None where every sample was left out, or after an error; a dataclass of tensors.
+        batch: a dataclass of tensors; None if every sample was left out, or after an error.
         skipped: name -> why it could not be read.
-        error: message of an InputError; it travels as text because torch wraps exceptions of
-            workers into others.
+        error: message of an InputError; a text, because torch wraps exceptions of workers.
     """
 
     batch: Loadable | None = None
@@ -125,7 +124,7 @@ class LoadedBatch:
     error: str = ""
 
     def pin_memory(self) -> LoadedBatch:
-        """Called by the loader's own thread, so that copies to the device need not wait."""
+        """The batch in pinned memory; called by a thread of the loader."""
         return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
 
 
@@ -157,22 +156,22 @@ class BatchReader(TorchDataset[LoadedBatch]):
 
 def start_worker(_: int) -> None:
     """Settings of a worker process."""
-    # The processes are the parallelism; threads of OpenCV beside them only get in each other's way.
+    # There is one process per core; threads of OpenCV would compete with them.
     cv2.setNumThreads(0)
-    # A terminal and a cluster signal all processes of a run. The main one finishes its step first,
-    # for which it needs its workers, and then ends them.
+    # A terminal and a cluster signal all processes of a run. The main process needs its workers
+    # to finish its step, and then ends them.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Leave when the main process says so, or is gone."""
-    # Not os.getppid: inside a sweep a server forks the workers, and outlives the main process.
+    """Exit when the main process sends SIGTERM, or has ended."""
+    # Not os.getppid: in a sweep a server forks the workers, and lives longer than the main process.
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a main process"
     while parent.is_alive():
-        told = signal.sigtimedwait(ENDING, LOOK_S)
-        if told and told.si_signo == signal.SIGTERM and told.si_pid == parent.pid:
+        received = signal.sigtimedwait(ENDING, LOOK_S)
+        if received and received.si_signo == signal.SIGTERM and received.si_pid == parent.pid:
             break
     os._exit(0)
 
@@ -191,8 +190,8 @@ def _pinned(tensor: Tensor) -> Tensor:
 def _shared(tensor: Tensor) -> Tensor:
     """`tensor` in memory that the main process can read.
 
-    The worker's queue would move it there as well, but in a thread whose error nobody sees: the
-    main process would wait for ever.
+    The worker's queue would do so too, but in a thread whose errors are not reported: the main
+    process would wait forever.
     """
     try:
         tensor.share_memory_()  # type: ignore[no-untyped-call]
@@ -202,7 +201,7 @@ def _shared(tensor: Tensor) -> Tensor:
 
 
 def no_shared_memory(reason: str) -> str:
-    """The sentence about shared memory that loader processes do not get.
+    """The message about missing shared memory.
 
     Args:
         reason: what the system reported.

@@ -113,7 +113,7 @@ def test_heads_of_images_that_are_in_no_list() -> None:
     for asked, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", asked)(("mine", "night")) == (head, head)
     assert session.dataset.asked == 0
-    with pytest.raises(InputError, match=r"night, so that no head can be chosen; say head=source"):
+    with pytest.raises(InputError, match=r"night, so no head can be chosen; set head=source"):
         heads_of(session, "rgb")(("mine",))
     alone = asked_session({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)

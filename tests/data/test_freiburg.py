@@ -446,6 +446,6 @@ def test_second_frames_are_of_the_other_layout(root: Path) -> None:
     with pytest.raises(InputError) as caught:
         NextFrames(reader(root))
     assert str(caught.value) == (
-        f"freiburg ({root}) cannot hold second frames: they are read in MFNet's layout alone; "
+        f"freiburg ({root}) has no second frames: they are read in MFNet's layout only; "
         "choose dataset=synth with dataset.ego_forward_m=0.5, and frames=virtual needs none."
     )
