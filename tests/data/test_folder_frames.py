@@ -48,7 +48,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("rgb/{1}.png", "expected words in braces"),
         ("rgb/{sequence}{name}.png", "with something between"),
         ("rgb/1.png", "is one file; write {name}"),
-        ("rgb/{frame}.png", "says frame but no name; write {name}"),
+        ("rgb/{frame}.png", "has frame but no name; write {name}"),
     ],
 )
 def test_texts_that_are_no_patterns(sound: Path, text: str, said: str) -> None:
@@ -115,18 +115,18 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
 
 def test_partners_that_are_not_there(root: Path) -> None:
     assert refused(lambda: folder(root, thermal="{split}/ir/{name}.tif")) == (
-        "dataset.thermal: '{split}/ir/{name}.tif' names no file that is there: the first would be "
-        f"{root}/test/ir/1.tif, ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
+        "dataset.thermal: '{split}/ir/{name}.tif' matches no existing file: the first would be "
+        f"{root}/test/ir/1.tif, but ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
     )
     assert refused(lambda: folder(root, label="{split}/labels/{name}.png")).endswith(
         "labels holds nothing; correct the pattern."
     )
-    assert "needs {scene}, which dataset.rgb='{split}/rgb/{name}.png' does not tell" in refused(
+    assert "needs {scene}, which dataset.rgb='{split}/rgb/{name}.png' does not have" in refused(
         lambda: folder(root, thermal="{scene}/ir/{name}.tif")
     )
     assert refused(lambda: folder(root, label="test/mask/{name}.png")) == (
         f"dataset.label: 'test_1' and 'train_1' would share {root}/test/mask/1.png; use every word "
-        "of dataset.rgb that tells them apart."
+        "of dataset.rgb in which they differ."
     )
     assert "are JPEG files, which change values and colours; save labels as PNG" in refused(
         lambda: folder(root, label="{split}/mask/{name}.JPG")
@@ -182,16 +182,16 @@ def test_splits_by_folder(sound: Path) -> None:
 def test_who_says_what_a_split_is(sound: Path) -> None:
     lists, shares = {"train": "train.txt"}, {"train": 1.0}
     assert refused(lambda: folder(sound, lists=lists)).startswith(
-        "dataset: dataset.lists and {split} in dataset.rgb both say what the splits are; keep one"
+        "dataset: dataset.lists and {split} in dataset.rgb both define the splits; keep one"
     )
     plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
-    assert "dataset.lists and dataset.shares both say" in refused(
+    assert "dataset.lists and dataset.shares both define" in refused(
         lambda: folder(sound, lists=lists, shares=shares, **plain)
     )
-    assert "nothing says what the splits are; write {split} in dataset.rgb" in refused(
+    assert "nothing defines the splits; write {split} in dataset.rgb" in refused(
         lambda: folder(sound, **plain)
     )
-    assert "nothing says what the splits are" in refused(
+    assert "nothing defines the splits" in refused(
         lambda: folder(sound, folders={"train": "train"}, **plain)
     )
     for key in ({"shares_seed": 1}, {"block": 3}):

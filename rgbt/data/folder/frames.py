@@ -1,4 +1,4 @@
-"""Which files of a folder belong to one frame, as patterns say; nothing is opened here."""
+"""The files of each frame of a folder, by the patterns of paths; nothing is opened here."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class FolderFrame(NamedTuple):
     """One pair of images and its label.
 
     Attributes:
-        name: what stands for the words of the RGB pattern, joined by "_".
-        values: what stands for each of them.
-        rgb: file that is there.
-        thermal: file that should be there; the same one where it is the fourth channel.
-        label: file that should be there; None where the data set has no labels.
+        name: values of the words of the RGB pattern, joined by "_".
+        values: value of each word.
+        rgb: existing file.
+        thermal: expected file; the same one if thermal is its fourth channel.
+        label: expected file; None if the data set has no labels.
     """
 
     name: str
@@ -30,7 +30,7 @@ class FolderFrame(NamedTuple):
 
 
 class Patterns(NamedTuple):
-    """Where the three images of a frame lie; `label` is None for a data set without labels."""
+    """Patterns of the three images of a frame; `label` is None for a data set without labels."""
 
     rgb: Pattern
     thermal: Pattern
@@ -41,8 +41,8 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     """The patterns of the configuration.
 
     Raises:
-        InputError: a text that is no pattern, no {name} in the first, words that only the others
-            have, or labels in a format that changes values.
+        InputError: an invalid pattern, no {name} in the first, words that only the others have,
+            or labels in a format that changes values.
     """
     found = Patterns(
         Pattern(rgb, "dataset.rgb"),
@@ -51,15 +51,15 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     )
     if NAME not in found.rgb.words:
         raise InputError(
-            f"dataset.rgb: '{rgb}' says {', '.join(found.rgb.words)} but no {NAME}; write "
-            f"{{{NAME}}} where the names of frames stand."
+            f"dataset.rgb: '{rgb}' has {', '.join(found.rgb.words)} but no {NAME}; write "
+            f"{{{NAME}}} instead of the names of frames."
         )
     for pattern in [each for each in found if each is not None]:
         for word in pattern.words:
             if word not in found.rgb.words:
                 raise InputError(
                     f"{pattern.key}: '{pattern.text}' needs {{{word}}}, which dataset.rgb='{rgb}' "
-                    f"does not tell; {nearest(word, found.rgb.words)}."
+                    f"does not have; {nearest(word, found.rgb.words)}."
                 )
     if label is not None and label.lower().endswith((".jpg", ".jpeg")):
         raise InputError(
@@ -103,7 +103,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
 
 
 def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) -> None:
-    """Refuse a pattern that names no file that is there, of any of some frames.
+    """Refuse a pattern by which none of the frames has an existing file.
 
     Args:
         pattern: of thermal images or labels.
@@ -111,21 +111,21 @@ def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) 
         root: what the pattern is relative to.
 
     Raises:
-        InputError: naming the first file and what is there in its place.
+        InputError: naming the first file and the content of its folder.
     """
     paths = [pattern.path(root, frame.values) for frame in frames]
     if paths and not any(map(os.path.lexists, paths)):
         raise InputError(
-            f"{pattern.key}: '{pattern.text}' names no file that is there: the first would be "
-            f"{paths[0]}, {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct the "
-            "pattern."
+            f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
+            f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct "
+            "the pattern."
         )
 
 
 def _candidates(root: Path, patterns: Patterns) -> list[FolderFrame]:
-    """What the RGB pattern matches, but for thermal images and labels of what it matches.
+    """Files that match the RGB pattern, without thermal images and labels of other matches.
 
-    Where all lie in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
     """
     rgb, thermal, label = patterns
     found = [
@@ -149,6 +149,6 @@ def _check_shared(pattern: Pattern, frames: dict[str, FolderFrame], root: Path) 
         if path in partners:
             raise InputError(
                 f"{pattern.key}: '{partners[path]}' and '{name}' would share {path}; use every "
-                "word of dataset.rgb that tells them apart."
+                "word of dataset.rgb in which they differ."
             )
         partners[path] = name

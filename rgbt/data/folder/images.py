@@ -1,4 +1,4 @@
-"""The images of somebody's own data: RGB of 8 bits, thermal values as grey levels."""
+"""Reads images of a user's own data: RGB of 8 bits, thermal values as grey levels."""
 
 from __future__ import annotations
 
