@@ -1,7 +1,7 @@
 """Freiburg Thermal: labelled days and unlabelled nights for training, both labelled for testing.
 
-A reader only: it cuts the frame, maps counts of the thermal camera to grey and brings labels to the
-size of the frame, each as the configuration says, and refuses what it cannot read exactly.
+A reader only: it crops frames, converts thermal counts to grey levels and resizes labels to the
+frame, as configured, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ Edge = Annotated[int, Interval(ge=0, le=8192)]
 Crop = tuple[Edge, Edge, Edge, Edge]
 
 MOST_STRETCH = 0.02
-"""How far the aspect of a label may be from that of its frame: what rounding a size leaves."""
+"""Largest relative difference of the aspect ratios of label and frame, due to rounding."""
 
 Array = NDArray[np.uint8]
 
 
 class Freiburg:
-    """RGB-thermal street scenes of Freiburg as their archives lay them out.
+    """RGB-thermal street scenes of Freiburg, in the layout of their archives.
 
     Layout (XX and YY are digits; sec and nsec are seconds and nanoseconds):
         train/seq_XX_{day|night}/YY/fl_rgb/fl_rgb_<sec>_<nsec>.png               8 bit, RGB
@@ -67,8 +67,8 @@ class Freiburg:
                                     fl_rgb_labels/fl_rgb_labels_<sec>_<nsec>.png   8 bit, by day
         test/{day|night}/ImagesRGB/*_rgb.png   ImagesIR/*_ir.png   SegmentationClass/*.npy
 
-    Splits: "train_day", "train_night", and "train", which is "train_day": what is trained on where
-    no domains are named; "val", day sequences that are taken out of "train_day"; "test_day",
+    Splits: "train_day", "train_night", and "train", which equals "train_day" and is used without
+    domains; "val", day sequences that are not in "train_day"; "test_day",
     "test_night", and "test", the day followed by the night. Training frames at night have no
     labels. Those by day, and so those of "val", carry predictions of an RGB network that was
     trained on Mapillary Vistas; only the test part is labelled by hand.
@@ -84,23 +84,23 @@ class Freiburg:
 
     Args:
         root: folder that holds `train`, `test` or both.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
         unscored: classes that are counted but left out of every mean over classes.
-        crop: first row, row after the last, first column, column after the last of what is cut out
-            of every frame and label; None keeps whole frames.
+        crop: first row, row after the last, first column, column after the last of the part of
+            every frame and label that is used; None: whole frames.
         thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
             [21800, 25000] in the HeatNet release.
-        ignored_test: classes whose pixels do not count in "val" and "test" (they become 255):
+        ignored_test: classes that are ignored in "val" and "test" (they become 255):
             "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
         val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
             "val".
 
     Raises:
-        InputError: no such root, neither part in it, a crop, range or class that cannot be, or
-            numbers of classes, names and colours that differ.
+        InputError: no such root, neither part in it, an invalid crop, range or class, or numbers of
+            classes, names and colours that differ.
     """
 
     preparation = PREPARATION
@@ -140,14 +140,14 @@ class Freiburg:
         self.images = FreiburgImages(crop, thermal_range)
 
     def has(self, split: str) -> bool:
-        """Whether there are frames of `split`; InputError where the split is unknown."""
+        """Whether `split` has frames; InputError if the split is unknown."""
         return bool(self._of(split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted by folder and file, the day before the night.
 
         Raises:
-            InputError: unknown split, no frame of it, a sequence for "val" that is not there.
+            InputError: unknown split, no frame of it, a missing sequence of "val".
         """
         frames = self._of(split)
         if split in ("train", "train_day", "val"):
@@ -170,7 +170,7 @@ class Freiburg:
         """
         frame = self.frame(name)
         pixels, counts = whole_frame(name, *self._image_paths(frame))
-        # A label is brought to the size of the whole frame, and cut with it.
+        # A label is resized to the whole frame, and cropped with it.
         label = None if frame.label is None else self._label(frame, counts.shape)
         sample = self.images.sample(name, pixels, counts)
         if label is None:
@@ -196,7 +196,7 @@ class Freiburg:
         return tuple(path for path in paths if path is not None)
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {
             "crop": self.crop,
             "thermal_range": self.thermal_range,
@@ -206,15 +206,14 @@ class Freiburg:
         }
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
-        """Whether each frame lies in a folder that says night; InputError where there is none."""
+        """Whether each frame is in a night folder; InputError if there is no such frame."""
         return tuple(self.frame(name).night for name in names)
 
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
-        What labels look like belongs to it (crop, `ignored_test`). Nothing is decoded and the root
-        is left out, so that equal copies have equal fingerprints; files that are missing count as
-        such.
+        It includes the settings of labels (crop, `ignored_test`), but not the root, so that equal
+        copies have equal fingerprints. Nothing is decoded; missing files have size -1.
         """
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(self.splits):
@@ -230,14 +229,14 @@ class Freiburg:
         return FreiburgChecks(self)
 
     def frame(self, name: str) -> FreiburgFrame:
-        """The files of `name`; InputError where there is no such frame."""
+        """The files of `name`; InputError if there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self._frames[name]
 
     @cached_property
     def frames(self) -> tuple[FreiburgFrame, ...]:
-        """Every frame, listed once: later changes of the folder are not seen."""
+        """Every frame; listed once, so later changes of the folder have no effect."""
         return find_frames(self.root)
 
     @cached_property
@@ -278,9 +277,9 @@ class Freiburg:
     def _why_empty(self, split: str) -> str:
         hint = f"unpack the archive '{split.partition('_')[0]}' there"
         if split == "val":
-            hint = f"it is {list(self.val_sequences)}, name day sequences that are there"
+            hint = f"it is {list(self.val_sequences)}, name existing day sequences"
         elif split in ("train", "train_day") and self.has("val"):
-            hint = "every day sequence is in dataset.val_sequences, leave one out of it"
+            hint = "every day sequence is in dataset.val_sequences, remove one of them"
         return (
             f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
             f"{self.root}; {hint}."
@@ -291,7 +290,7 @@ class Freiburg:
         return within(frame.rgb, self.root), thermal
 
     def _label(self, frame: FreiburgFrame, hw: tuple[int, ...]) -> Array:
-        """The label at the size of the frame, at the nearest pixel."""
+        """The label, resized to the frame with the nearest pixel."""
         assert frame.label is not None, "the frame has a label"
         path = existing_file("label", frame.label, frame.name, self.root)
         read = read_label if path.suffix == ".png" else read_label_array
@@ -301,8 +300,8 @@ class Freiburg:
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
                 raise InputError(
                     f"{frame.label} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
-                    f"{hw[0]}x{hw[1]}, which is another shape and no other size; use the label of "
-                    "the whole frame."
+                    f"{hw[0]}x{hw[1]}, which is another aspect ratio; use the label of the whole "
+                    "frame."
                 )
             size = (hw[1], hw[0])
             label = np.asarray(

@@ -1,4 +1,4 @@
-"""The images of Freiburg Thermal: what is cut out of a frame, counts as grey levels."""
+"""Reads images of Freiburg Thermal: crops them, and converts counts to grey levels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 @dataclass(frozen=True)
 class FreiburgImages:
-    """RGB of 8 bits and counts of the thermal camera, both cut (see `rgbt.data.freiburg`).
+    """RGB of 8 bits and counts of the thermal camera, both cropped (see `rgbt.data.freiburg`).
 
     Attributes:
         crop: see `Freiburg`.
@@ -54,13 +54,13 @@ class FreiburgImages:
         return self.sample(name, *whole_frame(name, rgb, thermal))
 
     def sample(self, name: str, pixels: Array, counts: CountImage) -> Sample:
-        """What is read of a whole frame, RGB (H, W, 3) and counts (H, W); errors as of `cut`."""
+        """The sample of a whole frame, RGB (H, W, 3) and counts (H, W); errors as of `cut`."""
         levels = np.take(_grey_levels(*self.thermal_range), self.cut(counts, name))
         cut = np.ascontiguousarray(self.cut(pixels, name))
         return Sample(rgb=cut, thermal=levels, label=None, name=name)
 
     def cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
-        """What of a whole frame is read.
+        """The part of a whole frame that is read.
 
         Raises:
             InputError: the frame is smaller than the crop.

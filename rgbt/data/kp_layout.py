@@ -29,17 +29,17 @@ LABELS_OF = {False: "val_day", True: "val_night"}
 
 
 def set_of(name: str) -> int:
-    """Number of the recording of `name`; InputError where it is not a name."""
+    """Number of the recording of `name`; InputError if the name is invalid."""
     return int(parts_of(name)[0].removeprefix("set"))
 
 
 def is_night(name: str) -> bool:
-    """Whether `name` was recorded at night, by its set; InputError where it is not a name."""
+    """Whether `name` was recorded at night, by its set; InputError if the name is invalid."""
     return set_of(name) in NIGHT_SETS
 
 
 def sets_of(split: str) -> tuple[int, ...]:
-    """Recordings that `split` is made of where no list says; it is one of `SPLITS`."""
+    """Recordings of `split`, one of `SPLITS`, when no list is used."""
     base, _, time = split.partition("_")
     return tuple(
         number for number in SETS[base] if not time or (number in NIGHT_SETS) == (time == "night")
@@ -47,7 +47,7 @@ def sets_of(split: str) -> tuple[int, ...]:
 
 
 def parts_of(name: str) -> tuple[str, str, str]:
-    """Set, video and frame, as ("set00", "V000", "I00050"); InputError where it is not a name."""
+    """Set, video and frame, as ("set00", "V000", "I00050"); InputError if it is invalid."""
     if NAME.fullmatch(name) is None:
         raise InputError(
             f"'{name}' is not {FORM}; its files and its time of day are unknown; correct the name."

@@ -1,6 +1,6 @@
-"""MFNet and every data set in its layout: split lists, images, labels, day or night by name.
+"""MFNet and data sets in its layout: split lists, images, labels, time of day by name.
 
-A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ PALETTE = (
 
 
 class MFNet:
-    """RGB-thermal street scenes with labels, as the MFNet archive lays them out.
+    """RGB-thermal street scenes with labels, in the layout of the MFNet archive.
 
     Layouts (NAME is a line of a split list, five digits and D for day or N for night):
         packed:  images/NAME.png with channels R, G, B, thermal, and labels/NAME.png
         folders: RGB/NAME.png, Thermal/NAME.png (one channel, or three equal ones), Label/NAME.png
 
-    A name NAME_flip is read from its own files where a list names it; nothing is mirrored here.
+    A name NAME_flip in a list is read from its own files; nothing is mirrored here.
 
     Source: MFNet (Ha et al., IROS 2017), archive ir_seg_dataset; the folders layout is the one of
     the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
@@ -55,15 +55,15 @@ class MFNet:
 
     Args:
         root: folder that holds the split lists.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
         splits: split -> list file in `root`; two splits may share one list.
-        layout: "packed", "folders", or "auto" for the one whose folders exist (packed first).
+        layout: "packed", "folders", or "auto": the one with existing folders (packed first).
 
     Raises:
-        InputError: no such root, no known layout, numbers of classes, names and colours differ.
+        InputError: no such root, no known layout, or numbers of classes, names and colours differ.
     """
 
     images = GreyImages(
@@ -78,7 +78,7 @@ class MFNet:
     preparation = PREPARATION
 
     unscored: tuple[str, ...] = ()
-    """Every class counts in the means, as in the published tables."""
+    """Every class is scored, as in the published tables."""
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -102,7 +102,7 @@ class MFNet:
         self._names: dict[str, tuple[str, ...]] = {}
 
     def has(self, split: str) -> bool:
-        """Whether the list of `split` is there; InputError where the split is unknown."""
+        """Whether the list of `split` exists; InputError if the split is unknown."""
         return self.list_path(split).is_file()
 
     def names(self, split: str) -> tuple[str, ...]:
@@ -142,11 +142,11 @@ class MFNet:
         return (*self.image_paths(name), self.label_path(name))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {"layout": self.layout, "num_classes": self.num_classes}
 
     def is_night(self, name: str) -> bool:
-        """Whether the letter before the ending says night (N) and not day (D).
+        """Whether the last letter of the name, before the suffix, is N (night) and not D (day).
 
         Raises:
             InputError: the name ends in neither letter.
@@ -154,16 +154,16 @@ class MFNet:
         letter = base_name(name)[-1:]
         if letter not in ("D", "N"):
             raise InputError(
-                f"'{name}' does not say whether it is day or night: expected a name that ends in D "
-                f"or N (before '{MIRRORED}'); rename it in the split lists of {self.root}."
+                f"the name '{name}' has no time of day: expected a name that ends in D or N "
+                f"(before '{MIRRORED}'); rename it in the split lists of {self.root}."
             )
         return letter == "N"
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """`is_night` of every name; None where no name says whether it is day or night.
+        """`is_night` of every name; None if no name contains the time of day.
 
         Raises:
-            InputError: some names say so and others do not.
+            InputError: some names contain it and others do not.
         """
         if not any(base_name(name)[-1:] in ("D", "N") for name in names):
             return None
@@ -172,8 +172,8 @@ class MFNet:
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
-        Nothing is decoded and the root is left out, so that equal copies have equal fingerprints.
-        Splits without a list and files that are missing count as such.
+        Nothing is decoded. The root is left out, so that equal copies have equal fingerprints.
+        Splits without a list are empty; missing files have size -1.
         """
         listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(listed, self.files)

@@ -74,9 +74,9 @@ def test_splits_by_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     root = write_ms_uda(tmp_path)
     report = check_dataset(KP(str(root)))
     assert report.problems == ()
-    assert report.notes[0].startswith("no list is read: splits are all labels on disk")
+    assert report.notes[0].startswith("no list is read: all labels on disk are divided")
     assert run(root) == 0
-    assert "kp (KP as MS-UDA has it, splits from set numbers)" in capsys.readouterr().out
+    assert "kp (KP in the layout of MS-UDA, splits from set numbers)" in capsys.readouterr().out
 
 
 def test_an_image_of_void_alone(root: Path) -> None:
@@ -127,7 +127,7 @@ def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFix
         f"split train_day lists '{TRAIN[2]}', which was recorded at night (set03).",
         "split train is not train_day and train_night together: 1 names are in one of them alone, "
         f"the first is '{TRAIN[1]}'.",
-        "1 labels have names that say no set, the first is '00001D.png'.",
+        "1 labels have names without a set, the first is '00001D.png'.",
         f"no split names 1 labels on disk, the first is '{TEST[3]}.png'.",
     ):
         assert sum(text in problem for problem in found) == 1, text

@@ -104,12 +104,14 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
             r"split 'train_night' of freiburg is empty: expected train/seq_\*_night/.*",
         ),
         ("test", r"split 'test' .* unpack the archive 'test' there\."),
-        ("train", r"every day sequence is in dataset.val_sequences, leave one out of it\."),
+        ("train", r"every day sequence is in dataset.val_sequences, remove one of them\."),
     ):
         assert not dataset.has(split)
         with pytest.raises(InputError, match=said):
             dataset.names(split)
-    with pytest.raises(InputError, match=r"'val' .* is empty: .* it is \[\], name day sequences"):
+    with pytest.raises(
+        InputError, match=r"'val' .* is empty: .* it is \[\], name existing day sequences"
+    ):
         reader(tmp_path, val_sequences=()).names("val")
     with pytest.raises(InputError, match="no split 'tran'; did you mean 'train'"):
         dataset.names("tran")

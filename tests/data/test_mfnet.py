@@ -78,7 +78,7 @@ def test_day_and_night(write_mfnet) -> None:
     names = ["00001D", "00001N", "00001D_flip", "00001N_flip"]
     assert [dataset.is_night(name) for name in names] == [False, True, False, True]
     assert base_name("00001N_flip") == "00001N"
-    with pytest.raises(InputError, match="'frame7' does not say whether it is day or night"):
+    with pytest.raises(InputError, match="'frame7' has no time of day"):
         dataset.is_night("frame7")
 
 

@@ -1,6 +1,6 @@
-"""Which files of the KAIST download are labelled, and how they are divided.
+"""Files of the KAIST download that have labels of KP, and their splits.
 
-KAIST has 95 thousand pairs and KP labels of 950 of them; nothing else is copied. Part of
+KAIST has 95 thousand pairs, KP labels of 950 of them; nothing else is copied. Part of
 `rgbt.data.prepare`.
 """
 
@@ -19,17 +19,17 @@ from rgbt.data.prepare.plans import Download, Preparation, add_once, lists_in, t
 
 KINDS = ("visible", "lwir")
 IMAGE = re.compile(r"(?:^|/)(set\d\d)/(V\d{3})/(visible|lwir)/(I\d{5})\.jpg$")
-"""As KAIST has images, and the CRM release below its folder images."""
+"""Path of an image of KAIST, also in the CRM release."""
 
 FLAT_IMAGE = re.compile(r"(?:^|/)(set\d\d)_(V\d{3})_(visible|lwir)_(I\d{5})\.png$")
-"""As MS-UDA has them."""
+"""Path of an image of MS-UDA."""
 
 Target = Callable[[str, str], str]
-"""(name, kind) -> where an image belongs."""
+"""(name, kind) -> path of an image in the new folder."""
 
 LABEL = re.compile(r"(?:^|/)(set\d\d_V\d{3}_I\d{5})\.png$")
 BY_TIME = re.compile(r"(?:^|/)(?:val_day|val_night)/[^/]+$")
-"""Where MS-UDA has the labels drawn by hand; its other folders hold those of a network."""
+"""Labels drawn by hand in MS-UDA; its other folders contain those of a network."""
 
 
 def plan_kp(download: Download) -> list[Item]:
@@ -53,14 +53,14 @@ def plan_kp(download: Download) -> list[Item]:
 
 
 class _List(NamedTuple):
-    """A list as it will be written, and the names in it."""
+    """A list to be written, and its names."""
 
     content: SourceFile | bytes
     names: tuple[str, ...]
 
 
 def _labels(source: SourceFiles) -> dict[str, SourceFile]:
-    """Name -> label; those drawn by hand alone where the folders tell."""
+    """Name -> label; only those drawn by hand if there are folders of them."""
     files = [path for path in source.entries if LABEL.search(path)]
     by_hand = [path for path in files if BY_TIME.search(path)]
     found: dict[str, SourceFile] = {}
@@ -106,7 +106,7 @@ def _lists_of(source: SourceFiles) -> dict[str, _List]:
 
 
 def _images(source: SourceFiles, names: set[str]) -> tuple[Target, dict[str, SourceFile]]:
-    """Where images belong, and target -> file of those of `names`; all of one form."""
+    """The target of an image, and target -> file of the images of `names`; all of one form."""
     for pattern, target in ((IMAGE, _as_kaist), (FLAT_IMAGE, _as_ms_uda)):
         found: dict[str, SourceFile] = {}
         for path, entry in source.entries.items():

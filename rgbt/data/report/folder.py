@@ -1,4 +1,4 @@
-"""What is checked of somebody's own folder: lists, files without a partner, thermal values."""
+"""Checks of a user's own folder: lists, unused files, thermal values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rgbt.data.folder.dataset import Folder
 
 MOST_CLIPPED = 0.5
-"""Share of the thermal values of a split that may lie outside the range that is read."""
+"""Largest share of the thermal values of a split that may be outside `thermal_range`."""
 
 
 class _Clipped(NamedTuple):
@@ -35,22 +35,22 @@ class FolderChecks:
 
     @property
     def title(self) -> str:
-        """Where its images are."""
+        """The patterns of its images."""
         rgb, thermal, _ = self.dataset.patterns
         where = "channel 4" if self.dataset.packed else thermal.text
         return f"RGB {rgb.text}, thermal {where}"
 
     def repeats(self, split: str) -> bool:
-        """Parts of a split by time of day need not be there."""
+        """Parts of a split by time of day need not exist."""
         return split.endswith(("_day", "_night"))
 
     def times(self, names: tuple[str, ...]) -> DayNight:
-        """By `dataset.night`; none where it is not given."""
+        """By `dataset.night`; zeros if it is not given."""
         nights = self.dataset.nights(names)
         return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
 
     def thermal(self, name: str) -> ThermalStatistics | None:
-        """Values before they are grey levels; None where they are grey levels already."""
+        """Statistics of the values of the camera; None if the files hold grey levels."""
         limits = self.dataset.thermal_range
         if limits is None:
             return None
@@ -71,7 +71,7 @@ class FolderChecks:
         )
 
     def problems(self, lists: SplitNames) -> list[str]:
-        """Names given twice, files that no RGB image goes with, a range that misses the values."""
+        """Names listed twice, files without an RGB image, a range that excludes the values."""
         splits = self.dataset.splits
         return [
             *listed_twice(lists),
@@ -81,19 +81,17 @@ class FolderChecks:
         ]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """How much of the thermal values lies outside the range, and frames of no split."""
+        """Shares of thermal values outside the range, and frames of no split."""
         return [*self._outside(splits), *self._unlisted()]
 
     def _unused(self) -> list[str]:
-        """Thermal images and labels of which the RGB image is not there."""
+        """Thermal images and labels without an RGB image."""
         dataset = self.dataset
         _, *partners = dataset.patterns
         frames = dataset.frames.values()
         used = {path for frame in frames for path in (frame.rgb, frame.thermal, frame.label)}
-        matching = [
-            found for each in partners if each is not None for found in each.files(dataset.root)
-        ]
-        unused = sorted({found.path for found in matching} - used)
+        matches = [match for each in partners if each for match in each.files(dataset.root)]
+        unused = sorted({match.path for match in matches} - used)
         if not unused:
             return []
         return [

@@ -1,4 +1,4 @@
-"""What is checked of Freiburg Thermal alone: partners, frames in two parts, counts of thermal."""
+"""Checks of Freiburg Thermal: missing images, frames in two parts, thermal counts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FreiburgChecks:
         return DayNight(len(names) - nights, nights)
 
     def thermal(self, name: str) -> ThermalStatistics:
-        """Counts of what is cut out of the frame."""
+        """Statistics of the counts in the crop."""
         counts = self.dataset.counts(name)
         low, high = self.dataset.thermal_range
         filled = counts[counts > 0]
@@ -52,7 +52,7 @@ class FreiburgChecks:
         return [*self._unused(), *self._overlaps(lists)]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """How much of the thermal images lies outside the range that is read."""
+        """Shares of thermal pixels outside `thermal_range`."""
         low, high = self.dataset.thermal_range
         notes = []
         for split in splits:
@@ -77,7 +77,7 @@ class FreiburgChecks:
         ]
 
     def _overlaps(self, lists: SplitNames) -> list[str]:
-        """Names differ between the parts, so that frames are compared by their time stamps."""
+        """Frames in two parts, by their time stamps; names differ between the parts."""
         problems = []
         for test in ("test_day", "test_night"):
             for other in ("train_day", "train_night", "val"):

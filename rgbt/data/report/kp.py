@@ -1,4 +1,4 @@
-"""What is checked of KP alone: where its splits come from, days and nights, published numbers."""
+"""Checks of KP: source of its splits, days and nights, published numbers."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class KPChecks:
 
     @property
     def title(self) -> str:
-        """Which layout images and labels have, and who divides them."""
+        """The layout of images and labels, and the source of the splits."""
         images = "the CRM release" if self.dataset.has_images else "MS-UDA"
         origin = "list files" if self.dataset.lists == "files" else "set numbers"
-        return f"KP as {images} has it, splits from {origin}"
+        return f"KP in the layout of {images}, splits from {origin}"
 
     def repeats(self, split: str) -> bool:
         """Splits by time of day only repeat names of others."""
@@ -40,7 +40,7 @@ class KPChecks:
         return DayNight(len(names) - nights, nights)
 
     def thermal(self, name: str) -> None:
-        """Thermal images come as grey levels."""
+        """None: thermal images are grey levels."""
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice, in two splits or at the wrong time; labels that are in no split."""
@@ -53,29 +53,29 @@ class KPChecks:
         ]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """Who divides the images, and how the numbers differ from the published split."""
+        """The source of the splits, and differences from the published split."""
         notes = [self._division()]
         if self.dataset.name != "kp":
             return notes
         if self._is_ms_uda(splits):
             notes.append(
-                "training holds days and validation nights alone, as MS-UDA divides KP: scores do "
-                "not compare with those of CRM, which trains on both; dataset.lists=sets is CRM's "
-                "division."
+                "the training split has only days and the validation split only nights, as in "
+                "MS-UDA: scores are not comparable with those of CRM, which trains on both; "
+                "dataset.lists=sets divides as CRM does."
             )
         return [*notes, *other_times(splits, OFFICIAL_DAY_NIGHT), *other_sizes(splits, HW)]
 
     def _division(self) -> str:
         if self.dataset.lists == "sets":
             return (
-                "no list is read: splits are all labels on disk, divided by set numbers as in the "
-                "CRM release."
+                "no list is read: all labels on disk are divided into splits by set numbers, as in "
+                "the CRM release."
             )
         files = [path for split in self.dataset.splits for path in self.dataset.list_files(split)]
         return f"splits are read from the lists {', '.join(dict.fromkeys(files)) or '(none)'}."
 
     def _share_a_list(self, one: str, other: str) -> bool:
-        """Whether the configuration reads both from one file, as for a set without a test list."""
+        """Whether the configuration reads both from one file, for example without a test list."""
         return not set(self.dataset.list_files(one)).isdisjoint(self.dataset.list_files(other))
 
     def _is_ms_uda(self, splits: tuple[SplitReport, ...]) -> bool:
@@ -95,8 +95,7 @@ class KPChecks:
         problems = []
         if strange:
             problems.append(
-                f"{len(strange)} labels have names that say no set, the first is "
-                f"'{strange[0]}.png'."
+                f"{len(strange)} labels have names without a set, the first is '{strange[0]}.png'."
             )
         if len(unlisted) > len(strange):
             first = next(name for name in unlisted if name not in set(strange))
@@ -121,7 +120,7 @@ def _wrong_times(lists: SplitNames) -> list[str]:
 
 
 def _lists_that_disagree(lists: SplitNames) -> list[str]:
-    """Where all three are listed, a split is its day and its night."""
+    """Problems of splits that are not the union of their day and their night."""
     problems = []
     for split, names in lists.items():
         parts = [f"{split}_{time}" for time in TIMES]

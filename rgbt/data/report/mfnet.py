@@ -1,4 +1,4 @@
-"""What is checked of a data set in MFNet's layout alone: names, lists, the published numbers."""
+"""Checks of data sets in MFNet's layout: names, lists, the published numbers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MFNetChecks:
         return f"{self.dataset.layout} layout"
 
     def repeats(self, split: str) -> bool:
-        """SplitNames by time of day only repeat names of others, and letters tell the same."""
+        """Lists by time of day only repeat names of others, and need not exist."""
         return split.endswith(("_day", "_night")) and not self.dataset.has(split)
 
     def times(self, names: tuple[str, ...]) -> DayNight:
@@ -46,10 +46,10 @@ class MFNetChecks:
         return DayNight(letters["D"], letters["N"], sum(name.endswith(MIRRORED) for name in names))
 
     def thermal(self, name: str) -> None:
-        """Thermal images come as grey levels."""
+        """None: thermal images are grey levels."""
 
     def problems(self, lists: SplitNames) -> list[str]:
-        """Wrong names, names in two splits, files that no list names."""
+        """Wrong names, names in two splits, files in no list."""
         return [*_name_problems(lists), *shared(lists, self._share_a_list), *self._unlisted(lists)]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:

@@ -1,4 +1,4 @@
-"""What is checked of PST900 alone: the two parts, their recordings, pixels without thermal."""
+"""Checks of PST900: the two parts, their recordings, pixels without thermal values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PST900Checks:
 
     @property
     def title(self) -> str:
-        """Which of the two layouts it is."""
+        """One of the two layouts."""
         return f"PST900 in {'lists' if self.dataset.has_lists else 'folders'}"
 
     def repeats(self, split: str) -> bool:
@@ -41,7 +41,7 @@ class PST900Checks:
         return self._is_test(split) and split != "test"
 
     def times(self, names: tuple[str, ...]) -> DayNight:  # noqa: ARG002 - as every layout
-        """There is no day underground."""
+        """None: images are taken underground."""
         return DayNight(0, 0)
 
     def thermal(self, name: str) -> ThermalStatistics:
@@ -79,7 +79,7 @@ class PST900Checks:
         )
 
     def _unused(self, lists: SplitNames) -> list[str]:
-        """Files that no image of a split opens."""
+        """Files that belong to no sample of a split."""
         unused: list[Path] = []
         for folder in self.dataset.folders():
             with_rgb = names_in(folder / FOLDERS[0])
