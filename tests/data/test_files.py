@@ -273,7 +273,7 @@ def test_lists(tmp_path: Path) -> None:
     for wrong in ("00001D\n".encode("utf-16"), b"\x89PNG\r\n\x1a\n\0\0", b"a\0b\n"):
         path.write_bytes(wrong)
         with pytest.raises(
-            InputError, match=r"^dataset.splits.train: .* is no text in UTF-8; give"
+            InputError, match=r"^dataset.splits.train: .* is not a text in UTF-8; give"
         ):
             read_names(path, "dataset.splits.train")
     path.write_text(" \n\n")

@@ -628,7 +628,7 @@ def test_words_that_mean_nothing(mfnet: Path, tmp_path: Path) -> None:
         call("mfnt", mfnet, out)
     with pytest.raises(InputError, match=r"labels has no effect for dataset=mfnet"):
         call("mfnet", mfnet, out, labels=mfnet)
-    with pytest.raises(InputError, match=r"lists has no meaning for dataset=pst900"):
+    with pytest.raises(InputError, match=r"lists has no effect for dataset=pst900"):
         call("pst900", mfnet, out, lists=mfnet)
     with pytest.raises(InputError, match=r"source: there is no file or folder '.*nowhere'"):
         call("mfnet", tmp_path / "nowhere", out)

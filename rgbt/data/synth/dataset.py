@@ -36,7 +36,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     ego_forward_m: ForwardMetres | None = None,
     ego_yaw_deg: YawDegrees = 0.0,
 ) -> MFNet:
-    """The synthetic data set with these factors, generated if no earlier call has done so.
+    """The synthetic data set with these factors, generated on first use.
 
     Args:
         cache_dir: folder that holds written data sets; None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt.
@@ -59,7 +59,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     """
     if ego_forward_m is None and ego_yaw_deg != 0:
         raise InputError(
-            f"dataset.ego_yaw_deg is {ego_yaw_deg:g} but no second frame is asked for; "
+            f"dataset.ego_yaw_deg is {ego_yaw_deg:g} but no second frame is requested; "
             "set dataset.ego_forward_m too (0 to turn on the spot)."
         )
     motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)

@@ -34,7 +34,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     num_test: Annotated[int, Interval(ge=2, le=30_000)] = 60,
     factors: SceneFactors,
 ) -> Freiburg:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     Labels are exact, those for training too, which in the real data set a network has predicted.
     "ignore" is in test labels alone: what the thermal camera does not see.

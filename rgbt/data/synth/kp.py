@@ -28,7 +28,7 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> KP:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     Five of the 19 classes are in no scene (see `rgbt.data.synth.kp_classes`): where absent classes
     count as 0, as in the published tables, no network scores more than 14 / 19 = 73.7 %.

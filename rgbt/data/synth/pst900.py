@@ -29,7 +29,7 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> PST900:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     These are streets and no tunnels. They stand in for the files and for how rare the four objects
     are (about 1 % of the pixels each, as backpack and survivor are there; the other two are rarer):

@@ -2,7 +2,7 @@
 
 images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
 train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
-next/               the same names after the ego-motion, with flow/NAME.npy, where asked for
+next/               the same names after the ego-motion, with flow/NAME.npy, if requested
 """
 
 from __future__ import annotations
