@@ -43,19 +43,19 @@ class LabelledDataset(Protocol):
         ...
 
     def has(self, split: str) -> bool:
-        """Whether any image of `split` exists; InputError where the split is unknown."""
+        """Whether any image of `split` exists; InputError if the split is unknown."""
         ...
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order; InputError where it is unknown, missing or empty."""
+        """Names of a split, in order; InputError if it is unknown, missing or empty."""
         ...
 
     def read(self, name: str) -> Sample:
-        """One sample; InputError where it cannot be read."""
+        """One sample; InputError if it cannot be read."""
         ...
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone, (H, W); None where the pair is unlabelled."""
+        """The label of `read` alone, (H, W); None if the pair is unlabelled."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
@@ -67,7 +67,7 @@ class LabelledDataset(Protocol):
         ...
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night; None where the data set does not state it."""
+        """Whether each image was taken at night; None if the data set does not state it."""
         ...
 
     def fingerprint(self) -> str:

@@ -96,7 +96,7 @@ class BatchTransform(Protocol):
         ...
 
     def stack(self, drawn: Sequence[Any]) -> Loadable:
-        """Examples of one size; InputError where they differ."""
+        """Examples of one size; InputError if they differ."""
         ...
 
 

@@ -117,7 +117,7 @@ class Domains:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Names of the heads, the source's first; () where the network has one for all."""
+        """Names of the heads, the source's first; () if the network has one for all."""
         return tuple(dict.fromkeys(head for head in self._own_heads() if head is not None))
 
     def heads_in_words(self, choice: TestedHead) -> str:

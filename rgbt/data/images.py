@@ -27,7 +27,7 @@ class PairPattern(NamedTuple):
     Attributes:
         rgb: of the RGB images.
         thermal: of the thermal images; equal to `rgb` where thermal is the fourth channel.
-        label: of the labels, which are not read as images; None where they lie elsewhere.
+        label: of the labels, which are not read as images; None if they lie elsewhere.
     """
 
     rgb: str

@@ -183,7 +183,7 @@ class MFNet:
         return MFNetChecks(self)
 
     def list_path(self, split: str) -> Path:
-        """The list file of `split`; InputError where the split is unknown."""
+        """The list file of `split`; InputError if the split is unknown."""
         check_split(split, self.splits)
         return self.root / self.splits[split]
 

@@ -72,7 +72,7 @@ def pair_of_one_size(name: str, rgb: Array, thermal: Array, path: Path) -> Sampl
 
 
 def with_label(pair: Sample, label: Array | None, path: Path | None) -> Sample:
-    """`pair` with its label (H, W), read from `path`; InputError where the sizes differ."""
+    """`pair` with its label (H, W), read from `path`; InputError if the sizes differ."""
     if label is not None:
         check_size(pair.rgb, "its label", label, pair.name, path)
     return replace(pair, label=label)
@@ -97,7 +97,7 @@ def hash_of_files(
 
     Args:
         splits: split -> its names; () where the split is not there.
-        files: name -> its files; those that are missing count as such.
+        files: name -> its files; a missing file has size -1.
     """
     sizes: dict[str, list[int]] = {}
     digest = hashlib.sha256()
@@ -111,17 +111,17 @@ def hash_of_files(
 
 
 def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
-    """The folder just above or below `root` that is one; None where there is none.
+    """The folder directly above or below `root` that is a root; None if there is none.
 
     Args:
-        root: a folder that is no root.
+        root: a folder that is not a root.
         holds: whether a folder is the root of a data set.
     """
 
     def is_one(folder: Path) -> bool:
         try:
             return holds(folder)
-        except OSError:  # a neighbour that may not be looked into is nothing to point to
+        except OSError:  # no permission
             return False
 
     return next(filter(is_one, (root.absolute().parent, *sorted(root.iterdir()))), None)
@@ -141,7 +141,7 @@ def check_lengths(
 
 def size_of(path: Path) -> int:
     """Bytes of a file, -1 if it is missing."""
-    # A name that leads through a file instead of a folder is missing as well.
+    # A path through a file instead of a folder is missing as well.
     try:
         return path.stat().st_size
     except (FileNotFoundError, NotADirectoryError):

@@ -192,7 +192,7 @@ class PST900:
         return read_label(within(self.files(name)[2], self.root), self.num_classes)
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; InputError where no part or both have it."""
+        """RGB, thermal and label of `name`; InputError if no part or both have it."""
         folders = self._folders(name)
         if len(folders) != 1:
             reason = "both train and test have" if folders else "neither train nor test has"

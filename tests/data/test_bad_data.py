@@ -166,7 +166,7 @@ def outside(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_check_tells_each_in_one_line(kind: str, tmp_path: Path, outside: Path) -> None:
+def test_check_reports_each_problem_in_one_line(kind: str, tmp_path: Path, outside: Path) -> None:
     make, root = KINDS[kind].make, KINDS[kind].write(tmp_path / "data")
     sound = check_dataset(make(root)).problems
     name = make(root).names("test")[0]
@@ -183,7 +183,7 @@ def test_the_check_tells_each_in_one_line(kind: str, tmp_path: Path, outside: Pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_may_not_be_read(
+def test_file_without_permission_is_refused(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Permission is taken away here and not on the disk, where it would not bind root."""

@@ -89,7 +89,7 @@ def test_an_image_of_void_alone(root: Path) -> None:
     assert val.images.tolist() == [0] * 19 + [2]
 
 
-def test_the_division_of_ms_uda_is_told(root: Path) -> None:
+def test_division_of_ms_uda_gives_note(root: Path) -> None:
     def told() -> bool:
         return any("as MS-UDA divides KP" in note for note in check_dataset(KP(str(root))).notes)
 
@@ -105,7 +105,7 @@ def test_the_division_of_ms_uda_is_told(root: Path) -> None:
     assert not told()
 
 
-def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_problem_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_lists(
         root,
         {
@@ -141,7 +141,7 @@ def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFix
     assert lines == [f"problem: {problem}" for problem in found]
 
 
-def test_splits_that_are_read_from_one_list(root: Path) -> None:
+def test_splits_of_one_list_may_share_names(root: Path) -> None:
     (root / "test.txt").unlink()
     splits = {"train": "train.txt", "val": "val.txt", "val_day": "val_day.txt", "test": "val.txt"}
     report = check_dataset(KP(str(root), splits=splits))

@@ -31,7 +31,7 @@ def two(target_is: str, **changes: Any) -> Domains:
 
 @pytest.mark.parametrize("labels", ["given", "none", "/some/folder"])
 @pytest.mark.parametrize("setting", [{"threshold": 0.5}, {"teacher_view": "thermal"}])
-def test_settings_of_a_teacher_without_one_are_refused(labels: str, setting: dict) -> None:
+def test_teacher_settings_without_teacher_are_refused(labels: str, setting: dict) -> None:
     with pytest.raises(InputError, match=f"with labels={labels} they have no effect"):
         domain(labels=labels, **setting)
     assert domain(labels="experiment:x/best.pt", **setting).labels.startswith("experiment:")
@@ -46,12 +46,12 @@ def test_confidence_needs_pseudo_labels(labels: str) -> None:
 
 
 @pytest.mark.parametrize(("source", "target"), [("day", None), (None, "dark")])
-def test_one_domain_alone_with_a_head_is_refused(source: str | None, target: str | None) -> None:
+def test_single_head_is_refused(source: str | None, target: str | None) -> None:
     with pytest.raises(InputError, match=f"got {source or 'null'} and {target or 'null'}"):
         domains(source=domain(head=source), target=domain(head=target))
 
 
-def test_target_is_goes_with_two_heads_and_only_with_them() -> None:
+def test_target_is_requires_two_heads() -> None:
     with pytest.raises(InputError, match="domains.target_is=null with 2 heads"):
         domains(source=domain(head="a"), target=domain(head="b"))
     for named in ("view", "night"):
@@ -68,7 +68,7 @@ def test_a_choice_of_heads_needs_two(head: str | None) -> None:
 
 
 @pytest.mark.parametrize("view", [None, "rgb"])
-def test_two_domains_of_one_view_are_not_told_apart_by_it(view: View | None) -> None:
+def test_target_is_view_requires_two_views(view: View | None) -> None:
     with pytest.raises(InputError, match="target_is=view"):
         domains(
             source=domain(view="rgb", head="a"),

@@ -230,7 +230,7 @@ def test_label_values(root: Path) -> None:
     assert found[0, 4] == 1
 
 
-def test_label_values_are_class_indices_unless_said_otherwise(root: Path) -> None:
+def test_label_values_are_class_indices_by_default(root: Path) -> None:
     path = root / "train" / "mask" / "1.png"
     label = np.full(HW, 2, np.uint8)
     label[0, 0] = 255
@@ -381,7 +381,7 @@ def test_a_sound_data_set(sound: Path) -> None:
     )
 
 
-def test_every_kind_of_problem_in_one_line(root: Path) -> None:
+def test_each_problem_is_one_line(root: Path) -> None:
     write_frame(root, "extra", "1")
     (root / "test" / "rgb" / "2.png").unlink()
     (root / "list.txt").write_text("train_1\ntrain_1\nval_1\nlost_1\n")

@@ -51,7 +51,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("rgb/{frame}.png", "has frame but no name; write {name}"),
     ],
 )
-def test_texts_that_are_no_patterns(sound: Path, text: str, said: str) -> None:
+def test_invalid_patterns_are_refused(sound: Path, text: str, said: str) -> None:
     sentence = refused(lambda: folder(sound, rgb=text))
     assert sentence.startswith("dataset.rgb: ")
     assert said in sentence
@@ -113,7 +113,7 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
     )
 
 
-def test_partners_that_are_not_there(root: Path) -> None:
+def test_missing_partners_are_refused(root: Path) -> None:
     assert refused(lambda: folder(root, thermal="{split}/ir/{name}.tif")) == (
         "dataset.thermal: '{split}/ir/{name}.tif' matches no existing file: the first would be "
         f"{root}/test/ir/1.tif, but ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
@@ -149,7 +149,7 @@ def test_two_files_of_one_name(root: Path) -> None:
     )
 
 
-def test_a_folder_that_may_not_be_listed(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_permission_is_refused(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def deny(_: object) -> list[str]:
         raise PermissionError(13, "Permission denied")
 
@@ -179,7 +179,7 @@ def test_splits_by_folder(sound: Path) -> None:
         assert "did you mean 'test'" in said
 
 
-def test_who_says_what_a_split_is(sound: Path) -> None:
+def test_splits_have_one_definition(sound: Path) -> None:
     lists, shares = {"train": "train.txt"}, {"train": 1.0}
     assert refused(lambda: folder(sound, lists=lists)).startswith(
         "dataset: dataset.lists and {split} in dataset.rgb both define the splits; keep one"
@@ -276,7 +276,7 @@ def test_shares_of_blocks() -> None:
         assert rule.has(split)
 
 
-def test_two_cameras_of_one_moment_stay_together() -> None:
+def test_shares_keep_cameras_of_one_moment_together() -> None:
     sides = ("left", "right")
     frames = frames_of(*(f"{side}/s/{number}" for side in sides for number in range(1, 7)))
     rule = drawn(frames, block=4, shares={"train": 0.4, "val": 0.3, "test": 0.3})

@@ -67,7 +67,7 @@ def test_night_is_what_the_path_says(root: Path) -> None:
         dataset.nights(("other",))
 
 
-def test_a_root_that_says_night_is_no_night(tmp_path: Path) -> None:
+def test_night_in_root_is_ignored(tmp_path: Path) -> None:
     dataset = reader(write_freiburg(tmp_path / "night_drives"))
     assert dataset.nights(dataset.names("test")) == (False, False, True, True)
 
@@ -121,7 +121,7 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("time", ["day", "night"])
-def test_stamps_of_test_thermal_may_lack_the_last_zero(tmp_path: Path, time: str) -> None:
+def test_stamp_of_thermal_may_lack_last_zero(tmp_path: Path, time: str) -> None:
     files.write_test(tmp_path, time, "1570_120", thermal="1570_12")
     files.write_test(tmp_path, time, "1571_130", thermal="1571_130")
     dataset = reader(tmp_path)
@@ -132,7 +132,7 @@ def test_stamps_of_test_thermal_may_lack_the_last_zero(tmp_path: Path, time: str
         assert dataset.read(name).label is not None
 
 
-def test_two_frames_with_one_thermal_image_are_refused(tmp_path: Path) -> None:
+def test_shared_thermal_image_is_refused(tmp_path: Path) -> None:
     files.write_test(tmp_path, "day", "1570_120", thermal="1570_12")
     files.write_test(tmp_path, "day", "1570_12")
     with pytest.raises(InputError, match=r"would both have .*1570_12_ir.png as their thermal"):
@@ -287,9 +287,7 @@ def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
 
 
 @pytest.mark.parametrize("hw", [(39, 78), (15, 30), (11, 22)])
-def test_labels_of_another_size_are_read_at_the_nearest_pixel(
-    root: Path, hw: tuple[int, int]
-) -> None:
+def test_label_of_other_size_is_resized(root: Path, hw: tuple[int, int]) -> None:
     dataset = reader(root, crop=None, ignored_test=())
     label = files.contents("label", hw)[2]
     write_png(path_of(dataset, "seq_00_day_00_1570_0000", "label"), label)
@@ -319,7 +317,7 @@ def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) ->
 @pytest.mark.parametrize(
     ("ignored", "gone"), [(("ignore",), [13]), ((), []), (("background", "ignore"), [12, 13])]
 )
-def test_what_is_ignored_is_so_in_testing_alone(
+def test_ignored_test_applies_to_test_only(
     root: Path, ignored: tuple[str, ...], gone: list[int]
 ) -> None:
     dataset = reader(root, ignored_test=ignored, crop=None)

@@ -219,7 +219,7 @@ def test_raise_names_the_damaged_file(dataset: MFNet, workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_skip_in_training_takes_the_next_of_the_list(
+def test_skip_in_training_reads_next_name(
     dataset: MFNet, workers: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     intact = list(train_batches(dataset, "train", crm(), settings(), 0, range(4)))
@@ -356,9 +356,7 @@ def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
         batch(None, 0.75)
 
 
-def test_full_shared_memory_is_reported_and_does_not_hang(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_shared_memory_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("unable to allocate shared memory(shm): No space left on device (28)")
 
@@ -368,7 +366,7 @@ def test_full_shared_memory_is_reported_and_does_not_hang(
         next(batches)
 
 
-def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
+def test_full_shared_memory_before_start_is_reported(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse() -> None:
@@ -380,9 +378,7 @@ def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
     assert told.value.__suppress_context__, "told once, not as a full disk as well"
 
 
-def test_a_killed_worker_is_reported_in_one_sentence(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     main = os.getpid()
 
     def die(_: str) -> Sample:

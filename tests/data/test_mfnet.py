@@ -179,7 +179,7 @@ def test_refuses_sizes_that_differ(write_mfnet, png) -> None:
         MFNet(str(root)).read("00001D")
 
 
-def test_refuses_labels_out_of_range_but_not_ignore(write_mfnet, png) -> None:
+def test_labels_out_of_range_are_refused(write_mfnet, png) -> None:
     root = write_mfnet({"train": ["00001D"]})
     label = np.zeros((24, 32), np.uint8)
     label[0, :2] = (8, 255)

@@ -124,7 +124,7 @@ def test_mfnet_in_three_folders(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "test_day.txt").read_text() == "01402D\n"
 
 
-def test_mirrored_copies_are_kept_where_a_list_names_them(tmp_path: Path) -> None:
+def test_listed_mirrored_copies_are_copied(tmp_path: Path) -> None:
     names = {**MF, "train": [*MF["train"], "00001D_flip", "00002N_flip"]}
     root = write_data(tmp_path / "in", names, (6, 8))
     assert call("mfnet", root, tmp_path / "out") == 0
@@ -136,7 +136,7 @@ def test_mirrored_copies_are_kept_where_a_list_names_them(tmp_path: Path) -> Non
     )
 
 
-def test_mfnet_that_is_not_complete(mfnet: Path, tmp_path: Path) -> None:
+def test_incomplete_mfnet_is_refused(mfnet: Path, tmp_path: Path) -> None:
     (mfnet / "labels" / "00003D.png").unlink()
     (mfnet / "images" / "00002N.png").unlink()
     with pytest.raises(
@@ -150,14 +150,14 @@ def test_mfnet_that_is_not_complete(mfnet: Path, tmp_path: Path) -> None:
         call("mfnet", mfnet, tmp_path / "out")
 
 
-def test_a_list_cannot_reach_out_of_the_download(mfnet: Path, tmp_path: Path) -> None:
+def test_list_with_outside_path_is_refused(mfnet: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "in" / "images" / "x.png", np.zeros((6, 8, 4), np.uint8))
     (mfnet / "train.txt").write_text("../../images/x\n")
     with pytest.raises(InputError, match="2 files that lists name are not in"):
         call("mfnet", mfnet, tmp_path / "out")
 
 
-def test_which_of_several(mfnet: Path, tmp_path: Path) -> None:
+def test_several_copies_are_refused(mfnet: Path, tmp_path: Path) -> None:
     shutil.copytree(mfnet, mfnet.parent / "copy")
     with pytest.raises(InputError, match=r"several times \(copy/, ir_seg_dataset/\)"):
         call("mfnet", mfnet.parent, tmp_path / "out")
@@ -279,7 +279,7 @@ def test_kp_with_lists_of_ones_own(tmp_path: Path) -> None:
         call("kp", source, tmp_path / "b", labels=labels, lists=source)
 
 
-def test_kp_that_is_not_complete(tmp_path: Path) -> None:
+def test_incomplete_kp_is_refused(tmp_path: Path) -> None:
     source, labels = kaist(tmp_path)
     with pytest.raises(InputError, match=r"source: there is no label such as .*labels=\.\.\."):
         call("kp", source, tmp_path / "out")
@@ -297,7 +297,7 @@ def test_kp_that_is_not_complete(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_lists_of_kp_are_those_of_the_release(tmp_path: Path) -> None:
+def test_lists_of_kp_equal_release(tmp_path: Path) -> None:
     published = SHARED / "realdata" / "kp_names"
     if not published.is_dir():
         pytest.skip("published lists are not part of the repository")
@@ -367,7 +367,7 @@ class Stop(BaseException):
 
 
 @pytest.mark.parametrize("number", [0, 1, 7, 16])
-def test_interrupted_it_goes_on(
+def test_interrupted_command_resumes(
     mfnet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     """Stopped in the middle of a file, it leaves whole files, which are not copied again."""
@@ -397,7 +397,7 @@ def test_interrupted_it_goes_on(
     assert {path: (out / path).stat().st_ino for path in whole} == before
 
 
-def test_done_it_checks_again(
+def test_repeated_command_checks_again(
     mfnet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -437,7 +437,7 @@ def test_a_repaired_download_is_copied_again(mfnet: Path, tmp_path: Path) -> Non
     assert (out / "labels" / "00002N.png").read_bytes() == label.read_bytes()
 
 
-def test_files_that_the_download_does_not_hold(tmp_path: Path) -> None:
+def test_other_files_in_out_are_refused(tmp_path: Path) -> None:
     """A reader that lists folders would take them for images of the split."""
     source, out = pst900_files.write_pst900(tmp_path / "in"), tmp_path / "out"
     assert call("pst900", source, out) == 0
@@ -461,7 +461,7 @@ def test_files_that_the_download_does_not_hold(tmp_path: Path) -> None:
     assert lost not in PST900(str(out)).names("train")
 
 
-def test_what_is_wrong_with_the_download_is_told(
+def test_problems_of_download_are_reported(
     mfnet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_png(mfnet / "labels" / "00001D.png", np.full((6, 8), 77, np.uint8))
@@ -469,7 +469,7 @@ def test_what_is_wrong_with_the_download_is_told(
     assert "label value 77 is out of range" in capsys.readouterr().out
 
 
-def test_a_folder_that_is_not_ours(mfnet: Path, tmp_path: Path) -> None:
+def test_foreign_out_folder_is_refused(mfnet: Path, tmp_path: Path) -> None:
     for out in (mfnet, mfnet / "new", mfnet / "images" / ".." / "new"):
         with pytest.raises(InputError, match=r"out: .* lies in .* outside"):
             call("mfnet", mfnet, out)
@@ -494,7 +494,7 @@ def test_a_folder_that_is_not_ours(mfnet: Path, tmp_path: Path) -> None:
         call("mfnet", mfnet, tmp_path / "out")
 
 
-def test_one_at_a_time(mfnet: Path, tmp_path: Path) -> None:
+def test_second_process_is_refused(mfnet: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     plan = {"dataset": "mfnet", "source": str(mfnet.resolve())}
@@ -506,7 +506,7 @@ def test_one_at_a_time(mfnet: Path, tmp_path: Path) -> None:
     assert call("mfnet", mfnet, out) == 0
 
 
-def test_a_disk_that_is_too_small(
+def test_too_small_disk_is_refused(
     mfnet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage("/")
@@ -528,7 +528,7 @@ def test_a_disk_that_is_too_small(
     assert call("mfnet", mfnet, tmp_path / "out") == 0
 
 
-def test_a_download_that_still_grows(
+def test_growing_download_is_refused(
     mfnet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chunks = prepare_copy.Item.chunks
@@ -541,7 +541,7 @@ def test_a_download_that_still_grows(
 @pytest.mark.parametrize(
     "name", ["../x.png", "/etc/x.png", "a/../../x.png", "..\\x.png", "C:/x.png"]
 )
-def test_an_archive_that_leads_out(tmp_path: Path, name: str) -> None:
+def test_archive_with_outside_path_is_refused(tmp_path: Path, name: str) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as writer:
         writer.writestr("images/00001D.png", b"1")
         writer.writestr(name, b"1")
@@ -574,7 +574,7 @@ def test_links_in_a_folder_are_copied_as_files(mfnet: Path, tmp_path: Path) -> N
     assert not any(path.is_symlink() for path in (tmp_path / "out").rglob("*"))
 
 
-def test_files_come_before_those_of_an_archive_beside_them(mfnet: Path, tmp_path: Path) -> None:
+def test_files_have_precedence_over_archive(mfnet: Path, tmp_path: Path) -> None:
     archive = zipped(mfnet, mfnet.parent / "ir_seg_dataset.zip", "ir_seg_dataset")
     (mfnet / "train.txt").write_text("00001D\n")
     with SourceFiles(mfnet.parent, "source", r"ir_seg_dataset\.zip") as source:
@@ -607,7 +607,7 @@ def test_damaged_archives(mfnet: Path, tmp_path: Path) -> None:
         call("mfnet", tmp_path / "locked.zip", tmp_path / "new")
 
 
-def test_files_that_cannot_be_read(
+def test_unreadable_files_are_refused(
     mfnet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = Path.open
@@ -622,7 +622,7 @@ def test_files_that_cannot_be_read(
         call("mfnet", mfnet, tmp_path / "out")
 
 
-def test_words_that_mean_nothing(mfnet: Path, tmp_path: Path) -> None:
+def test_arguments_without_effect_are_refused(mfnet: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(InputError, match=r"dataset: 'mfnt' is not a choice; did you mean 'mfnet'"):
         call("mfnt", mfnet, out)

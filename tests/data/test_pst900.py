@@ -218,7 +218,7 @@ def test_refuses_sizes_that_differ(root: Path) -> None:
         PST900(str(root)).read(name)
 
 
-def test_refuses_labels_out_of_range_but_not_ignore(root: Path) -> None:
+def test_labels_out_of_range_are_refused(root: Path) -> None:
     path = root / "train/labels" / f"{TRAIN[0]}.png"
     label = np.zeros(HW, np.uint8)
     label[0, :2] = (4, 255)

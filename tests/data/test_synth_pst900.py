@@ -59,7 +59,7 @@ def test_files_hold_the_scenes(data: PST900) -> None:
         assert np.array_equal(sample.label, CLASS_OF[scene.label])
 
 
-def test_the_files_are_of_the_kind_that_pst900_has(data: PST900) -> None:
+def test_files_have_format_of_pst900(data: PST900) -> None:
     assert sorted(str(path.relative_to(data.root)) for path in data.root.glob("*/*")) == [
         f"{part}/{kind}" for part in ("test", "train") for kind in ("labels", "rgb", "thermal")
     ]
@@ -94,7 +94,7 @@ def test_classes_by_hand() -> None:
     assert len(CLASS_OF) == 9
 
 
-def test_the_four_objects_are_rare_and_there() -> None:
+def test_four_objects_are_present_and_rare() -> None:
     factors = SceneFactors(width=214, field_of_view_deg=80.0)
     counts = [
         np.bincount(CLASS_OF[render_scene(0, index, factors).label].ravel(), minlength=5)
@@ -119,7 +119,7 @@ def test_equal_plans_give_equal_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all((alone / path).read_bytes() == (pooled / path).read_bytes() for path in found)
 
 
-def test_the_cache_is_used_again_and_named_by_the_plan(
+def test_folder_is_reused_and_named_by_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = plan(num_train=1, num_val=1, num_test=1)
@@ -134,13 +134,13 @@ def test_the_cache_is_used_again_and_named_by_the_plan(
             assert cached(small, tmp_path) != folder
 
 
-def test_a_bag_that_is_not_there_is_named(data: PST900) -> None:
+def test_missing_bag_is_refused(data: PST900) -> None:
     other = synth_pst900(cache_dir=str(data.root.parent), **SMALL, val_bags=(33,))
     with pytest.raises(InputError, match=r"dataset.val_bags: .* has no bag 33"):
         other.names("val")
 
 
-def test_the_yaml_names_every_setting_with_its_default() -> None:
+def test_yaml_has_every_setting_with_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_pst900"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.pst900.synth_pst900"

@@ -29,7 +29,7 @@ MISSING = FileState(-1, 0, 0, 0, 0)
 
 
 def state_of(path: Path) -> FileState:
-    """The present state of a file; `MISSING` where it cannot be accessed."""
+    """The present state of a file; `MISSING` if it cannot be accessed."""
     return FileState(*_status(path), _crc(path))
 
 

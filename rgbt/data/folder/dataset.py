@@ -141,7 +141,7 @@ class Folder:
         return self._rule.splits
 
     def has(self, split: str) -> bool:
-        """Whether any frame of `split` exists; InputError where the split is unknown."""
+        """Whether any frame of `split` exists; InputError if the split is unknown."""
         self._check_split(split)
         return self._rule.has(split)
 
@@ -234,7 +234,7 @@ class Folder:
         return FolderChecks(self)
 
     def frame(self, name: str) -> FolderFrame:
-        """The files of `name`; InputError where there is no such frame."""
+        """The files of `name`; InputError if there is no such frame."""
         if name not in self.frames:
             raise InputError(
                 f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "

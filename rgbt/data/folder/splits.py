@@ -68,7 +68,7 @@ class ByFolder:
         return bool(self._of(split))
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in its folder; InputError where there are none."""
+        """Names in its folder; InputError if there are none."""
         names = self._of(split)
         if not names:
             known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
@@ -114,7 +114,7 @@ class ByList:
     def names(self, split: str) -> tuple[str, ...]:
         """Names in the order of the list.
 
-        A line that is no frame stays as it is, so that reading it says so; InputError where none
+        A line that is no frame stays as it is, so that reading it says so; InputError if none
         is, or there is no such list.
         """
         path, key = self._path(split), f"dataset.lists.{split}"

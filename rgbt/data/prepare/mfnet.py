@@ -1,4 +1,4 @@
-"""Files of a download of MFNet: what the lists name, the lists, and lists by time of day."""
+"""Files of a download of MFNet: the lists, their files, and lists by time of day."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TIMES = {"D": "day", "N": "night"}
 
 
 def plan_mfnet(download: Download) -> list[Item]:
-    """What the lists name, the lists, and lists of day and night where there are none.
+    """The lists and their files, and lists of day and night if there are none.
 
     Raises:
         InputError: no folders of images and labels, no list, or files that a list names and that
@@ -58,7 +58,7 @@ def _base(source: SourceFiles) -> tuple[str, str]:
 
 
 def _by_time(lists: dict[str, SourceFile]) -> list[Item]:
-    """Lists of the day and of the night of the test list, by the letters, if neither is there."""
+    """Lists of days and nights of the test list, by the letters, if there is neither."""
     test = SPLITS["test"]
     targets = {letter: SPLITS[f"test_{time}"] for letter, time in TIMES.items()}
     if test not in lists or not set(targets.values()).isdisjoint(lists):

@@ -57,7 +57,7 @@ class Preparable(Protocol):
 
 
 def lists_in(source: SourceFiles, base: str, splits: Mapping[str, str]) -> dict[str, SourceFile]:
-    """Name of a list -> the list, of those that lie in the folder `base` of `source`."""
+    """Name of a list -> the list, of those in the folder `base` of `source`."""
     return {
         name: source.entries[base + name]
         for name in splits.values()
@@ -71,7 +71,7 @@ def text_of(names: Iterable[str]) -> bytes:
 
 
 def add_once(found: dict[str, SourceFile], key: str, entry: SourceFile) -> None:
-    """Note the file that becomes `key`; InputError where there are two."""
+    """Add the file that becomes `key`; InputError if there are two."""
     if key in found:
         raise InputError(
             f"{found[key]} and {entry} would both be {key}; move one of them out of the download."
@@ -80,12 +80,12 @@ def add_once(found: dict[str, SourceFile], key: str, entry: SourceFile) -> None:
 
 
 def base_of(source: SourceFiles, holds: Callable[[Callable[[str], bool]], bool], what: str) -> str:
-    """Beginning of the paths in the one folder of least depth that `holds` says is the right one.
+    """Prefix of the paths in the one folder of least depth for which `holds` is true.
 
     Args:
         source: the download.
-        holds: gets whether a folder of some name is inside.
-        what: it should hold, for the message.
+        holds: called with a function that returns whether a folder is inside.
+        what: expected content, for the message.
     """
     folders = source.folders()
     bases = ["" if folder == "" else f"{folder}/" for folder in folders]
