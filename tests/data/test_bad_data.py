@@ -122,7 +122,7 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept;"),
     "a link to nowhere": (partial(move, link="gone"), "is missing: it is a link to .*/gone, where"),
     "another depth": (change_depth, "expected 8 bits|of 16 bits|whole numbers|got 8 bits"),
-    "another size": (change_size, r"is \d+x\d+ pixels but|which is another shape"),
+    "another size": (change_size, r"is \d+x\d+ pixels but|which is another aspect ratio"),
     "an unknown value": (change_values, "label value 77 "),
 }
 

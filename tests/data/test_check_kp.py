@@ -61,7 +61,7 @@ def test_a_sound_data_set(root: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert report.notes[-1].startswith("images are 16x24, the original ones 512x640")
     assert run(root) == 0
     output = capsys.readouterr().out
-    assert "kp (KP as the CRM release has it, splits from list files)" in output
+    assert "kp (KP in the layout of the CRM release, splits from list files)" in output
     assert "0 problem(s)" in output
 
 
@@ -90,19 +90,19 @@ def test_an_image_of_void_alone(root: Path) -> None:
 
 
 def test_division_of_ms_uda_gives_note(root: Path) -> None:
-    def told() -> bool:
-        return any("as MS-UDA divides KP" in note for note in check_dataset(KP(str(root))).notes)
+    def has_note() -> bool:
+        return any("as in MS-UDA" in note for note in check_dataset(KP(str(root))).notes)
 
     days = [name for name in NAMES if name[:5] in ("set00", "set02", "set06", "set07", "set08")]
     nights = [name for name in NAMES if name not in days]
-    assert not told()
+    assert not has_note()
     write_lists(root, {"train": days, "val": nights, "test": nights})
-    assert told()
+    assert has_note()
     # A day of CRM to train on and one of its nights to validate on is no division of MS-UDA.
     write_lists(root, {"train": TRAIN[:2], "val": VAL[1:]})
-    assert not told()
+    assert not has_note()
     write_lists(root, {"train": [*days, TRAIN[2]], "val": VAL[1:]})
-    assert not told()
+    assert not has_note()
 
 
 def test_each_problem_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

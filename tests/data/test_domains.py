@@ -131,11 +131,11 @@ def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> Non
     ],
     ids=["view", "night", "tested with one"],
 )
-def test_which_head_predicts_what_in_words(found: Domains, own: str) -> None:
+def test_heads_in_words_names_heads(found: Domains, own: str) -> None:
     """As asked, not as configured: the caller knows whether another one was asked for."""
-    assert found.told("own") == own
-    assert found.told("source") == "day for all images"
-    assert found.told("target") == "dark for all images"
+    assert found.heads_in_words("own") == own
+    assert found.heads_in_words("source") == "day for all images"
+    assert found.heads_in_words("target") == "dark for all images"
 
 
 @pytest.mark.parametrize(
@@ -148,6 +148,6 @@ def test_which_head_predicts_what_in_words(found: Domains, own: str) -> None:
     ],
     ids=["none", "one", "two domains", "one of two domains"],
 )
-def test_one_head_is_not_told_of(found: Domains) -> None:
+def test_heads_in_words_is_empty_for_one_head(found: Domains) -> None:
     for asked in ("own", "source", "target"):
-        assert found.told(asked) == ""
+        assert found.heads_in_words(asked) == ""

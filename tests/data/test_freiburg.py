@@ -75,7 +75,7 @@ def test_night_in_root_is_ignored(tmp_path: Path) -> None:
 @pytest.mark.parametrize("folder", ["seq_05_dusk", "seq_05_day_and_night"])
 def test_a_sequence_of_no_time_is_refused(root: Path, folder: str) -> None:
     (root / "train" / folder / "00").mkdir(parents=True)
-    with pytest.raises(InputError, match=rf"{folder}: expected the name of a sequence to say day"):
+    with pytest.raises(InputError, match=rf"{folder}: expected a name of a sequence with day"):
         reader(root).names("test")
 
 
@@ -309,8 +309,8 @@ def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) ->
     with pytest.raises(InputError) as caught:
         dataset.read("seq_00_day_00_1570_0000")
     assert str(caught.value) == (
-        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another shape and no "
-        "other size; use the label of the whole frame."
+        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another aspect "
+        "ratio; use the label of the whole frame."
     )
 
 
