@@ -12,7 +12,7 @@ from rgbt.config.command import built
 
 if TYPE_CHECKING:
     from analysis.uncertainty.settings import NamedBlocks
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
 
 MOST = 1_000_000
 """What a count may be, where nothing else limits it."""

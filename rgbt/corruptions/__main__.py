@@ -9,7 +9,7 @@ from rgbt.checks import InputError, nearest
 from rgbt.config.command import built, plain_command
 
 if TYPE_CHECKING:
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
 
 OWN = {"out": "", "degradations": "", "split": "test", "name": ""}
 SUFFIXES = (".png", ".jpg")

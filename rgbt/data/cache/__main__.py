@@ -1,6 +1,6 @@
-"""Command that fills the cache of decoded images, or removes it.
+"""Command that fills the image cache, or removes it.
 
-python -m rgbt.data.cache dataset=mfnet dataset.root=... cache=auto    # decode, show the size
+python -m rgbt.data.cache dataset=mfnet dataset.root=... cache=auto    # fill it, show the size
 python -m rgbt.data.cache dataset=mfnet dataset.root=... remove=true   # and remove it
 """
 
@@ -16,14 +16,14 @@ from rich.progress import Progress, TaskID
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.command import built, plain_command
-from rgbt.data.cache.dataset import Decoded, check_cache, decoded_dataset
-from rgbt.data.cache.store import Told, gigabytes, remove, size_of
-from rgbt.data.dataset import LabelledDataset
+from rgbt.data.cache.dataset import CachedDataset, cached_dataset, check_cache
+from rgbt.data.cache.folder import OnProgress, gigabytes, remove, size_of
+from rgbt.dataset import LabelledDataset
 
 
 @contextmanager
-def shown() -> Iterator[Told]:
-    """Progress bars on stderr for `Decoded.ensure`, one for each thing that is done."""
+def progress_bars() -> Iterator[OnProgress]:
+    """Progress bars on stderr for `CachedDataset.ensure`, one per kind of work."""
     with Progress(console=Console(stderr=True)) as progress:
         tasks: dict[str, TaskID] = {}
 
@@ -39,10 +39,10 @@ OWN = {"cache": "auto", "remove": "false"}
 
 
 def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Decode every split of a data set into a cache and show its size, or remove it.
+    """Decode every split of a data set into the image cache and show its size, or remove it.
 
-    cache      auto, or the folder where caches lie
-    remove     true: remove the cache, and those of earlier states of the same folder
+    cache      auto, or the folder that holds caches
+    remove     true: remove the cache, and those of former states of the same data set
     overrides  such as dataset=mfnet dataset.root=/data/MFNet
     """
     check_choice("remove", arguments["remove"], ("true", "false"))
@@ -52,16 +52,17 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         if key.partition(".")[0] != "dataset" and key != "hydra.searchpath":
             raise InputError(
                 f"'{key}' has no effect here; give dataset=... and its settings, cache=FOLDER for "
-                "where the cache lies, or remove=true."
+                "the folder of caches, or remove=true."
             )
     source: LabelledDataset = built("dataset", overrides)
-    dataset = decoded_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
-    assert isinstance(dataset, Decoded)
+    dataset = cached_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
+    assert isinstance(dataset, CachedDataset)
     removes = arguments["remove"] == "true"
     if not removes:
         splits = [split for split in source.splits if source.has(split)]
-        with shown() as advance:
-            dataset.ensure(tuple(name for split in splits for name in source.names(split)), advance)
+        names = tuple(name for split in splits for name in source.names(split))
+        with progress_bars() as on_progress:
+            dataset.ensure(names, on_progress)
     for cache in dataset.caches():
         sys.stdout.write(f"{cache}: {gigabytes(size_of(cache))}{' removed' * removes}\n")
         if removes:

@@ -1,4 +1,4 @@
-"""Files of a download, whether they lie in folders or in zip archives; nothing is ever changed.
+"""Files of a download, in folders or in zip archives; they are only read.
 
 Part of `rgbt.data.prepare`.
 """
@@ -21,21 +21,21 @@ CHUNK = 2**20
 """Bytes read at a time."""
 
 BROKEN = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError)
-"""What a damaged, encrypted or unknown archive raises when it is read."""
+"""Exceptions of damaged, encrypted or unknown archives."""
 
 ENCRYPTED = 1
 """Bit of the flags of a member."""
 
 
 @dataclass(frozen=True)
-class Entry:
+class SourceFile:
     """A file of the download.
 
     Attributes:
-        path: where it lies in the download, with "/"; archives count as folders.
+        path: in the download, with "/"; an archive counts as a folder.
         size: bytes.
-        file: itself, or the archive that holds it.
-        archive: the same, opened; None: it is no member of one.
+        file: the file, or the archive that contains it.
+        archive: the open archive; None: a plain file.
         member: its name in the archive.
     """
 
@@ -46,7 +46,7 @@ class Entry:
     member: str = ""
 
     def chunks(self) -> Iterator[bytes]:
-        """Its bytes in pieces; InputError where they cannot be read."""
+        """Its bytes in pieces; InputError if they cannot be read."""
         try:
             opened = self.file.open("rb") if self.archive is None else self._member(self.archive)
             with opened as stream:
@@ -58,7 +58,7 @@ class Entry:
             ) from error
 
     def lines(self) -> tuple[str, ...]:
-        """Lines that are not empty, without what surrounds them; InputError where it is no text."""
+        """Stripped lines that are not empty; InputError if it is not a text."""
         try:
             text = b"".join(self.chunks()).decode("utf-8-sig")
         except UnicodeDecodeError as error:
@@ -72,32 +72,32 @@ class Entry:
         return archive.open(self.member)  # type: ignore[return-value]
 
 
-class Source:
-    """Everything that a download holds, listed once. A context: archives are closed at its end.
+class SourceFiles:
+    """All files of a download, listed once. A context that closes archives at its end.
 
-    Hidden files and what archivers of other systems leave (__MACOSX) are left out. A file that lies
-    in a folder comes before one of the same path in an archive beside it.
+    Hidden files and folders of other systems (__MACOSX) are left out. A file in a folder has
+    precedence over one of the same path in an archive.
 
     Args:
         path: a folder, or a zip archive.
-        key: what the path is called in messages.
-        archives: names of archives that are opened where they lie in a folder.
+        key: name of the argument, for messages.
+        archives: pattern of the names of archives that are opened inside a folder.
 
     Attributes:
-        path: the same.
-        key: the same.
-        entries: path -> entry, sorted.
+        path: of the download.
+        key: of the argument.
+        entries: path -> file, sorted.
 
     Raises:
-        InputError: nothing is there, it is neither a folder nor a whole archive, or an archive
-            holds a name that leads out of the folder into which it is unpacked.
+        InputError: the path does not exist, is neither a folder nor a complete archive, or an
+            archive contains a path outside the folder into which it is unpacked.
     """
 
     def __init__(self, path: Path, key: str, archives: str = r"$^") -> None:
         self.path = path
         self.key = key
         self._opened = ExitStack()
-        found: dict[str, Entry] = {}
+        found: dict[str, SourceFile] = {}
         if path.is_dir():
             self._add_folder(path, re.compile(archives, re.IGNORECASE), found)
         elif path.is_file():
@@ -109,7 +109,7 @@ class Source:
             )
         self.entries = dict(sorted(found.items()))
 
-    def __enter__(self) -> Source:
+    def __enter__(self) -> SourceFiles:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -120,12 +120,14 @@ class Source:
         parents = {parent for path in self.entries for parent in PurePosixPath(path).parents}
         return frozenset("" if str(parent) == "." else str(parent) for parent in parents)
 
-    def _add_folder(self, root: Path, archives: re.Pattern[str], found: dict[str, Entry]) -> None:
+    def _add_folder(
+        self, root: Path, archives: re.Pattern[str], found: dict[str, SourceFile]
+    ) -> None:
         packed = []
         try:
             for file in _files(root):
                 relative = file.relative_to(root).as_posix()
-                found[relative] = Entry(relative, file.stat().st_size, file)
+                found[relative] = SourceFile(relative, file.stat().st_size, file)
                 if archives.fullmatch(file.name):
                     packed.append(file)
         except OSError as error:
@@ -137,36 +139,34 @@ class Source:
             inside = file.relative_to(root).parent.as_posix()
             self._add_archive(file, "" if inside == "." else f"{inside}/", found)
 
-    def _add_archive(self, file: Path, place: str, found: dict[str, Entry]) -> None:
-        """List an archive as if it were unpacked into `place`, into a folder of its own name."""
+    def _add_archive(self, file: Path, parent: str, found: dict[str, SourceFile]) -> None:
+        """List an archive as if unpacked into a folder of its own name in `parent`."""
         try:
             archive = self._opened.enter_context(zipfile.ZipFile(file))
             members = archive.infolist()
         except BROKEN as error:
             raise InputError(
-                f"{self.key}: {file} is no whole zip archive ({error}); download it again, or give "
-                "the folder into which it was unpacked."
+                f"{self.key}: {file} is not a complete zip archive ({error}); download it again, "
+                "or give the folder into which it was unpacked."
             ) from error
         paths = {self._checked(member, file): member for member in members}
         tops = {path.partition("/")[0] for path in paths}
-        own = place if tops <= {file.stem} else f"{place}{file.stem}/"
+        own = parent if tops <= {file.stem} else f"{parent}{file.stem}/"
         for path, member in paths.items():
             is_link = stat.S_ISLNK(member.external_attr >> 16)
             if not (member.is_dir() or is_link or _is_hidden(path)):
-                entry = Entry(own + path, member.file_size, file, archive, member.filename)
+                entry = SourceFile(own + path, member.file_size, file, archive, member.filename)
                 found.setdefault(entry.path, entry)
 
     def _checked(self, member: zipfile.ZipInfo, file: Path) -> str:
         path = member.filename.replace("\\", "/")
         if path.startswith("/") or ":" in path.partition("/")[0] or ".." in path.split("/"):
             raise InputError(
-                f"{self.key}: {file} holds '{member.filename}', which leads out of the folder that "
-                "it is unpacked into; this is not the original archive, download it again."
+                f"{self.key}: {file} holds '{member.filename}', which is outside the folder into "
+                "which it is unpacked; this is not the original archive, download it again."
             )
         if member.flag_bits & ENCRYPTED:
-            raise InputError(
-                f"{self.key}: {file} asks for a password; unpack it and give the folder."
-            )
+            raise InputError(f"{self.key}: {file} is encrypted; unpack it and give the folder.")
         return path
 
 

@@ -1,4 +1,7 @@
-"""What a name of KP says: its recording, and with it the time of day and the split."""
+"""Names, split lists and label folders of KP; a name contains recording, video and frame.
+
+The recording decides time of day and split. Nothing is opened here.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +22,24 @@ SPLITS = {
 NAME = re.compile(r"set(0\d|1[01])_V(\d{3})_I(\d{5})")
 FORM = "a name such as set00_V000_I00050 with a set from 00 to 11"
 MODALITY = re.compile("_(visible|lwir)_")
-"""What names in the lists of MS-UDA hold beside."""
+"""The modality in names of the lists of MS-UDA."""
+
+LABELS_OF = {False: "val_day", True: "val_night"}
+"""Folders of MS-UDA, by whether they hold nights."""
 
 
 def set_of(name: str) -> int:
-    """Number of the recording of `name`; InputError where it is not a name."""
+    """Number of the recording of `name`; InputError if the name is invalid."""
     return int(parts_of(name)[0].removeprefix("set"))
 
 
 def is_night(name: str) -> bool:
-    """Whether `name` was recorded at night, by its set; InputError where it is not a name."""
+    """Whether `name` was recorded at night, by its set; InputError if the name is invalid."""
     return set_of(name) in NIGHT_SETS
 
 
 def sets_of(split: str) -> tuple[int, ...]:
-    """Recordings that `split` is made of where no list says; it is one of `SPLITS`."""
+    """Recordings of `split`, one of `SPLITS`, when no list is used."""
     base, _, time = split.partition("_")
     return tuple(
         number for number in SETS[base] if not time or (number in NIGHT_SETS) == (time == "night")
@@ -41,8 +47,10 @@ def sets_of(split: str) -> tuple[int, ...]:
 
 
 def parts_of(name: str) -> tuple[str, str, str]:
-    """Set, video and frame, as ("set00", "V000", "I00050"); InputError where it is not a name."""
+    """Set, video and frame, as ("set00", "V000", "I00050"); InputError if it is invalid."""
     if NAME.fullmatch(name) is None:
-        raise InputError(f"'{name}' is not {FORM}; it says neither its files nor the time of day.")
+        raise InputError(
+            f"'{name}' is not {FORM}; its files and its time of day are unknown; correct the name."
+        )
     recording, video, frame = name.split("_")
     return recording, video, frame

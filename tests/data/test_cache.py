@@ -5,6 +5,8 @@ import logging
 import os
 import pickle
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,14 +19,13 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data.cache import file as decoded_file
-from rgbt.data.cache import stamps as decoded_stamps
-from rgbt.data.cache import store as decoded_store
+from rgbt.data.cache import file_state, sample_file
+from rgbt.data.cache import folder as cache_folder
 from rgbt.data.cache.__main__ import main
-from rgbt.data.cache.dataset import Decoded, decoded_dataset, default_folder
+from rgbt.data.cache.dataset import CachedDataset, _cache_name, cached_dataset, default_folder
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
-from rgbt.data.reader import Source
+from rgbt.data.reader import SplitReader
 from rgbt.types import Sample
 from tests.data.pst900_files import TRAIN, write_pst900
 
@@ -33,7 +34,7 @@ SIZES = {"a": (4, 6), "b": (5, 7), "c": (4, 6), "d": (3, 3)}
 
 
 class Arrays:
-    """Frames as .npy: channels R, G, B, thermal and, but for "d", label. Counts what it decodes."""
+    """Samples as .npy: R, G, B, thermal and, except for "d", label. Records what it decodes."""
 
     name, num_classes, classes, unscored = "arrays", 2, ("x", "y"), ()
     palette = ((0, 0, 0), (1, 1, 1))
@@ -81,12 +82,12 @@ class Case(NamedTuple):
     source: Arrays
     cache: Path
 
-    def opened(self, source: Arrays | None = None) -> Decoded:
-        """A new one, as another process would make it, with `NAMES` ensured."""
+    def opened(self, source: Arrays | None = None) -> CachedDataset:
+        """A new one, as in another process, with `NAMES` ensured."""
         self.source.decoded.clear()
-        decoded = Decoded(source or self.source, self.cache, num_threads=2)
-        decoded.ensure(NAMES)
-        return decoded
+        cached = CachedDataset(source or self.source, self.cache, num_threads=2)
+        cached.ensure(NAMES)
+        return cached
 
     def files(self) -> list[Path]:
         return sorted(self.cache.glob("*/*.frames"))
@@ -107,8 +108,8 @@ def case(tmp_path: Path) -> Case:
     return Case(Arrays(root), tmp_path / "cache")
 
 
-def check_equal(found: Decoded, source: Any, names: tuple[str, ...] = NAMES) -> None:
-    """Bit for bit what the source says, and served without asking it."""
+def check_equal(found: CachedDataset, source: Any, names: tuple[str, ...] = NAMES) -> None:
+    """Bit for bit the samples of the source, without reading the source."""
     for name in names:
         expected = source.read(name)
         before = list(getattr(source, "decoded", ()))
@@ -124,39 +125,39 @@ def check_equal(found: Decoded, source: Any, names: tuple[str, ...] = NAMES) -> 
             np.testing.assert_array_equal(found.label(name), expected.label)
 
 
-def test_returns_what_the_source_does_and_decodes_once(case: Case) -> None:
-    decoded = case.opened()
+def test_cache_returns_samples_of_source_decoded_once(case: Case) -> None:
+    cached = case.opened()
     assert sorted(set(case.source.decoded)) == list(NAMES)
-    check_equal(decoded, case.source)
-    assert decoded.label("d") is None
+    check_equal(cached, case.source)
+    assert cached.label("d") is None
     again = case.opened()
     assert case.source.decoded == []
     check_equal(again, case.source)
 
 
 @pytest.mark.parametrize("layout", ["packed", "folders"])
-def test_mfnet_bit_for_bit(write_mfnet, tmp_path: Path, layout: str) -> None:
+def test_cached_mfnet_equals_source(write_mfnet, tmp_path: Path, layout: str) -> None:
     names = ("00001D", "00002N")
     source = MFNet(str(write_mfnet({"train": list(names)}, layout=layout)))
-    decoded = Decoded(source, tmp_path / "cache", num_threads=1)
-    decoded.ensure(source.names("train"))
-    check_equal(decoded, source, names)
+    cached = CachedDataset(source, tmp_path / "cache", num_threads=1)
+    cached.ensure(source.names("train"))
+    check_equal(cached, source, names)
 
 
-def test_is_the_data_set_otherwise(case: Case) -> None:
-    decoded, source = case.opened(), case.source
-    assert decoded.source is source
+def test_other_members_are_those_of_source(case: Case) -> None:
+    cached, source = case.opened(), case.source
+    assert cached.source is source
     for key in ("root", "name", "num_classes", "classes", "palette", "unscored", "splits"):
-        assert getattr(decoded, key) == getattr(source, key)
-    assert decoded.names("train") == NAMES
-    assert decoded.has("train")
-    assert decoded.files("a") == source.files("a")
-    assert decoded.decoding() == {}
-    assert decoded.nights(NAMES) is None
-    assert decoded.fingerprint() == source.fingerprint()
+        assert getattr(cached, key) == getattr(source, key)
+    assert cached.names("train") == NAMES
+    assert cached.has("train")
+    assert cached.files("a") == source.files("a")
+    assert cached.decoding() == {}
+    assert cached.nights(NAMES) is None
+    assert cached.fingerprint() == source.fingerprint()
 
 
-def test_views_of_the_map_that_nobody_can_write(case: Case) -> None:
+def test_read_returns_read_only_views(case: Case) -> None:
     sample = case.opened().read("b")
     for image in (sample.rgb, sample.thermal, sample.label):
         assert image.flags.c_contiguous
@@ -169,34 +170,34 @@ def test_views_of_the_map_that_nobody_can_write(case: Case) -> None:
     assert np.shares_memory(crop, sample.rgb)
 
 
-def test_what_was_not_ensured_is_read_from_the_source(case: Case) -> None:
-    decoded = Decoded(case.source, case.cache, num_threads=1)
-    decoded.ensure(("a",))
+def test_read_without_ensure_reads_source(case: Case) -> None:
+    cached = CachedDataset(case.source, case.cache, num_threads=1)
+    cached.ensure(("a",))
     case.source.decoded.clear()
-    decoded.read("a")
+    cached.read("a")
     assert case.source.decoded == []
-    decoded.read("b")
+    cached.read("b")
     assert case.source.decoded == ["b"]
-    decoded.ensure(("b", "b"))
-    check_equal(decoded, case.source, ("a", "b"))
+    cached.ensure(("b", "b"))
+    check_equal(cached, case.source, ("a", "b"))
 
 
-def test_progress_counts_what_is_decoded(case: Case) -> None:
-    told: list[tuple[str, int, int]] = []
-    decoded = Decoded(case.source, case.cache, num_threads=2)
-    decoded.ensure(NAMES, lambda *each: told.append(each))
-    assert told == [("decoding", n, 4) for n in (1, 2, 3, 4)]
-    told.clear()
-    decoded.ensure(NAMES, lambda *each: told.append(each))
-    assert told == []
+def test_progress_counts_decoded_samples(case: Case) -> None:
+    reported: list[tuple[str, int, int]] = []
+    cached = CachedDataset(case.source, case.cache, num_threads=2)
+    cached.ensure(NAMES, lambda *each: reported.append(each))
+    assert reported == [("decoding", n, 4) for n in (1, 2, 3, 4)]
+    reported.clear()
+    cached.ensure(NAMES, lambda *each: reported.append(each))
+    assert reported == []
 
 
-def test_a_changed_file_is_decoded_again_and_no_other(case: Case) -> None:
+def test_changed_file_alone_is_decoded_again(case: Case) -> None:
     case.opened()
     write(case.source.root, "b", seed=1)  # as long as it was
-    decoded = case.opened()
+    cached = case.opened()
     assert set(case.source.decoded) == {"b"}
-    check_equal(decoded, case.source)
+    check_equal(cached, case.source)
     assert len(case.files()) == 2
     for name in NAMES:
         write(case.source.root, name, seed=2)
@@ -204,7 +205,7 @@ def test_a_changed_file_is_decoded_again_and_no_other(case: Case) -> None:
     assert len(case.files()) == 1, "files of which nothing is used any more are removed"
 
 
-def test_every_file_of_a_frame_counts(case: Case) -> None:
+def test_change_of_second_file_is_noticed(case: Case) -> None:
     (case.source.root / "a.txt").write_text("x")
     case.opened()
     os.utime(case.source.root / "a.txt", ns=(1, 1))
@@ -213,7 +214,7 @@ def test_every_file_of_a_frame_counts(case: Case) -> None:
     assert set(case.source.decoded) == {"a"}
 
 
-def test_a_copy_with_other_times_finds_the_cache(case: Case, tmp_path: Path) -> None:
+def test_copy_with_other_times_uses_same_cache(case: Case, tmp_path: Path) -> None:
     case.opened()
     shutil.copytree(case.source.root, tmp_path / "copy", copy_function=shutil.copyfile)
     copy = Arrays(tmp_path / "copy")
@@ -228,7 +229,7 @@ def settle(path: Path, time: int) -> None:
         os.utime(path, ns=(time, time))
 
 
-def test_equal_lengths_and_times_are_not_equal_files(case: Case, tmp_path: Path) -> None:
+def test_equal_lengths_and_times_compare_bytes(case: Case, tmp_path: Path) -> None:
     """Archives and images of containers keep times; a copy of other content is another data set."""
     other = Arrays(tmp_path / "other")
     other.root.mkdir()
@@ -238,13 +239,13 @@ def test_equal_lengths_and_times_are_not_equal_files(case: Case, tmp_path: Path)
             os.utime(root / f"{name}.npy", ns=(5, 5))
     assert other.fingerprint() == case.source.fingerprint()
     case.opened()
-    decoded = case.opened(other)
+    cached = case.opened(other)
     assert set(other.decoded) == {"b"}, "equal bytes are not decoded again"
-    check_equal(decoded, other)
+    check_equal(cached, other)
     check_equal(case.opened(), case.source)
 
 
-def test_a_file_that_was_changed_in_place_and_given_its_time_back(case: Case) -> None:
+def test_change_with_restored_time_is_noticed(case: Case) -> None:
     path = case.source.root / "b.npy"
     os.utime(path, ns=(5, 5))
     case.opened()
@@ -255,37 +256,37 @@ def test_a_file_that_was_changed_in_place_and_given_its_time_back(case: Case) ->
     check_equal(case.opened(), case.source)
 
 
-def test_files_that_are_as_they_were_are_not_opened(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unchanged_files_are_not_opened(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     case.opened()
 
     def refuses(path: Path) -> int:
         raise AssertionError(f"{path} was read")
 
-    monkeypatch.setattr(decoded_stamps, "_crc", refuses)
+    monkeypatch.setattr(file_state, "_crc", refuses)
     check_equal(case.opened(), case.source)
 
 
-def test_other_lengths_make_another_cache_that_takes_what_is_the_same(
+def test_new_cache_takes_unchanged_samples_of_old(
     case: Case, caplog: pytest.LogCaptureFixture
 ) -> None:
     case.opened()
     np.save(case.source.root / "c.npy", np.zeros((2, 2, 5), np.uint8))
     with caplog.at_level(logging.WARNING):
-        decoded = Decoded(case.source, case.cache, num_threads=1)
-        told: list[Any] = []
-        decoded.ensure(NAMES, lambda *each: told.append(each))
-    assert told == [("decoding", 1, 1)], "the frame that is another one"
+        cached = CachedDataset(case.source, case.cache, num_threads=1)
+        reported: list[Any] = []
+        cached.ensure(NAMES, lambda *each: reported.append(each))
+    assert reported == [("decoding", 1, 1)], "the frame that is another one"
     assert "arrays has changed" in caplog.text
-    check_equal(decoded, case.source)
+    check_equal(cached, case.source)
     assert len({path.parent for path in case.files()}) == 2, "the old one stays"
-    told.clear()
-    Decoded(case.source, case.cache, num_threads=1).ensure(NAMES, lambda *each: told.append(each))
-    assert told == [], "neither decoded nor verified once more"
+    reported.clear()
+    CachedDataset(case.source, case.cache, num_threads=1).ensure(
+        NAMES, lambda *each: reported.append(each)
+    )
+    assert reported == [], "neither decoded nor verified once more"
 
 
-def test_a_file_of_another_length_is_never_the_same(case: Case) -> None:
+def test_other_length_with_same_time_is_noticed(case: Case) -> None:
     """Not even where its time was kept, as archivers and rsync do."""
     case.opened()
     path = case.source.root / "c.npy"
@@ -295,12 +296,12 @@ def test_a_file_of_another_length_is_never_the_same(case: Case) -> None:
     check_equal(case.opened(), case.source)
 
 
-def test_other_settings_share_nothing(case: Case) -> None:
+def test_other_decoding_settings_have_own_cache(case: Case) -> None:
     case.opened()
     other = Arrays(case.source.root, {"crop": (0, 1)})
     case.opened(other)
     assert set(other.decoded) == set(NAMES)
-    assert len(decoded_store.stores_like(case.cache, case.opened()._about())) == 1
+    assert len(cache_folder.caches_like(case.cache, case.opened()._about())) == 1
 
 
 class Inverted(Arrays):
@@ -312,19 +313,19 @@ class Inverted(Arrays):
 
 
 @pytest.mark.parametrize(("kind", "name"), [(Inverted, "arrays"), (Arrays, "others")])
-def test_readers_share_nothing(case: Case, kind: type[Arrays], name: str) -> None:
+def test_other_class_or_name_has_own_cache(case: Case, kind: type[Arrays], name: str) -> None:
     """Their class and their name tell them apart, where all else is the same."""
     case.opened()
     other = kind(case.source.root)
     other.name = name
-    decoded = case.opened(other)
+    cached = case.opened(other)
     assert set(other.decoded) == set(NAMES)
-    check_equal(decoded, other)
-    assert len(decoded.caches()) == 1
+    check_equal(cached, other)
+    assert len(cached.caches()) == 1
     assert len(case.files()) == 2
 
 
-def test_another_data_set_is_no_earlier_state(
+def test_cache_of_other_root_is_not_adopted(
     case: Case, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Not even one with the same names: images of one folder are never linked to another's."""
@@ -334,28 +335,28 @@ def test_another_data_set_is_no_earlier_state(
     for name in NAMES:
         np.save(other.root / f"{name}.npy", np.full((2, 2, 5), ord(name), np.uint8))
     with caplog.at_level(logging.WARNING):
-        decoded = case.opened(other)
+        cached = case.opened(other)
     assert caplog.text == ""
-    check_equal(decoded, other)
-    (mine,), (its,) = decoded.caches(), first.caches()
+    check_equal(cached, other)
+    (mine,), (its,) = cached.caches(), first.caches()
     assert [len(list(cache.glob("*.frames"))) for cache in (mine, its)] == [1, 1]
     assert not {path.name for path in mine.glob("*.frames")} & {
         path.name for path in case.files() if path.parent == its
     }
-    decoded_store.remove(mine)
+    cache_folder.remove(mine)
     again = case.opened()
     assert case.source.decoded == [], "what others remove is theirs"
     check_equal(again, case.source)
 
 
-def test_a_data_set_that_moved_keeps_its_cache(case: Case, tmp_path: Path) -> None:
+def test_moved_data_set_keeps_its_cache(case: Case, tmp_path: Path) -> None:
     """And the states of the folder that it lies in now are its own, by whatever path."""
     (cache,) = case.opened().caches()
     case.source.root.rename(tmp_path / "moved")
     moved = Arrays(tmp_path / "moved")
-    decoded = case.opened(moved)
+    cached = case.opened(moved)
     assert moved.decoded == []
-    assert decoded.caches() == [cache]
+    assert cached.caches() == [cache]
     (tmp_path / "link").symlink_to(tmp_path / "moved")
     np.save(moved.root / "c.npy", np.zeros((2, 2, 5), np.uint8))
     (changed,) = case.opened(moved).caches()
@@ -374,47 +375,49 @@ def flip(path: Path, offset: int) -> None:
 
 
 @pytest.mark.parametrize("image", ["rgb", "thermal", "label"])
-def test_a_damaged_frame_is_decoded_again(case: Case, image: str) -> None:
+def test_damaged_sample_is_decoded_again(case: Case, image: str) -> None:
     case.opened()
     (path,) = case.files()
-    (frame,) = [f for f in decoded_file.FrameFile(path).frames() if f.name == "b"]
+    (record,) = [f for f in sample_file.SampleFile(path).records() if f.name == "b"]
     within = {"rgb": 0, "thermal": 3 * 35, "label": 5 * 35 - 1}[image]
-    flip(path, frame.offset + within)
-    told: list[tuple[str, int, int]] = []
-    Decoded(case.source, case.cache, num_threads=2).ensure(("a",), lambda *each: told.append(each))
-    assert told == [("comparing checksums", n, 4) for n in (1, 2, 3, 4)]
-    told.clear()
+    flip(path, record.offset + within)
+    reported: list[tuple[str, int, int]] = []
+    CachedDataset(case.source, case.cache, num_threads=2).ensure(
+        ("a",), lambda *each: reported.append(each)
+    )
+    assert reported == [("comparing checksums", n, 4) for n in (1, 2, 3, 4)]
+    reported.clear()
     case.source.decoded.clear()
-    decoded = Decoded(case.source, case.cache, num_threads=2)
-    decoded.ensure(NAMES, lambda *each: told.append(each))
-    assert told == [("decoding", 1, 1)], "noted: not compared twice, and not served"
+    cached = CachedDataset(case.source, case.cache, num_threads=2)
+    cached.ensure(NAMES, lambda *each: reported.append(each))
+    assert reported == [("decoding", 1, 1)], "noted: not compared twice, and not served"
     assert set(case.source.decoded) == {"b"}
-    check_equal(decoded, case.source)
+    check_equal(cached, case.source)
 
 
 def test_checksums_are_compared_once(case: Case) -> None:
     case.opened()
     (path,) = case.files()
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
 
     def open_again() -> int:
-        told.clear()
-        Decoded(case.source, case.cache, num_threads=1).ensure(
-            NAMES, lambda *each: told.append(each)
+        reported.clear()
+        CachedDataset(case.source, case.cache, num_threads=1).ensure(
+            NAMES, lambda *each: reported.append(each)
         )
-        return len(told)
+        return len(reported)
 
     assert open_again() == 0
     os.utime(path, ns=(1, 1))
     assert open_again() == 4
     assert open_again() == 0
-    (path.parent / decoded_store.VERIFIED).write_text("{damaged")
+    (path.parent / cache_folder.VERIFIED).write_text("{damaged")
     assert open_again() == 4
     assert open_again() == 0
 
 
 @pytest.mark.parametrize("damage", ["cut", "index", "end", "empty"])
-def test_a_file_that_is_not_whole_is_written_again(case: Case, damage: str) -> None:
+def test_incomplete_file_is_written_again(case: Case, damage: str) -> None:
     case.opened()
     (path,) = case.files()
     content = path.read_bytes()
@@ -427,12 +430,14 @@ def test_a_file_that_is_not_whole_is_written_again(case: Case, damage: str) -> N
 
 
 class Stop(BaseException):
-    """Stands for a kill: no handler of the code under test catches it."""
+    """Simulates a kill: the code under test does not catch it."""
 
 
 @pytest.mark.parametrize("step", ["open", "first", "third", "index", "sync", "rename", "note"])
-def test_killed_at_any_step(case: Case, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
-    """A build that ends anywhere leaves nothing that looks whole, and the next one goes on."""
+def test_process_killed_at_any_step_leaves_valid_cache(
+    case: Case, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """It leaves no file that looks complete, and the next process completes the cache."""
     calls = 0
 
     def stops(*args: Any, **kwargs: Any) -> Any:
@@ -445,26 +450,26 @@ def test_killed_at_any_step(case: Case, monkeypatch: pytest.MonkeyPatch, step: s
             raise Stop
         add(writer, *args)
 
-    add = decoded_file.FrameWriter.add
+    add = sample_file.SampleFileWriter.add
     with monkeypatch.context() as patch:
         if step == "open":
-            patch.setattr(decoded_file.FrameWriter, "__init__", stops)
+            patch.setattr(sample_file.SampleFileWriter, "__init__", stops)
         elif step in ("first", "third"):
-            patch.setattr(decoded_file.FrameWriter, "add", at_third)
+            patch.setattr(sample_file.SampleFileWriter, "add", at_third)
         elif step == "index":
-            patch.setattr(decoded_file.zlib, "crc32", _fails_for_bytes)
+            patch.setattr(sample_file.zlib, "crc32", _fails_for_bytes)
         elif step == "sync":
-            patch.setattr(decoded_file.os, "fsync", _only_in("publish"))
+            patch.setattr(sample_file.os, "fsync", _only_in("publish"))
         elif step == "rename":
             patch.setattr(Path, "replace", _only_in("publish"))
         else:
-            patch.setattr(decoded_store.Store, "_write_notes", stops)
-        patch.setattr(decoded_file.FrameWriter, "discard", lambda writer: None)
+            patch.setattr(cache_folder.CacheFolder, "_write_notes", stops)
+        patch.setattr(sample_file.SampleFileWriter, "discard", lambda writer: None)
         with pytest.raises(Stop):
             case.opened()
     assert len(case.files()) == (1 if step == "note" else 0)
     check_equal(case.opened(), case.source)
-    assert list(case.cache.glob("*/.*")) == [], "what the killed one left is cleared away"
+    assert list(case.cache.glob("*/.*")) == [], "files of the killed process are removed"
 
 
 def _fails_for_bytes(data: Any, *start: int) -> int:
@@ -473,13 +478,11 @@ def _fails_for_bytes(data: Any, *start: int) -> int:
     return _CRC32(data, *start)
 
 
-_CRC32 = decoded_file.zlib.crc32
+_CRC32 = sample_file.zlib.crc32
 
 
 def _only_in(function: str) -> Any:
-    """Raises where `function` calls it, and otherwise does what it did."""
-    import sys
-
+    """Raises if `function` calls it, and otherwise calls the original."""
     real = {"fsync": os.fsync, "replace": Path.replace}
 
     def call(*args: Any) -> Any:
@@ -490,11 +493,9 @@ def _only_in(function: str) -> Any:
     return call
 
 
-def test_what_was_complete_before_the_end_stays(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(decoded_store, "FILE_BYTES", 1)  # a file for every frame
-    add = decoded_file.FrameWriter.add
+def test_complete_files_survive_an_exception(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache_folder, "FILE_BYTES", 1)  # one file per sample
+    add = sample_file.SampleFileWriter.add
 
     def stops_at_c(writer: Any, sample: Sample, *rest: Any) -> None:
         if sample.name == "c":
@@ -502,7 +503,7 @@ def test_what_was_complete_before_the_end_stays(
         add(writer, sample, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(decoded_file.FrameWriter, "add", stops_at_c)
+        patch.setattr(sample_file.SampleFileWriter, "add", stops_at_c)
         with pytest.raises(Stop):
             case.opened()
     assert len(case.files()) == 2
@@ -511,49 +512,51 @@ def test_what_was_complete_before_the_end_stays(
     assert {"a", "b"}.isdisjoint(case.source.decoded[:-4]), "read by check_equal alone"
 
 
-def test_two_builders_do_the_work_once(case: Case) -> None:
+def test_two_processes_decode_once(case: Case) -> None:
     barrier = threading.Barrier(2)
 
-    def build(source: Arrays) -> Decoded:
-        decoded = Decoded(source, case.cache, num_threads=1)
+    def build(source: Arrays) -> CachedDataset:
+        cached = CachedDataset(source, case.cache, num_threads=1)
         barrier.wait()
-        decoded.ensure(NAMES)
-        return decoded
+        cached.ensure(NAMES)
+        return cached
 
     sources = [Arrays(case.source.root), Arrays(case.source.root)]
     with ThreadPoolExecutor(2) as pool:
         built = list(pool.map(build, sources))
     assert len(case.files()) == 1
-    for decoded in built:
-        check_equal(decoded, decoded.source)
+    for cached in built:
+        check_equal(cached, cached.source)
 
 
-def test_two_builders_without_locks_do_no_harm(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_processes_without_locks_keep_cache_valid(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def no_locks(*args: Any) -> None:
         raise OSError(37, "No locks available")
 
-    monkeypatch.setattr(decoded_store.fcntl, "flock", no_locks)
-    first = Decoded(case.source, case.cache, num_threads=1)
-    second = Decoded(Arrays(case.source.root), case.cache, num_threads=1)
-    build = decoded_store.Store.add
+    monkeypatch.setattr(cache_folder.fcntl, "flock", no_locks)
+    first = CachedDataset(case.source, case.cache, num_threads=1)
+    second = CachedDataset(Arrays(case.source.root), case.cache, num_threads=1)
+    build = cache_folder.CacheFolder.add
 
-    def add_after_another(store: Any, frames: Iterator[Any]) -> None:
-        monkeypatch.setattr(decoded_store.Store, "add", build)
+    def add_after_another(cache: Any, samples: Iterator[Any]) -> None:
+        monkeypatch.setattr(cache_folder.CacheFolder, "add", build)
         second.ensure(NAMES)
-        build(store, frames)
+        build(cache, samples)
 
-    monkeypatch.setattr(decoded_store.Store, "add", add_after_another)
+    monkeypatch.setattr(cache_folder.CacheFolder, "add", add_after_another)
     first.ensure(NAMES)
     assert len(case.files()) == 2
     check_equal(first, case.source)
     check_equal(second, second.source)
 
 
-def test_a_disk_that_is_too_small_is_told_before_anything_is_written(
+def test_too_small_disk_is_refused_before_writing(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage("/")._replace(free=479)
-    monkeypatch.setattr(decoded_store.shutil, "disk_usage", lambda path: usage)
+    monkeypatch.setattr(cache_folder.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(InputError) as caught:
         case.opened()
     # The first frame has 4 x 6 pixels of 5 bytes; four times 120 bytes.
@@ -565,26 +568,26 @@ def test_a_disk_that_is_too_small_is_told_before_anything_is_written(
 
 
 @pytest.mark.parametrize("number", [28, 122])
-def test_a_disk_that_fills_up(case: Case, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_full_disk_is_refused(case: Case, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     def full(writer: Any) -> None:
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
-        patch.setattr(decoded_file.FrameWriter, "publish", full)
-        with pytest.raises(InputError, match=r"filled up .*data\.cache=null"):
+        patch.setattr(sample_file.SampleFileWriter, "publish", full)
+        with pytest.raises(InputError, match=r"is full .*data\.cache=null"):
             case.opened()
     assert [path.name for path in case.cache.glob("*/.*")] == []
     check_equal(case.opened(), case.source)
 
 
-def test_a_folder_that_cannot_be_written(case: Case) -> None:
+def test_unwritable_folder_is_refused(case: Case) -> None:
     case.cache.write_text("a file")
     with pytest.raises(InputError, match=r"data\.cache: cannot write .*data\.cache=FOLDER"):
         case.opened()
 
 
-def test_a_whole_cache_is_not_written_to(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So it may lie where it can only be read; a frame that is damaged makes no difference."""
+def test_complete_cache_is_not_written_to(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it may be in a read-only folder, even if a sample is damaged."""
     (case.source.root / "c.npy").write_bytes(b"none")
     case.opened()
 
@@ -592,49 +595,49 @@ def test_a_whole_cache_is_not_written_to(case: Case, monkeypatch: pytest.MonkeyP
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", refuses)
-    monkeypatch.setattr(decoded_store, "_write_whole", refuses)
-    os.utime(case.files()[0], ns=(1, 1))  # compares the checksums, and cannot note it
+    monkeypatch.setattr(cache_folder, "_write_whole", refuses)
+    os.utime(case.files()[0], ns=(1, 1))  # compares the checksums, cannot record the result
     check_equal(case.opened(), case.source, ("a", "b", "d"))
 
 
-def test_an_unreadable_file_speaks_for_itself(case: Case) -> None:
+def test_unreadable_file_raises_message_of_data_set(case: Case) -> None:
     path = case.source.root / "c.npy"
     content = path.read_bytes()
     path.write_bytes(b"none")
-    decoded = case.opened()
-    check_equal(decoded, case.source, ("a", "b", "d"))
+    cached = case.opened()
+    check_equal(cached, case.source, ("a", "b", "d"))
     case.source.decoded.clear()
     for _ in range(2):
         with pytest.raises(InputError, match=r"c\.npy is no array\."):
-            decoded.read("c")
-    assert case.source.decoded == [], "known, without another look"
+            cached.read("c")
+    assert case.source.decoded == [], "known without reading again"
     path.write_bytes(content)
-    decoded.ensure(("c",))
-    check_equal(decoded, case.source)
+    cached.ensure(("c",))
+    check_equal(cached, case.source)
     check_equal(case.opened(), case.source)
 
 
-def test_a_frame_that_became_unreadable_is_not_served(case: Case) -> None:
+def test_file_that_became_unreadable_is_refused(case: Case) -> None:
     case.opened()
     path = case.source.root / "c.npy"
     path.write_bytes(b"x" * path.stat().st_size)  # the same cache
-    decoded = case.opened()
+    cached = case.opened()
     with pytest.raises(InputError, match="no array"):
-        decoded.read("c")
-    check_equal(decoded, case.source, ("a", "b", "d"))
+        cached.read("c")
+    check_equal(cached, case.source, ("a", "b", "d"))
 
 
-def test_trouble_of_the_system_is_told_as_well(case: Case) -> None:
+def test_system_error_is_reported(case: Case) -> None:
     class Faulty(Arrays):
         def read(self, name: str) -> Sample:
             if name == "b":
                 raise PermissionError(13, "Permission denied", "b.npy")
             return super().read(name)
 
-    decoded = case.opened(Faulty(case.source.root))
+    cached = case.opened(Faulty(case.source.root))
     with pytest.raises(InputError, match=r"b\.npy: Permission denied\."):
-        decoded.read("b")
-    check_equal(decoded, case.source, ("a", "c", "d"))
+        cached.read("b")
+    check_equal(cached, case.source, ("a", "c", "d"))
 
 
 OTHER_IMAGES = {
@@ -648,8 +651,8 @@ OTHER_IMAGES = {
 
 
 @pytest.mark.parametrize("change", OTHER_IMAGES)
-def test_what_it_cannot_hold_is_refused_and_moves_nothing_else(case: Case, change: str) -> None:
-    """Readers of one's own may make other arrays; frames after them must stay where they are."""
+def test_unsupported_sample_is_refused_and_others_kept(case: Case, change: str) -> None:
+    """A user's data set may return other arrays; later samples must keep their offsets."""
     changed, sentence = OTHER_IMAGES[change]
 
     class Own(Arrays):
@@ -658,49 +661,49 @@ def test_what_it_cannot_hold_is_refused_and_moves_nothing_else(case: Case, chang
             return changed(sample) if name == "b" else sample
 
     source = Own(case.source.root)
-    decoded = case.opened(source)
+    cached = case.opened(source)
     with pytest.raises(InputError, match=rf"^'b': {sentence}.* \(data\.cache=null\)\.$"):
-        decoded.read("b")
-    check_equal(decoded, source, ("a", "c", "d"))
+        cached.read("b")
+    check_equal(cached, source, ("a", "c", "d"))
     check_equal(case.opened(source), source, ("a", "c", "d"))
 
 
 @pytest.mark.parametrize("begun", [False, True])
-def test_names_without_files_are_left_out_as_without_a_cache(tmp_path: Path, begun: bool) -> None:
+def test_names_without_files_are_skipped_as_without_cache(tmp_path: Path, begun: bool) -> None:
     """data.on_error=skip: PST900 refuses a name of both parts, and says so for its files too."""
     before = PST900(str(write_pst900(tmp_path / "data")))
     if begun:  # the frame is in the cache that the next one begins with
-        Decoded(before, tmp_path / "cache", num_threads=1).ensure(before.names("train"))
+        CachedDataset(before, tmp_path / "cache", num_threads=1).ensure(before.names("train"))
     source = PST900(str(write_pst900(tmp_path / "data", (), (TRAIN[0],))))
-    decoded = Decoded(source, tmp_path / "cache", num_threads=2)
+    cached = CachedDataset(source, tmp_path / "cache", num_threads=2)
     names = source.names("train")
-    decoded.ensure(names)
+    cached.ensure(names)
     found: list[dict[str, str]] = []
-    for dataset in (source, decoded):
+    for dataset in (source, cached):
         skipped: dict[str, str] = {}
-        reader = Source(dataset, names, None, skip_errors=True)  # type: ignore[arg-type]
+        reader = SplitReader(dataset, names, None, skip_errors=True)  # type: ignore[arg-type]
         read = [reader.read(name, skipped) for name in names]
         assert [sample.name for sample in read if sample] == [n for n in names if n != TRAIN[0]]
         found.append(skipped)
     assert list(found[0]) == [TRAIN[0]]
     assert found[0] == found[1]
-    check_equal(decoded, source, tuple(name for name in names if name != TRAIN[0]))
+    check_equal(cached, source, tuple(name for name in names if name != TRAIN[0]))
 
 
-def test_nothing_can_be_decoded(case: Case) -> None:
+def test_no_cache_is_written_without_readable_sample(case: Case) -> None:
     for name in NAMES:
         (case.source.root / f"{name}.npy").unlink()
-    decoded = case.opened()
+    cached = case.opened()
     assert not case.cache.exists()
     with pytest.raises(InputError, match="no array"):
-        decoded.read("a")
+        cached.read("a")
 
 
-def test_travels_to_workers_without_its_map(case: Case) -> None:
-    decoded = case.opened()
+def test_pickle_does_not_contain_map(case: Case) -> None:
+    cached = case.opened()
     (case.source.root / "c.npy").write_bytes(b"none")
-    decoded.ensure(("c",))
-    text = pickle.dumps(decoded)
+    cached.ensure(("c",))
+    text = pickle.dumps(cached)
     assert len(text) < 4000
     copy = pickle.loads(text)
     check_equal(copy, copy.source, ("a", "b", "d"))
@@ -708,41 +711,43 @@ def test_travels_to_workers_without_its_map(case: Case) -> None:
         copy.read("c")
 
 
-def test_a_cache_that_was_removed_does_not_stop_a_worker(case: Case) -> None:
-    decoded = case.opened()
-    late = pickle.loads(pickle.dumps(decoded))
-    for cache in decoded.caches():
-        decoded_store.remove(cache)
+def test_removed_cache_does_not_stop_worker(case: Case) -> None:
+    cached = case.opened()
+    late = pickle.loads(pickle.dumps(cached))
+    for cache in cached.caches():
+        cache_folder.remove(cache)
     assert list(case.cache.iterdir()) == []
-    check_equal(decoded, case.source)  # the map is still there
+    check_equal(cached, case.source)  # the map is still there
     np.testing.assert_array_equal(late.read("a").rgb, case.source.read("a").rgb)
 
 
-def test_removes_nothing_of_others(case: Case) -> None:
-    decoded = case.opened()
-    (cache,) = decoded.caches()
+def test_remove_keeps_foreign_files(case: Case) -> None:
+    cached = case.opened()
+    (cache,) = cached.caches()
     (cache / "notes.txt").write_text("mine")
-    decoded_store.remove(cache)
+    cache_folder.remove(cache)
     assert [path.name for path in cache.iterdir()] == ["notes.txt"]
 
 
-def test_which_folder(case: Case, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cached_dataset_chooses_folder(
+    case: Case, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert default_folder() == tmp_path / "xdg" / "rgbt" / "decoded"
     source = case.source
-    assert decoded_dataset(source, None, num_threads=1) is source
-    found = decoded_dataset(source, "auto", num_threads=1)
-    assert isinstance(found, Decoded)
+    assert cached_dataset(source, None, num_threads=1) is source
+    found = cached_dataset(source, "auto", num_threads=1)
+    assert isinstance(found, CachedDataset)
     assert found.folder == default_folder()
-    named = decoded_dataset(source, str(tmp_path / "own"), num_threads=1)
-    assert isinstance(named, Decoded)
+    named = cached_dataset(source, str(tmp_path / "own"), num_threads=1)
+    assert isinstance(named, CachedDataset)
     assert named.folder == tmp_path / "own"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert default_folder() == tmp_path / "home" / ".cache" / "rgbt" / "decoded"
 
 
-def test_the_command(
+def test_command_fills_and_removes_cache(
     case: Case, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("rgbt.data.cache.__main__.built", lambda node, overrides: case.source)
@@ -755,24 +760,41 @@ def test_the_command(
     assert list(case.cache.iterdir()) == []
     with pytest.raises(InputError, match="remove: 'maybe' is not a choice"):
         main({**arguments, "remove": "maybe"}, [])
-    with pytest.raises(InputError, match=r"^cache: 'null' names no folder; expected auto or a"):
+    with pytest.raises(InputError, match=r"^cache: 'null' is not a folder; expected auto or a"):
         main({**arguments, "cache": "null"}, [])
 
 
-def test_real_pairs_bit_for_bit(tmp_path: Path) -> None:
+def test_cached_real_pairs_equal_source(tmp_path: Path) -> None:
     shared = Path(os.environ.get("RGBT_SHARED", Path(__file__).parents[3] / "shared"))
     root = shared / "realdata" / "mfnet200"
     if not root.is_dir():
         pytest.skip("real images are not part of the repository")
     source = MFNet(str(root))
     names = source.names("train")[:3]
-    decoded = Decoded(source, tmp_path, num_threads=2)
-    decoded.ensure(names)
-    check_equal(decoded, source, names)
+    cached = CachedDataset(source, tmp_path, num_threads=2)
+    cached.ensure(names)
+    check_equal(cached, source, names)
     packed = cv2.imread(str(root / "images" / f"{names[0]}.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(decoded.read(names[0]).rgb, packed[..., 2::-1])
+    np.testing.assert_array_equal(cached.read(names[0]).rgb, packed[..., 2::-1])
 
 
-def test_the_command_refuses_what_it_does_not_heed(case: Case) -> None:
+def test_former_command_warns_and_works() -> None:
+    command = [sys.executable, "-m", "rgbt.data.decoded", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "into the image cache" in done.stdout
+    assert "use python -m rgbt.data.cache" in done.stderr
+
+
+def test_folder_and_file_names_are_those_of_existing_caches(case: Case) -> None:
+    """Caches that exist must remain valid."""
+    about = {"format": 2, "name": "a b", "class": "rgbt.data.mfnet.MFNet", "root": "/x"}
+    assert _cache_name({**about, "decoding": {}, "fingerprint": "0"}) == "a_b-867e0a9462b65d63"
+    case.opened()
+    kinds = {path.name.partition("-")[2][8:] or path.name for path in case.cache.glob("*/*")}
+    assert kinds == {".frames", "about.json", "verified.json", "lock"}
+
+
+def test_command_refuses_setting_without_effect(case: Case) -> None:
     with pytest.raises(InputError, match=r"'data\.cache' has no effect here; .*cache=FOLDER"):
         main({"cache": str(case.cache), "remove": "false"}, ["dataset=synth", "data.cache=/x"])
