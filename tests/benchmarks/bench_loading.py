@@ -27,10 +27,10 @@ from torch.utils.data import DataLoader
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.cache.dataset import CachedDataset
-from rgbt.dataset import LabelledDataset
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.dataset import synth
+from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.benchmarks.released_loading import ReleasedSamples
 
