@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import available
 from rgbt.config.schema import build
 from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
@@ -179,7 +179,7 @@ def _tell_what_is_not_as_published(session: Session) -> None:
         )
     meant = config.recipe.dataset
     if config.scale.name == "paper" and meant != data.name:
-        known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
+        known = data.name in available("recipe")
         tell(
             f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
             + (f"choose recipe={data.name}, or " if known else "")

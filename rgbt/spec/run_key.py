@@ -12,7 +12,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.compose import compose, conf_dir
+from rgbt.config.compose import available, compose, search_path
+from rgbt.config.hydra_messages import forgotten
 from rgbt.config.schema import NODES, OF_THE_RUN, check, typed
 from rgbt.files.budgets import read_json
 from rgbt.spec.source_code import user_code
@@ -161,12 +162,11 @@ def earlier_run(key: str, value: str | None) -> tuple[str, str] | None:
         raise InputError(
             f"{key}={value}: expected experiment:NAME/best.pt or experiment:NAME/last.pt."
         )
-    known = [path.stem for path in (conf_dir() / "experiment").glob("*.yaml")]
+    known = available("experiment")
     if name not in known:
         raise InputError(
-            f"{key}={value}: there is no experiment '{name}' in {conf_dir() / 'experiment'}; "
-            f"{nearest(name, known)}. One of your own lies there too, or its run is named by its "
-            f"folder (runs/<key>/{checkpoint})."
+            f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. A run can be "
+            f"named by its folder too: runs/<key>/{checkpoint}.{forgotten()}"
         )
     return name, checkpoint
 
@@ -188,7 +188,7 @@ def earlier_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
     """
     if config.name == experiment:
         raise InputError(f"experiment {experiment} names itself as an earlier run.")
-    earlier = _composed(experiment, config.scale.name).copy()
+    earlier = _composed(experiment, config.scale.name, *search_path()).copy()
     # Whether a network has pretrained weights is said by its experiment, all else by the scale.
     shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == "model.weights":
@@ -206,9 +206,9 @@ def earlier_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
 
 
 @cache
-def _composed(experiment: str, scale: str) -> DictConfig:
-    """An experiment as it stands; composing takes long, and a chain asks for it again and again."""
-    return compose([f"+experiment={experiment}", f"scale={scale}"])
+def _composed(experiment: str, scale: str, *search_path: str) -> DictConfig:
+    """An experiment by itself; cached, because composing takes long and a chain needs it often."""
+    return compose([f"+experiment={experiment}", f"scale={scale}", *search_path])
 
 
 def weights_file(config: DictConfig) -> Path | None:
