@@ -358,7 +358,7 @@ def _check_domains(scheme: object, session: Session) -> None:
             raise InputError(
                 f"domains.{name}.head={domain.head}, but {type(model).__name__} has "
                 + (f"the heads {', '.join(heads)}" if heads else "no heads to choose from")
-                + "; choose one of them, or model=multi_head_demo (or _paper)."
+                + "; choose one of them, or a DeepLab v2 with model.heads=[source,target]."
             )
         views = getattr(model, "views", VIEWS)
         if domain.view is not None and domain.view not in views:

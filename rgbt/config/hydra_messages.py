@@ -131,8 +131,8 @@ def _of_the_defaults(first: str, overrides: Sequence[str]) -> str:
     sizes = re.search(r"'\$\{by_scale:(.*)\}'", first)
     if sizes:
         return (
-            f"this scale is not one of {sizes[1]}, for which the experiment names a file; choose one "
-            "yourself, such as model=NAME."
+            f"the experiment names files for these scales alone: {sizes[1]}; choose one yourself "
+            "with group=NAME."
         )
     absent = re.search(r"Could not override '([^']+)'", first)
     if absent and absent[1] in ADDED:

@@ -247,12 +247,12 @@ def test_what_names_no_earlier_run_is_refused(
 
 
 def test_another_network_is_that_of_the_run_it_starts_from_too() -> None:
-    config = composed("sh_adversarial", "model=rtfnet_demo")
+    config = composed("sh_adversarial", "model=rtfnet_tiny")
     config.model.weights = "experiment:sh_source/last.pt"
     (found,) = earlier_runs(config)
     assert found.config.model._target_ == config.model._target_
     assert found.config.model.weights is None
-    assert run_key(found.config) == alone("sh_source", "model=rtfnet_demo")
+    assert run_key(found.config) == alone("sh_source", "model=rtfnet_tiny")
 
 
 def test_a_teacher_has_a_network_of_its_own() -> None:
@@ -379,7 +379,7 @@ OWN = (
 
 def test_an_earlier_run_is_named_after_what_was_typed_for_it_too(bring: Any) -> None:
     """And after nothing that does not change it: its name is that of a run of its own."""
-    train, model = Train(), ["model.base_width=7", "model=multi_head_demo"]
+    train, model = Train(), ["model.base_width=7", "model=deeplabv2_two_heads_modified_tiny"]
     bring("multi_head_night", train, *COMMON, *OWN, *model)
     unsaid = ["tracking=none"]  # which no name says
     assert train.words == {
