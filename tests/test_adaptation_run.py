@@ -505,11 +505,11 @@ BAD: dict[str, tuple[list[str], str]] = {
         "domains.source.head=left, but DeepLabV2 has the heads source, target",
     ),
     "heads of a network with one": (
-        ["multi_head_thermal_stage1", "model=deeplab_demo"],
+        ["multi_head_thermal_stage1", "model.heads=[main]"],
         "domains.source.head=source, but DeepLabV2 has the heads main; choose one of them",
     ),
     "a head that nothing trains": (
-        ["sh_source", "model=multi_head_demo"],
+        ["sh_source", "model.heads=[source,target]"],
         "DeepLabV2 has the heads source, target, of which these domains train only the first",
     ),
     "network without scores": (

@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.component import build
-from rgbt.config.compose import compose, conf_dir, register_resolvers
+from rgbt.config.compose import compose, conf_dir, register_resolvers, searching
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.keys import check_keys
 from rgbt.runtime.resources import reporting_exhaustion
@@ -63,7 +63,7 @@ def command(
             def job(config: DictConfig) -> None:
                 codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
 
-            with answered():
+            with answered(), searching(words):
                 code = max([_report(lambda: _compose(config_name, job, words)), *codes])
             sys.exit(code)
 
@@ -193,7 +193,7 @@ def plain_command(
             usage = " ".join(f"{k}=..." if v is None else f"[{k}={v}]" for k, v in own.items())
             sys.stdout.write(f"{(main.__doc__ or '').strip()}\n\nusage: {usage} [overrides]\n")
             sys.exit(0)
-        with answered():
+        with answered(), searching(arguments):
             code = _report(lambda: main(*_split(own, arguments)))
         sys.exit(code)
 

@@ -61,7 +61,7 @@ def test_every_option_of_every_group_passes_the_check(
     if group == "scale":  # sets nodes of all groups
         specify(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
         return
-    made = option.startswith("synth") or option.endswith("_demo")
+    made = option.startswith("synth")
     needed = {} if group != "dataset" or made else {"root": "unused"}
     if option == "folder":
         needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
@@ -131,7 +131,7 @@ def test_published_settings_of_the_networks() -> None:
     assert compose("model=mfnet").model.final_activation
 
 
-@pytest.mark.parametrize("name", ["deeplabv2", "deeplabv2_two_heads", "deeplabv2_tiny"])
+@pytest.mark.parametrize("name", ["deeplabv2", "deeplabv2_tiny"])
 def test_deeplab_pools_as_released_and_counts_all_rates(name: str) -> None:
     model = compose(f"model={name}").model
     assert model.ceil_mode
