@@ -24,6 +24,7 @@ from sweeps.point import Point
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
+from sweeps.worker import trial_source
 from sweeps.worker.driver import Driver
 from sweeps.worker.owner import STALE_S, Owner
 from sweeps.worker.planner import PlannedPoint, PlannedRun
@@ -436,7 +437,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drivers that look again at once."""
     monkeypatch.setattr(drivers, "POLL_S", 0.001)
     monkeypatch.setattr(drivers, "LOOK_S", 0.002)
-    monkeypatch.setattr(sources, "PAUSE_S", 0.002)
+    monkeypatch.setattr(trial_source, "PAUSE_S", 0.002)
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:

@@ -14,6 +14,7 @@ from sweeps.asked import OF_THE_TABLE, settings_of
 from sweeps.point import Point
 from sweeps.reproduce import OWN, entry
 from sweeps.settings import EXECUTION, SweepSettings
+from sweeps.worker import point_list
 from sweeps.worker.point_list import Outcome, PointList
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
@@ -54,8 +55,8 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
             return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
 
-        monkeypatch.setattr(lists, "work_off", work)
-        monkeypatch.setattr(lists, "survey", work)
+        monkeypatch.setattr(point_list, "run_points", work)
+        monkeypatch.setattr(point_list, "preview_points", work)
         return asked
 
     return drive

@@ -14,6 +14,7 @@ from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import code
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour, varied_keys
+from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.point_list import (
     Outcome,
@@ -55,7 +56,7 @@ def test_the_time_of_what_is_trained_and_not_evaluated_is_not_counted(tmp_path: 
 def test_a_survey_tells_what_lacks_further_evaluations_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lists, "Planner", OneKey)
+    monkeypatch.setattr(point_list, "Planner", OneKey)
     aligned = ExtraEvaluation(frames="aligned")
     point = Point("a", ("x=1",), evaluations=(aligned,))
     run = finish(tmp_path / plan_of(point).runs[0].key)
@@ -88,9 +89,9 @@ def wanted(tmp_path: Path, *points: Point) -> PointList:
 def test_points_that_are_one_run_share_their_tags(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lists, "Planner", OneKey)
+    monkeypatch.setattr(point_list, "Planner", OneKey)
     rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
-    prepared = lists._PlannedPoints(wanted(tmp_path, *rows))
+    prepared = point_list._PlannedPoints(wanted(tmp_path, *rows))
     first, second = (plan.point.tags for plan in prepared.plans.values())
     assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
 
@@ -129,7 +130,7 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
 def test_a_mistake_of_all_points_is_one_of_the_call(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lists, "Planner", OneKey)
+    monkeypatch.setattr(point_list, "Planner", OneKey)
     wrong, good = Point("a", ("wrong",)), Point("b", ("x=1",))
     with pytest.raises(InputError, match="wrong=1 is no key"):
         preview_points(wanted(tmp_path, wrong, wrong), settings())

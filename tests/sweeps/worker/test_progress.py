@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from sweeps.worker import progress
 from sweeps.worker.progress import ProgressView, duration
 
 
@@ -40,7 +41,7 @@ def console(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], io.StringIO]:
     def make(is_terminal: bool) -> io.StringIO:
         text = io.StringIO()
         made = Console(file=text, force_terminal=is_terminal, width=160, color_system=None)
-        monkeypatch.setattr(live, "CONSOLE", made)
+        monkeypatch.setattr(progress, "CONSOLE", made)
         return text
 
     return make
@@ -113,8 +114,8 @@ def test_what_other_drivers_finished_is_counted_now_and_then(
     with ProgressView("table", 10, 2, lambda: done[0]) as view:
         done[0] = 7
         assert view._headline([]).startswith("table: 1 of 10")
-        later = live.time.monotonic() + 60
-        monkeypatch.setattr(live.time, "monotonic", lambda: later)
+        later = progress.time.monotonic() + 60
+        monkeypatch.setattr(progress.time, "monotonic", lambda: later)
         view.update([])
         assert view._headline([]).startswith("table: 7 of 10")
 
