@@ -14,10 +14,10 @@ from rgbt.config.schema import NODES, TOP_LEVEL, check_node
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
-    from sweeps.settings import Settings
-    from sweeps.table.cell_points import Wanted
-    from sweeps.worker.found import Runs
-    from sweeps.worker.lists import PointList
+    from sweeps.settings import SweepSettings
+    from sweeps.table.request import TableRequest
+    from sweeps.worker.point_list import PointList
+    from sweeps.worker.run_store import RunStore
 
 Arguments = Mapping[str, str]
 """Values by key, as typed."""
@@ -42,7 +42,7 @@ class Place:
         runs_dir: the folder of runs.
         out: folder of the table's files; None: ``tables/<table>_<scale>`` inside `runs_dir`.
         tracker: overrides of the tracker.
-        fresh: see `Runs`.
+        fresh: see `RunStore`.
     """
 
     runs_dir: Path
@@ -55,12 +55,12 @@ class Place:
         """Overrides that every run has, whatever row it belongs to."""
         return (*readable_paths([f"runs_dir={self.runs_dir}"]), *self.tracker)
 
-    def folder(self, wanted: Wanted) -> Path:
+    def folder(self, wanted: TableRequest) -> Path:
         """Where the files go."""
         return self.out or self.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
 
 
-def settings_of(arguments: Arguments) -> Settings:
+def settings_of(arguments: Arguments) -> SweepSettings:
     """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
 
     Raises:
@@ -135,14 +135,14 @@ def _is_misspelt(word: str, arguments: Arguments) -> bool:
     return not set(key) & set("./@") and key not in KEYS and key not in arguments
 
 
-def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted:
+def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableRequest:
     """The table called `name` at the scale and with the seeds that were given.
 
     Raises:
         InputError: no such table, scale or metric; no seeds.
     """
     from rgbt.config.compose import conf_dir
-    from sweeps.table.cell_points import Wanted, seeds_of
+    from sweeps.table.request import TableRequest, seeds_of
     from sweeps.table.scoring import check_metrics
     from sweeps.table.table import load_table
     from sweeps.worker.storage import NAME
@@ -161,7 +161,7 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> Wanted
     seeds = seeds_of(arguments["seeds"])
     weights = dict(_weights(word) for word in extra if word.startswith(WEIGHTS))
     others = tuple(word for word in extra if not word.startswith(WEIGHTS))
-    wanted = Wanted(name, table, arguments["scale"], seeds, others, weights)
+    wanted = TableRequest(name, table, arguments["scale"], seeds, others, weights)
     for model in weights:
         if model not in wanted.models():
             raise InputError(
@@ -176,20 +176,20 @@ def _weights(word: str) -> tuple[str, str]:
     return model, file
 
 
-def runs_of(place: Place) -> Runs:
+def runs_of(place: Place) -> RunStore:
     """Where finished runs are found, as the overrides of the tracker say."""
     from rgbt.config.compose import compose
-    from sweeps.worker.found import open_runs
+    from sweeps.worker.run_store import open_run_store
 
     with composing(place.base):
         config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])
         check_node(config.tracking, "tracking")
-    return open_runs(config)
+    return open_run_store(config)
 
 
-def point_list(wanted: Wanted, place: Place, runs: Runs) -> PointList:
+def point_list(wanted: TableRequest, place: Place, runs: RunStore) -> PointList:
     """The runs of a table, as the driver takes them."""
-    from sweeps.worker.lists import PointList
+    from sweeps.worker.point_list import PointList
 
     return PointList(
         study=f"table/{wanted.name}",

@@ -10,8 +10,8 @@ import sys
 from rgbt.checks import InputError
 from rgbt.config.command import plain_command
 from sweeps.asked import Arguments, Place, place_of, point_list, runs_of, settings_of, wanted_of
-from sweeps.settings import Settings
-from sweeps.table.cell_points import Wanted
+from sweeps.settings import SweepSettings
+from sweeps.table.request import TableRequest
 
 OWN = {
     "table": None,
@@ -65,14 +65,14 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     return _reproduce(wanted, place, settings)
 
 
-def _preview(wanted: Wanted, place: Place, settings: Settings) -> int:
+def _preview(wanted: TableRequest, place: Place, settings: SweepSettings) -> int:
     from rich.text import Text
 
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.sheet.preview import cells_grid, summary
-    from sweeps.worker.lists import survey
+    from sweeps.rendering.preview import cells_grid, summary
+    from sweeps.worker.point_list import preview_points
 
-    outcomes = survey(point_list(wanted, place, runs_of(place)), settings)
+    outcomes = preview_points(point_list(wanted, place, runs_of(place)), settings)
     if outcomes:
         show(rich_table(cells_grid(wanted, outcomes)))
     show(Text("\n".join(summary(wanted, outcomes, settings.workers))))
@@ -80,37 +80,39 @@ def _preview(wanted: Wanted, place: Place, settings: Settings) -> int:
 
 
 def _preview_all(
-    arguments: Arguments, extra: tuple[str, ...], place: Place, settings: Settings
+    arguments: Arguments, extra: tuple[str, ...], place: Place, settings: SweepSettings
 ) -> int:
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.sheet.preview import tables_grid
+    from sweeps.rendering.preview import tables_grid
     from sweeps.table.table import table_names
-    from sweeps.worker.lists import survey
+    from sweeps.worker.point_list import preview_points
 
     if not settings.dry_run:
         raise InputError("table=all is for dry_run=true; run one table at a time.")
     every = [wanted_of(name, arguments, extra) for name in table_names()]
     runs = runs_of(place)
-    surveyed = [(wanted, survey(point_list(wanted, place, runs), settings)) for wanted in every]
+    surveyed = [
+        (wanted, preview_points(point_list(wanted, place, runs), settings)) for wanted in every
+    ]
     show(rich_table(tables_grid(surveyed, settings.workers)))
     return 0
 
 
-def _reproduce(wanted: Wanted, place: Place, settings: Settings) -> int:
-    from sweeps.sheet.results import finish
-    from sweeps.worker.lists import work_off
+def _reproduce(wanted: TableRequest, place: Place, settings: SweepSettings) -> int:
+    from sweeps.rendering.publish import finish
+    from sweeps.worker.point_list import run_points
 
     runs = runs_of(place)
     points = point_list(wanted, place, runs)
-    outcomes = work_off(points, settings) if points.points else []
+    outcomes = run_points(points, settings) if points.points else []
     return finish(wanted, outcomes, place.folder(wanted), runs.tracking)
 
 
 def entry() -> None:
     """The command; its first word may be ``new``."""
     if sys.argv[1:2] == ["new"]:
-        from sweeps.table.new import OWN as OF_NEW
-        from sweeps.table.new import new
+        from sweeps.table.new_table import OWN as OF_NEW
+        from sweeps.table.new_table import new
 
         del sys.argv[1]
         plain_command(OF_NEW, new)()

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from rgbt.tracking.mlflow_store import Link, Tracking
     from rgbt.tracking.tables import Grid
-    from sweeps.report.data import Importances, StudyData
-    from sweeps.report.figures import Picture
+    from sweeps.report.figures import StudyFigure
+    from sweeps.report.study_data import Importances, StudyData
 
 OWN = {"name": "", "storage": "", "runs_dir": "runs", "out": ""}
 
@@ -52,7 +52,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
     out = Path(arguments["out"] or study_folder(runs_dir, study.study_name))
     links = report(study, out, tracking)
-    show_places([*links, ("dashboard", dashboard_command(place, runs_dir))])
+    show_links([*links, ("dashboard", dashboard_command(place, runs_dir))])
     return 0
 
 
@@ -72,9 +72,9 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.report.data import importances, read
     from sweeps.report.figures import draw
     from sweeps.report.records import record
+    from sweeps.report.study_data import importances, read
     from sweeps.report.tables import tables, trials_csv
 
     data = read(study)
@@ -113,13 +113,13 @@ def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str
     return "\n".join([head, *map(markdown_table, grids), remarked])
 
 
-def gallery(pictures: Sequence[Picture]) -> str:
+def gallery(pictures: Sequence[StudyFigure]) -> str:
     """The figures in Markdown, by the names of their files."""
     drawn = [picture for picture in pictures if picture.path is not None]
     return "".join(f"\n## {p.title}\n\n![{p.title}]({p.name}.png)\n" for p in drawn)
 
 
-def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
+def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
     """What a person should know: how good the importances are, and which figures there are not."""
     missing: dict[str, list[str]] = {}
     for picture in pictures:
@@ -132,7 +132,7 @@ def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
 
 def metrics(data: StudyData) -> dict[str, float]:
     """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
-    from sweeps.report.data import pruning
+    from sweeps.report.study_data import pruning
     from sweeps.report.tables import WORDS
 
     found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
@@ -171,7 +171,7 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
         )
 
 
-def show_places(places: Sequence[Link]) -> None:
+def show_links(places: Sequence[Link]) -> None:
     """Print where everything is, one "name  place" pair per line."""
     from rgbt.tracking.terminal import place_lines, show
 
