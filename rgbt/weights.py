@@ -176,8 +176,8 @@ def _model(path: Path) -> DictConfig:
 entry = CommandGroup(
     __doc__,
     {
-        "inspect": PlainCommand(InspectOptions, inspect, word="inspect", first="file"),
-        "export": PlainCommand(ExportOptions, export, heeds=(), word="export"),
+        "inspect": PlainCommand(InspectOptions, inspect, name="rgbt weights inspect", first="file"),
+        "export": PlainCommand(ExportOptions, export, heeds=(), name="rgbt weights export"),
     },
 )
 

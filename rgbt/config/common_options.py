@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from rgbt.config.options import Help
+
+AS_TRAINED: Final = "as trained"
+"""Value of an option: what the run was trained with."""
 
 RunsDir = Annotated[Path, Help("folder of runs")]
 
@@ -19,13 +22,11 @@ Trained = Annotated[
 
 Split = Annotated[str, Help("split of the data set")]
 
-Checkpoint = Annotated[
-    Literal["best", "last"], Help("best (by validation mIoU) or last, of a run")
-]
+Checkpoint = Annotated[Literal["best", "last"], Help("best (by validation mIoU) or last, of a run")]
 
 Modality = Annotated[
     str,
-    Help("rgbt, rgb or thermal: what is predicted from; default: what the network is made for"),
+    Help("rgbt, rgb or thermal: what is predicted from; by default what the network is made for"),
 ]
 
 Head = Annotated[
@@ -33,9 +34,7 @@ Head = Annotated[
     Help("of a network with a head per domain: own, source or target"),
 ]
 
-RegionsFile = Annotated[
-    str, Help("a file of conf/metric: ring5, ring9, vertical5, horizontal5")
-]
+RegionsFile = Annotated[str, Help("a file of conf/metric: ring5, ring9, vertical5, horizontal5")]
 
 Trust = Annotated[
     str, Help("modules of yours that the run was made with: trust=my_lab; their code is run")

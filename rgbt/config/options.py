@@ -12,11 +12,10 @@ those of a configuration are (`rgbt.config.values`), and ``--help`` is made from
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -90,7 +89,9 @@ def _plain(key: str, text: str, annotation: Any) -> Any:
     kinds = _leaves(annotation)
     if type(None) in kinds and text in ("", "null"):
         return None
-    if {str, Path} & set(kinds) or text in kinds:
+    if Path in kinds and not text:
+        raise InputError(f"'{key}' has no value; give a path.")
+    if str in kinds or Path in kinds or text in kinds:
         return text
     for kind in kinds:
         if typing.get_origin(kind) is tuple:
@@ -111,6 +112,13 @@ def _leaves(annotation: Any) -> list[Any]:
     return [annotation]
 
 
+def choices_of(annotation: Any) -> list[str]:
+    """The texts that an annotation names one by one."""
+    leaves = _leaves(annotation)
+    booleans = ["true", "false"] if bool in leaves else []
+    return [*booleans, *(each for each in leaves if isinstance(each, str))]
+
+
 def _as_hydra_reads(key: str, text: str) -> Any:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -127,9 +135,11 @@ def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None
     key = word.lstrip("+~").partition("=")[0]
     if heeds is None:
         _check_key(word, key, names)
-    elif key != "hydra.searchpath":  # where files of a data set of one's own lie
-        if not any(key == each or key.startswith(f"{each}.") for each in heeds):
-            raise InputError(f"'{key}' has no effect here; {nearest(key, [*names, *heeds])}.")
+        return
+    # The search path says where files of a data set of one's own lie.
+    known = (*heeds, "hydra.searchpath") if heeds else ()
+    if not any(key == each or key.startswith(f"{each}.") for each in known):
+        raise InputError(f"'{key}' has no effect here; {nearest(key, [*names, *heeds])}.")
 
 
 def _check_key(word: str, key: str, names: Sequence[str]) -> None:
@@ -142,24 +152,25 @@ def _check_key(word: str, key: str, names: Sequence[str]) -> None:
 
 
 def _is_required(field: dataclasses.Field[Any]) -> bool:
-    return field.default is dataclasses.MISSING
+    return field.default is field.default_factory is dataclasses.MISSING
 
 
-def help_text(usage: str, options: type, main: Callable[..., Any]) -> str:
-    """What ``--help`` shows: the docstring of `main` around its options.
+def help_text(usage: str, options: type, about: str, given: Sequence[str] = ()) -> str:
+    """What ``--help`` shows: the text of a command around its options.
 
     Args:
         usage: the command as it is typed, without its options.
         options: dataclass that declares them.
-        main: its first paragraph says what the command does; the others stand below the options.
+        about: the first paragraph says what the command does; others stand below the options.
+        given: options that `usage` names already.
     """
-    summary, _, rest = inspect.cleandoc(main.__doc__ or "").partition("\n\n")
+    summary, _, rest = about.partition("\n\n")
     fields = dataclasses.fields(options)
-    needed = [f"{field.name}=..." for field in fields if _is_required(field)]
+    needed = [each.name for each in fields if _is_required(each) and each.name not in given]
+    usage = " ".join(["usage:", usage, *(f"{name}=..." for name in needed), "[option=value ...]"])
     kinds = types_of(options)
-    width = 2 + max((len(name) for name in kinds), default=0)
+    width = 2 + max(map(len, kinds), default=0)
     lines = [_entry(field, kinds[field.name], width) for field in fields]
-    usage = " ".join(["usage:", usage, *needed, "[option=value ...]"])
     return "\n\n".join(filter(None, [summary, usage, "\n".join(lines), rest]))
 
 
@@ -167,14 +178,14 @@ def _entry(field: dataclasses.Field[Any], annotation: Any, width: int) -> str:
     """One option with its meaning, choices and default."""
     notes = [each.text for each in getattr(annotation, "__metadata__", ()) if type(each) is Help]
     text = "; ".join(notes)
-    choices = [str(each) for each in _leaves(annotation) if isinstance(each, str)]
+    choices = [each for each in choices_of(annotation) if each not in ("true", "false")]
     if not all(re.search(rf"\b{re.escape(each)}\b", text) for each in choices):
         text += f"; one of: {', '.join(choices)}"
     shown = _shown(field.default)
-    if shown and not _is_required(field):
+    if shown and "default" not in text:
         text += f" (default: {shown})"
     return textwrap.fill(
-        text,
+        text.lstrip("; "),
         WIDTH,
         initial_indent=f"  {field.name:<{width}}",
         subsequent_indent=" " * (width + 2),
@@ -187,4 +198,4 @@ def _shown(default: Any) -> str:
     """A default as one types it; "" for none."""
     if isinstance(default, bool):
         return str(default).lower()
-    return "" if default is None else str(default)
+    return "" if default is None or default is dataclasses.MISSING else str(default)

@@ -5,6 +5,7 @@ Other ``key=value`` words are overrides of the configuration. See `rgbt.config.o
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,24 +29,28 @@ class PlainCommand(Generic[T]):
         main: gets the options, and all other words as overrides of the configuration; its docstring
             is the help text.
         heeds: keys of the configuration that take effect, each with all below it; None: all.
-        word: follows the name of the command, for one of a `CommandGroup`.
+        name: as it is typed; "": as `rgbt.config.commands` names its module.
         first: option that the first word sets if it has no ``=``.
     """
 
     options: type[T]
     main: Callable[[T, list[str]], int | None]
     heeds: Sequence[str] | None = None
-    word: str = ""
+    name: str = ""
     first: str = ""
 
     def __call__(self) -> None:
         """Run with the words of ``sys.argv``; leaves by ``sys.exit``."""
         words = sys.argv[1:]
         if any(word in ("-h", "--help") for word in words):
-            name = " ".join(filter(None, [typed_as(self.main), self.word, self.first.upper()]))
-            sys.stdout.write(f"{help_text(name, self.options, self.main)}\n")
+            sys.stdout.write(f"{self.help()}\n")
             sys.exit(0)
         sys.exit(self.code(words))
+
+    def help(self) -> str:
+        """What ``--help`` shows."""
+        usage = f"{self.name or typed_as(self.main)} {self.first.upper()}".strip()
+        return help_text(usage, self.options, inspect.getdoc(self.main) or "", (self.first,))
 
     def code(self, words: Sequence[str]) -> int:
         """The exit code of the command with these words; a mistake is one sentence on stderr."""

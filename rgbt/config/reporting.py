@@ -29,10 +29,8 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         return say(str(error), 2)
     except RunError as error:
         return say(str(error), 1)
-    except (FileExistsError, NotADirectoryError) as error:
-        return say(f"{error.filename}: a file is where a folder is needed; name another path.", 2)
     except OSError as error:
-        return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
+        return say(_of_file(error), 2)
     except Stopped as stop:
         if not catch_interrupt:
             raise
@@ -46,6 +44,12 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         if sentence is None:
             raise
         return say(sentence, 2)
+
+
+def _of_file(error: OSError) -> str:
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"{error.filename}: a file is where a folder is needed; name another path."
+    return f"{error.filename or 'a file'}: {error.strerror or error}."
 
 
 def _of_hydra(error: Exception) -> str | None:

@@ -61,7 +61,7 @@ def main(options: Options, overrides: list[str]) -> int:
     name = options.name or listed[min(PLACE, len(listed) - 1)]
     if name not in listed:
         near = nearest(name, listed[:20])
-        raise InputError(f"name={name}: split '{arguments['split']}' has no such sample; {near}.")
+        raise InputError(f"name={name}: split '{options.split}' has no such sample; {near}.")
     kinds = [each.degradation for each in chosen]
     lines = sheet(dataset, kinds, name, options.split, chosen[0].seed)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,9 @@ class Options:
     """What is sent, and where."""
 
     run: Annotated[Path | None, Help("one run folder")] = None
-    runs_dir: Annotated[Path | None, Help("instead: a folder of runs, all of which are sent")] = None
+    runs_dir: Annotated[Path | None, Help("instead: a folder of runs, all of which are sent")] = (
+        None
+    )
     uri: Annotated[
         str | None, Help("of the store; default: the one that the run was started with")
     ] = None

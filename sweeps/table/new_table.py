@@ -10,17 +10,16 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import PIXELS, compose
+from rgbt.config.options import Help
 from rgbt.config.schema import check
 from rgbt.files.atomic import write_atomic
 from sweeps.table.table import OWN as FOLDER
 from sweeps.table.table import PUBLISHED, load_table
-
-OWN = {"table": None, "experiment": None}
 
 RINGS = 5
 END = "\n..."
@@ -71,18 +70,24 @@ class Factor:
         return found if len(found) > 1 and all(map(math.isfinite, found)) else None
 
 
-def new(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Write a table of your own, to be run with `python -m sweeps.reproduce table=my/ablation`.
+@dataclass(frozen=True)
+class NewOptions:
+    """Of ``rgbt reproduce new``."""
 
-    table       its name, my/ablation for the file tables/my/ablation.yaml
-    experiment  a file of conf/experiment
-    overrides   with comma lists for what is varied: masker.sigma_div=1,2,4 masker.patch_size=32,64
+    table: Annotated[str, Help("its name, my/ablation for the file tables/my/ablation.yaml")]
+    experiment: Annotated[str, Help("a file of conf/experiment")]
+
+
+def new(options: NewOptions, overrides: list[str]) -> int:
+    """Write a table of your own, to be run with `rgbt reproduce table=my/ablation`.
+
+    Overrides with comma lists say what is varied: masker.sigma_div=1,2,4 masker.patch_size=32,64
     """
-    path = write_new(arguments["table"], arguments["experiment"], overrides)
-    rows = len(load_table(arguments["table"]).rows)
+    path = write_new(options.table, options.experiment, overrides)
+    rows = len(load_table(options.table).rows)
     sys.stdout.write(
         f"{path} has {rows} rows; run them with\n"
-        f"python -m sweeps.reproduce table={arguments['table']} seeds=3 workers=2\n"
+        f"rgbt reproduce table={options.table} seeds=3 workers=2\n"
     )
     return 0
 

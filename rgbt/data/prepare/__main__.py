@@ -53,13 +53,12 @@ class Options:
     ]
     out: Annotated[Path, Help("a new folder outside of it")]
     labels: Annotated[
-        Path | None, Help("kp: folder or archive of the labels of MS-UDA, where the source has none")
+        Path | None,
+        Help("kp: folder or archive of the labels of MS-UDA, where the source has none"),
     ] = None
     lists: Annotated[
         Path | None,
-        Help(
-            "mfnet and kp: folder of lists to use instead of the download's, or of set numbers"
-        ),
+        Help("mfnet and kp: folder of lists to use instead of the download's, or of set numbers"),
     ] = None
 
     @property

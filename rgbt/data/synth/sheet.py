@@ -80,7 +80,9 @@ def _column(scene: Scene, zoom: int) -> NDArray[np.uint8]:
 def main(options: Options, overrides: list[str]) -> int:
     """Draw scenes of the embedded data set: RGB, thermal, label by day, then the same by night."""
     del overrides  # none is heeded
-    factors = SceneFactors(**{each.name: getattr(options, each.name) for each in fields(SceneFactors)})
+    factors = SceneFactors(
+        **{each.name: getattr(options, each.name) for each in fields(SceneFactors)}
+    )
     if not options.out.parent.is_dir():
         raise InputError(f"out={options.out} cannot be written; name a PNG in an existing folder.")
     sheet = contact_sheet(options.seed, options.first, factors, options.columns, options.zoom)

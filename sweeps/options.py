@@ -1,16 +1,19 @@
-"""What the arguments of ``python -m sweeps.reproduce`` ask for."""
+"""Options of ``rgbt reproduce``, and the table, paths and settings that they stand for."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config.command import composing, readable_paths
-from rgbt.config.schema import NODES, TOP_LEVEL, check_node
+from rgbt.config.command import composing
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.config.schema import check_node
+from rgbt.config.words import readable_paths
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
@@ -19,23 +22,66 @@ if TYPE_CHECKING:
     from sweeps.worker.point_list import PointList
     from sweeps.worker.run_store import RunStore
 
-Arguments = Mapping[str, str]
-"""Values by key, as typed."""
-
-OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
-"""Arguments that are no settings of execution."""
-
 WEIGHTS = "weights."
 """weights.mask2former_swin_b=FILE: for the rows that name this network."""
 
-KEYS = (*NODES, *TOP_LEVEL, "debug")
 
-WORDS = ("storage", "retry", "executor")
-"""Settings that are text."""
+@dataclass(frozen=True)
+class Options:
+    """Of ``rgbt reproduce``; those of execution are explained in the sweeper's file too."""
+
+    table: Annotated[
+        str,
+        Help("spatialseg/table3, my/ablation (in ./tables), a file; all with dry_run=true"),
+    ]
+    seeds: Annotated[str, Help("how many (3 for the seeds 0, 1, 2), or which: 0,4,7")] = "1"
+    scale: Annotated[str, Help("demo (minutes, embedded data) or paper (as published)")] = "demo"
+    dry_run: Annotated[
+        bool, Help("true: show the cells, which of them are finished, and how long the rest takes")
+    ] = False
+    runs_dir: RunsDir = Path("runs")
+    out: Annotated[
+        Path | None,
+        Help(
+            "folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder of runs"
+        ),
+    ] = None
+    workers: Annotated[int, Help("runs at a time")] = 1
+    gpus: Annotated[tuple[int, ...] | None, Help("gpus=[0,1] gives each worker one of them")] = None
+    retry: Annotated[
+        Literal["none", "failed"], Help("failed: try again what failed in a previous call")
+    ] = "none"
+    retries: Annotated[int, Help("how often a run is tried again in this call")] = 0
+    fresh: Annotated[
+        bool,
+        Help(
+            "true: train again what other code made; the old runs are kept in <runs_dir>/replaced"
+        ),
+    ] = False
+    wait: Annotated[
+        bool,
+        Help("false: leave cells to the commands that run them instead of waiting for them"),
+    ] = True
+    storage: Annotated[
+        str | None,
+        Help("where machines agree on who runs what: file.journal, postgresql://user@host/name"),
+    ] = None
+    timeout_minutes: Annotated[float | None, Help("of one run")] = None
+    max_failures: Annotated[int | None, Help("failed runs after which no other is begun")] = None
+    executor: Annotated[
+        Literal["local", "submitit"], Help("processes of this machine, or jobs of a cluster")
+    ] = "local"
+    submitit: Annotated[
+        dict[str, Any] | None, Help("options of its jobs: submitit={timeout_min: 60}")
+    ] = field(default_factory=dict)
+
+
+OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
+"""Options that are no settings of execution."""
 
 
 @dataclass(frozen=True)
-class Place:
+class Workspace:
     """Where a table's runs and files lie.
 
     Attributes:
@@ -60,11 +106,11 @@ class Place:
         return self.out or self.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
 
 
-def settings_of(arguments: Arguments) -> SweepSettings:
+def settings_of(options: Options) -> SweepSettings:
     """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
 
     Raises:
-        InputError: a value of a wrong type.
+        InputError: a value out of its range.
     """
     from omegaconf import DictConfig, OmegaConf
 
@@ -75,67 +121,46 @@ def settings_of(arguments: Arguments) -> SweepSettings:
     assert isinstance(node, DictConfig), "the file is a mapping"
     # What Optuna's own pages show of a table; nothing is chosen by it.
     node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
-    for key, text in arguments.items():
+    for key, value in vars(options).items():
         if key not in OF_THE_TABLE:
-            node[key] = _parsed(key, text)
+            node[key] = value
     try:
         return read_settings(node)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
 
 
-def _parsed(key: str, text: str) -> Any:
-    """A value as Hydra reads it."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    if key in WORDS:
-        return None if text in ("null", "") else text
-    try:
-        return OverridesParser.create().parse_override(f"{key}={text}").value()
-    except HydraException as error:
-        raise InputError(f"{key}={text}: cannot be read as a value.") from error
-
-
-def place_of(arguments: Arguments, overrides: Sequence[str]) -> tuple[Place, tuple[str, ...]]:
+def workspace_of(options: Options, overrides: Sequence[str]) -> tuple[Workspace, tuple[str, ...]]:
     """Where everything lies, and the overrides of the rows.
 
     Raises:
         InputError: an override that belongs to the rows of the table.
     """
     for word in overrides:
-        key = word.lstrip("+~").partition("=")[0]
-        if key in ("seed", "experiment"):
-            other = "seeds=3" if key == "seed" else "another table"
-            raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
-        if key.rpartition("@")[2].partition(".")[0] == "consistency":
-            raise InputError(
-                f"'{word}': the columns of the table say what is counted, on the published sets of "
-                "views; measure others with python -m rgbt.consistency run=..."
-            )
-        if key == "metric" or key.startswith("metric."):
-            raise InputError(
-                f"'{word}': the columns of the table say what is counted; set its `regions` in a "
-                "table of your own."
-            )
-        if _is_misspelt(word, arguments):
-            raise InputError(f"'{word}': {key} is no key; {nearest(key, [*arguments, *KEYS])}.")
-        if word.startswith("-"):
-            raise InputError(f"'{word}' is no key=value; {nearest(word, arguments)}.")
+        _check_override(word)
     tracker = tuple(word for word in overrides if word.lstrip("+~").startswith("tracking"))
     rest = tuple(word for word in overrides if word not in tracker)
-    out = Path(arguments["out"]) if arguments["out"] else None
-    check_choice("fresh", arguments["fresh"], ("true", "false"))
-    return Place(Path(arguments["runs_dir"]), out, tracker, arguments["fresh"] == "true"), rest
+    return Workspace(options.runs_dir, options.out, tracker, options.fresh), rest
 
 
-def _is_misspelt(word: str, arguments: Arguments) -> bool:
-    """Whether a word without a dot is neither a node nor a plain key of a configuration."""
+def _check_override(word: str) -> None:
     key = word.lstrip("+~").partition("=")[0]
-    return not set(key) & set("./@") and key not in KEYS and key not in arguments
+    if key in ("seed", "experiment"):
+        other = "seeds=3" if key == "seed" else "another table"
+        raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
+    if key.rpartition("@")[2].partition(".")[0] == "consistency":
+        raise InputError(
+            f"'{word}': the columns of the table say what is counted, on the published sets of "
+            "views; measure others with rgbt consistency run=..."
+        )
+    if key == "metric" or key.startswith("metric."):
+        raise InputError(
+            f"'{word}': the columns of the table say what is counted; set its `regions` in a "
+            "table of your own."
+        )
 
 
-def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableRequest:
+def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequest:
     """The table called `name` at the scale and with the seeds that were given.
 
     Raises:
@@ -148,7 +173,7 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableR
     from sweeps.worker.storage import NAME
 
     scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
-    check_choice("scale", arguments["scale"], scales)
+    check_choice("scale", options.scale, scales)
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"
@@ -158,10 +183,10 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableR
             f"table={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone; "
             "rename the file."
         )
-    seeds = seeds_of(arguments["seeds"])
+    seeds = seeds_of(options.seeds)
     weights = dict(_weights(word) for word in extra if word.startswith(WEIGHTS))
     others = tuple(word for word in extra if not word.startswith(WEIGHTS))
-    wanted = TableRequest(name, table, arguments["scale"], seeds, others, weights)
+    wanted = TableRequest(name, table, options.scale, seeds, others, weights)
     for model in weights:
         if model not in wanted.models():
             raise InputError(
@@ -176,18 +201,18 @@ def _weights(word: str) -> tuple[str, str]:
     return model, file
 
 
-def runs_of(place: Place) -> RunStore:
+def runs_of(workspace: Workspace) -> RunStore:
     """Where finished runs are found, as the overrides of the tracker say."""
     from rgbt.config.compose import compose
     from sweeps.worker.run_store import open_run_store
 
-    with composing(place.base):
-        config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])
+    with composing(workspace.base):
+        config = compose([*workspace.base, f"fresh={str(workspace.fresh).lower()}"])
         check_node(config.tracking, "tracking")
     return open_run_store(config)
 
 
-def point_list(wanted: TableRequest, place: Place, runs: RunStore) -> PointList:
+def point_list(wanted: TableRequest, workspace: Workspace, runs: RunStore) -> PointList:
     """The runs of a table, as the driver takes them."""
     from sweeps.worker.point_list import PointList
 
@@ -197,5 +222,5 @@ def point_list(wanted: TableRequest, place: Place, runs: RunStore) -> PointList:
         kind="list",
         points=tuple(wanted.points()),
         runs=runs,
-        base=place.base,
+        base=workspace.base,
     )
