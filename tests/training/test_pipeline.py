@@ -625,7 +625,6 @@ def test_a_run_that_another_process_began_in_between(bring: Any, tmp_path: Path)
 @pytest.mark.slow
 def test_a_stored_run_of_before_domains_opens(call: Call, trained: Trained, tmp_path: Path) -> None:
     from rgbt import evaluate
-    from rgbt.config.command import plain_command
 
     done = trained("+experiment=crm", *short(1))
     folder = tmp_path / "runs" / done.name
@@ -633,11 +632,11 @@ def test_a_stored_run_of_before_domains_opens(call: Call, trained: Trained, tmp_
     stored = OmegaConf.load(folder / "config.yaml")
     del stored["domains"], stored["pretrained"], stored["trainer"]["tested"]
     OmegaConf.save(stored, folder / "config.yaml")
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={folder}")
+    code, _, err = call(evaluate.entry, f"run={folder}")
     assert code == 0, err
     (path,) = (folder / "evaluations").glob("*.npz")
     again, first = Counts.load(path), Counts.load(folder / "counts_test.npz")
     assert np.array_equal(again.counts, first.counts)
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={folder}", "head=source")
+    code, _, err = call(evaluate.entry, f"run={folder}", "head=source")
     assert code == 2
     assert "head=source chooses between the heads of two domains" in err
