@@ -49,6 +49,4 @@ def test_of_virtual_views_one_call_makes_two_files() -> None:
     assert released.path == "evaluations/consistency_released_test.npz"
     assert aligned.label == "consistency, aligned"
     assert ExtraEvaluation(frames="next").command == ("rgbt.consistency", "frames=next")
-    assert {word.partition("=")[0] for word in aligned.command[1:]} <= set(
-        types_of(OfConsistency)
-    )
+    assert {word.partition("=")[0] for word in aligned.command[1:]} <= set(types_of(OfConsistency))
