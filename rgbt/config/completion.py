@@ -6,10 +6,13 @@ import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from typing import Any
 
 from rgbt.config.commands import COMMANDS
 from rgbt.config.options import choices_of, types_of
 from rgbt.config.plain_command import CommandGroup, PlainCommand
+
+AnyCommand = PlainCommand[Any]
 
 HYDRA_OPTIONS = ("-m", "--multirun", "--help", "--cfg", "--resolve")
 
@@ -54,7 +57,7 @@ def _importable(module: str) -> str:
     return f"{module}.__main__" if is_package else module
 
 
-def _of_command(command: PlainCommand | CommandGroup, words: list[str]) -> list[str]:
+def _of_command(command: AnyCommand | CommandGroup, words: list[str]) -> list[str]:
     if isinstance(command, PlainCommand):
         return _of_options(command, words)
     if words[0] in command.commands and len(words) > 1:
@@ -63,7 +66,7 @@ def _of_command(command: PlainCommand | CommandGroup, words: list[str]) -> list[
     return [*named, *(_of_options(command.default, words) if command.default else [])]
 
 
-def _of_options(command: PlainCommand, words: list[str]) -> list[str]:
+def _of_options(command: AnyCommand, words: list[str]) -> list[str]:
     kinds = types_of(command.options)
     key, equals, _ = words[-1].partition("=")
     if equals and key in kinds:
@@ -74,13 +77,13 @@ def _of_options(command: PlainCommand, words: list[str]) -> list[str]:
     return [*_begin(words[-1], options), *_heeded(command, [*overrides, words[-1]])]
 
 
-def _heeded(command: PlainCommand, words: list[str]) -> Iterator[str]:
+def _heeded(command: AnyCommand, words: list[str]) -> Iterator[str]:
     """Overrides of the configuration that the command takes."""
     heeds = command.heeds
     if heeds == () or (heeds is None and not words[-1]):  # all of them would hide the options
         return
     for each in _of_hydra(words):
-        if heeds is None or any(each.startswith((key, *[f"{key}."])) for key in heeds):
+        if heeds is None or any(each.startswith(key) for key in heeds):
             yield each
 
 
@@ -101,7 +104,10 @@ def _of_hydra(words: list[str]) -> list[str]:
     key = begun.partition("=")[0]
     word = f"{key}={value}" if comma else last
     known = DefaultCompletionPlugin(loader)._query("config", " ".join([*others, word]))
-    return [f"{begun},{each.partition('=')[2]}" if comma else each for each in known]
+    if comma:
+        return [f"{begun},{each.partition('=')[2]}" for each in known]
+    # A group that holds a folder beside its files has no "=" in Hydra's answer.
+    return [each if "=" in word or each[-1] in "=./" else f"{each}=" for each in known]
 
 
 def _begin(word: str, known: Sequence[str]) -> list[str]:
