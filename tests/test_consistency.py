@@ -298,7 +298,7 @@ def test_counts_are_written_where_no_image_of_the_picture_can_be_read(
 
 
 REFUSED = {
-    "no such frames": (["frames=nxt"], "frames: 'nxt' is not a choice"),
+    "no such frames": (["frames=nxt"], "did you mean 'next'?"),
     "no second frames": (["frames=next"], "has no second frames: expected the folder next/"),
     "no views": (["consistency=none"], "consistency.sets is empty"),
     "empty sets": (["consistency.sets=[]"], "consistency.sets is empty"),
@@ -306,7 +306,7 @@ REFUSED = {
     "another precision": (["trainer.precision=bf16-mixed"], "changes how the run is measured"),
     "no such split": (["split=tset"], "no split 'tset'; did you mean 'test'?"),
     "no such modality": (["modality=rgb"], "modality: 'rgb' is not a choice"),
-    "no such checkpoint": (["checkpoint=first"], "checkpoint: 'first' is not a choice"),
+    "no such checkpoint": (["checkpoint=first"], "'checkpoint' must be 'best' or 'last'"),
     "no such set": (["consistency.sets=[released_4]"], "did you mean 'released_3'?"),
     "misspelt key": (["consistency.veiw.mode=both"], "did you mean 'view'?"),
     "no such file": (["consistency=veiws"], "there is no consistency 'veiws'"),

@@ -355,7 +355,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
         ("run=nowhere",): "run=nowhere: neither a run folder",
         (f"run={folder}", "modality=infrared"): "modality: 'infrared' is not a choice",
         (f"run={folder}", "split=tset"): "no split 'tset'",
-        (f"run={folder}", "checkpoint=first"): "'first' is not a choice",
+        (f"run={folder}", "checkpoint=first"): "'checkpoint' must be 'best' or 'last'",
         (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
         (f"run={folder}", "data.batch_siz=1"): "did you mean 'data.batch_size'?",
         (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",

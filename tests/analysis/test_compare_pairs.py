@@ -114,7 +114,7 @@ def test_files_compare_without_frames(call: Call, runs: Path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["frames=virtual"], "frames: 'virtual' is not a choice; known: aligned, next, released"),
+        (["frames=virtual"], "'frames' must be"),
         (
             ["a=plain0", "b=bare0", "metrics=TC"],
             "'TC' is a score of pairs of frames, but these counts (ring2) are of",
