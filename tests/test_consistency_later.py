@@ -234,7 +234,7 @@ def test_a_store_that_is_away_does_not_cost_what_was_measured(
     (folder / "mlflow.json").write_text(json.dumps({**sent, "uri": "http://127.0.0.1:9"}))
     code, _, err = measure(call, f"run={folder}")
     assert code == 0, err
-    assert_one_sentence(err, f"python -m rgbt.tracking.sync run={folder}")
+    assert_one_sentence(err, f"rgbt sync run={folder}")
     assert set(SCORES) <= set(read(folder, "result.json")["test"])
 
 
