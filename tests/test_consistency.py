@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import ca, ca_released, tc
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, short, train
@@ -35,7 +34,7 @@ def copied(trained: Trained, tmp_path: Path, *overrides: str) -> Path:
 def measure(call: Call, *arguments: str) -> tuple[int, str, str]:
     from rgbt import consistency
 
-    return call(plain_command(consistency.OWN, consistency.main), *arguments)
+    return call(consistency.entry, *arguments)
 
 
 def pair_counts(path: Path) -> Counts:
@@ -138,7 +137,7 @@ def test_a_run_of_before_there_was_any_consistency(
     del tables["consistency"], tables["crc32"]
     (old / "tables.json").write_text(json.dumps(tables))
 
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={old}")
+    code, _, err = call(evaluate.entry, f"run={old}")
     assert code == 0, err
     code, _, err = measure(call, f"run={old}")
     assert code == 0, err
@@ -299,7 +298,7 @@ def test_counts_are_written_where_no_image_of_the_picture_can_be_read(
 
 
 REFUSED = {
-    "no such frames": (["frames=nxt"], "frames: 'nxt' is not a choice"),
+    "no such frames": (["frames=nxt"], "did you mean 'next'?"),
     "no second frames": (["frames=next"], "has no second frames: expected the folder next/"),
     "no views": (["consistency=none"], "consistency.sets is empty"),
     "empty sets": (["consistency.sets=[]"], "consistency.sets is empty"),
@@ -307,7 +306,7 @@ REFUSED = {
     "another precision": (["trainer.precision=bf16-mixed"], "changes how the run is measured"),
     "no such split": (["split=tset"], "no split 'tset'; did you mean 'test'?"),
     "no such modality": (["modality=rgb"], "modality: 'rgb' is not a choice"),
-    "no such checkpoint": (["checkpoint=first"], "checkpoint: 'first' is not a choice"),
+    "no such checkpoint": (["checkpoint=first"], "'checkpoint' must be 'best' or 'last'"),
     "no such set": (["consistency.sets=[released_4]"], "did you mean 'released_3'?"),
     "misspelt key": (["consistency.veiw.mode=both"], "did you mean 'view'?"),
     "no such file": (["consistency=veiws"], "there is no consistency 'veiws'"),

@@ -16,7 +16,7 @@ from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import describe
 from rgbt.spec.specify import specify
-from sweeps.worker.found import Found
+from sweeps.worker.run_store import RunResult
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, train
 from tests.conftest import pair, write_png
 from tests.test_consistency import ALIGNED, RELEASED, TEMPORAL, copied, measure
@@ -152,10 +152,10 @@ def test_what_is_measured_later_is_the_runs(
 
 
 def test_a_search_finds_what_was_added(call: Call, plain: Path) -> None:
-    assert "val/TC/aligned" not in Found(plain.name, plain).scores()
+    assert "val/TC/aligned" not in RunResult(plain.name, plain).scores()
     code, _, err = measure(call, f"run={plain}", "split=val")
     assert code == 0, err
-    found = Found(plain.name, plain).scores()
+    found = RunResult(plain.name, plain).scores()
     result = read(plain, "result.json")["val"]
     for name in SCORES:
         assert found[f"val/{name}"] == pytest.approx(100 * result[name])
@@ -234,7 +234,7 @@ def test_a_store_that_is_away_does_not_cost_what_was_measured(
     (folder / "mlflow.json").write_text(json.dumps({**sent, "uri": "http://127.0.0.1:9"}))
     code, _, err = measure(call, f"run={folder}")
     assert code == 0, err
-    assert_one_sentence(err, f"python -m rgbt.tracking.sync run={folder}")
+    assert_one_sentence(err, f"rgbt sync run={folder}")
     assert set(SCORES) <= set(read(folder, "result.json")["test"])
 
 

@@ -124,7 +124,6 @@ def words_of(lab: Path) -> list[str]:
 
 def test_the_page_runs(lab: Path, call: Call) -> None:
     from rgbt import evaluate, predict
-    from rgbt.config.command import plain_command
     from rgbt.maskers import sketch
     from rgbt.run import main
 
@@ -138,12 +137,12 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     assert code == 0, err
     assert (lab / "masks.png").is_file()
     words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
+    code, _, err = call(evaluate.entry, *words)
     assert code == 0, err
     words = (f"run={run}", "input=test", f"out={lab / 'out'}", "trust=my_lab")
-    code, _, err = call(plain_command(predict.OWN, predict.main), *words)
+    code, _, err = call(predict.entry, *words)
     assert code == 0, err
-    code, _, err = call(plain_command(predict.OWN, predict.main), *words, f"input={lab}")
+    code, _, err = call(predict.entry, *words, f"input={lab}")
     assert code == 2
     assert_one_sentence(
         err, "Arrays does not declare how new images are read; name one of its splits"

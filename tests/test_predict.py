@@ -11,13 +11,12 @@ import pytest
 import torch
 
 from rgbt import predict
-from rgbt.config.command import plain_command
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import PseudoLabels
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
 
-PREDICT = plain_command(predict.OWN, predict.main)
+PREDICT = predict.entry
 ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
 
 
@@ -157,16 +156,16 @@ def test_what_names_no_images_is_refused(
     ("asked", "sentence"),
     [
         (("threshold=0.5",), "threshold=0.5 is for pseudo_labels=true"),
-        (("pseudo_labels=yes",), "pseudo_labels: 'yes' is not a choice"),
-        (("pseudo_labels=true", "threshold=half"), "threshold=half: expected a number from 0 to 1"),
+        (("pseudo_labels=yes",), "'pseudo_labels' must be true or false"),
+        (("pseudo_labels=true", "threshold=half"), "'threshold' must be a number"),
         (("pseudo_labels=true", "threshold=2"), "threshold must lie in [0, 1], got 2"),
         (("pseudo_labels=true", "input=pictures"), "written of a split of mfnet; name one of"),
         (("pseudo_labels=true", "label_map=x"), "there is no label_map 'x'"),
         (("pseudo_labels=true", "modality=infrared"), "modality: 'infrared' is not a choice"),
         (("pseudo_labels=true", "head=target"), "head=target chooses between the heads"),
-        (("pseudo_labels=true", "head=night"), "head: 'night' is not a choice"),
+        (("pseudo_labels=true", "head=night"), "'head' must be"),
         (("head=target",), "head=target chooses between the heads"),
-        (("checkpoint=first",), "checkpoint: 'first' is not a choice"),
+        (("checkpoint=first",), "'checkpoint' must be 'best' or 'last'"),
     ],
 )
 def test_what_does_not_fit_is_refused(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from analysis.figures import make_methods, make_papers
 from analysis.figures.inputs import Given
@@ -161,13 +161,13 @@ FIGURES: dict[str, Entry] = {
 
 
 def make(
-    figure: str, values: dict[str, str], overrides: list[str]
+    figure: str, values: dict[str, Any], overrides: list[str]
 ) -> tuple[Figure, Mapping[str, str]]:
     """The figure called `figure`, and its numbers as text by the ending of their file.
 
     Args:
         figure: a key of `FIGURES`.
-        values: key -> text of the keys that were given.
+        values: key -> value of the options that were given.
         overrides: other ``key=value`` arguments.
 
     Raises:

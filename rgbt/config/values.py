@@ -7,11 +7,13 @@ The range of a setting is declared once, in the annotations of the constructor t
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
 import types
 import typing
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from annotated_types import DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, MultipleOf
@@ -24,7 +26,7 @@ Place = tuple[int | str, ...]
 
 NAMES: dict[Any, str] = {
     **{float: "a number", int: "a whole number", str: "a text", bool: "true or false"},
-    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list"},
+    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list", Path: "a path"},
     Any: "a finite value",
 }
 
@@ -90,7 +92,21 @@ def _refusal(path: str, value: Any, annotation: Any, place: Place) -> str:
             break
         annotation, value = inner, value[step]
         path += f"[{step}]" if isinstance(step, int) else f".{step}"
-    return f"'{path}' must be {expected(annotation)}, got {_shown(value)}."
+    return (
+        f"'{path}' must be {expected(annotation)}, got {_shown(value)}{_meant(annotation, value)}"
+    )
+
+
+def _meant(annotation: Any, value: Any) -> str:
+    """The nearest of the texts that an annotation names, as the end of a sentence."""
+    literals = [each for each in _members(_bare(annotation)) if _is_literal(each)]
+    words = [str(word) for each in literals for word in typing.get_args(each)]
+    close = difflib.get_close_matches(str(value), words, n=1)
+    return f"; did you mean '{close[0]}'?" if close else "."
+
+
+def _is_literal(annotation: Any) -> bool:
+    return typing.get_origin(annotation) is typing.Literal
 
 
 def _holds(value: Any, step: int | str) -> bool:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from rgbt.config.command import plain_command
-from rgbt.data.cache.__main__ import OWN, main
+from rgbt.data.cache.__main__ import entry
 
 if __name__ == "__main__":
     sys.stderr.write("rgbt: use python -m rgbt.data.cache; rgbt.data.decoded is its former name.\n")
-    plain_command(OWN, main)()
+    entry()

@@ -16,9 +16,8 @@ import pytest
 from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import score_folder
 from analysis.predictions.table import Cell
-from analysis.score import OWN, main, score_tables
+from analysis.score import entry, score_tables
 from analysis.uncertainty import Resampling, estimate
-from rgbt.config.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -45,7 +44,7 @@ def predictions(data: Path, tmp_path: Path) -> Path:
 
 
 def score(call: Call, *arguments: str) -> tuple[int, str, str]:
-    return call(plain_command(OWN, main), *arguments)
+    return call(entry, *arguments)
 
 
 def place(data: Path) -> tuple[str, str]:
@@ -279,9 +278,9 @@ def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
         (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect here"),
         (("predictions=a", "dataset=mfnte"), "did you mean 'mfnet'"),
         (("predictions=a", "dataset=mfnet"), "dataset.root"),
-        (("predictions=a", "resamples=many"), "resamples=many: expected a whole number"),
-        (("predictions=a", "level=high"), "level=high: expected a number"),
-        (("predictions=a", "blocks=run"), "blocks=run: expected auto"),
+        (("predictions=a", "resamples=many"), "'resamples' must be a whole number"),
+        (("predictions=a", "level=high"), "'level' must be a number"),
+        (("predictions=a", "blocks=run"), "'blocks' must be 'auto'"),
     ],
 )
 def test_arguments_that_make_no_sense(
@@ -296,9 +295,9 @@ def test_arguments_that_make_no_sense(
 @pytest.mark.parametrize(
     ("argument", "sentence"),
     [
-        ("partition=rings", "partition: 'rings' is not a choice; did you mean 'ring'"),
-        ("regions=0", "regions must lie in [1, 255]"),
-        ("format=color", "format: 'color' is not a choice"),
+        ("partition=rings", "did you mean 'ring'"),
+        ("regions=0", "'regions' must be a whole number from 1 to 255"),
+        ("format=color", "'format' must be 'auto', 'index' or 'colour'"),
         ("split=val", "2 of them"),
         ("split=tset", "did you mean 'test'"),
     ],
@@ -316,14 +315,14 @@ def test_help_waits_for_no_heavy_import() -> None:
     code = (
         "import sys; sys.argv[1:] = ['--help']\n"
         "from analysis.score import *\n"
-        "try: plain_command(OWN, main)()\n"
+        "try: entry()\n"
         "except SystemExit as left: assert left.code == 0\n"
         "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'PIL', 'cv2'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "usage: [predictions=]" in done.stdout
+    assert "usage: rgbt score [option=value ...]" in done.stdout
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from rgbt.config.targets import setting_types
 from rgbt.config.values import check_value, expected
 from rgbt.ranges import Pixels, Share
 from rgbt.spec.run_spec import VALUES
-from sweeps.settings import Settings
+from sweeps.settings import SweepSettings
 
 TARGETS = sorted(
     {
@@ -145,7 +145,7 @@ def bounded(annotation: Any) -> bool:
     return bool(re.search(r"from .* to|(above|at least) .* and (at most|below)|of \d+ to", words))
 
 
-@pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.Settings"])
+@pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.SweepSettings"])
 def test_every_number_and_text_has_a_range(target: str) -> None:
     for key, annotation in setting_types(get_object(target)).items():
         for leaf in leaves(annotation):
@@ -249,4 +249,4 @@ def test_nan_and_infinity_are_refused_without_a_declared_range() -> None:
 
 def test_settings_of_a_sweep_are_those_of_its_file() -> None:
     node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
-    assert set(setting_types(Settings)) == set(node) - {"_target_"}
+    assert set(setting_types(SweepSettings)) == set(node) - {"_target_"}

@@ -11,7 +11,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
 from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
 from rgbt.config.stored_config import (
@@ -182,13 +181,13 @@ def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path
     settings: Any = OmegaConf.to_container(compose(["+experiment=crm"]), resolve=True)
     evil = {"_target_": "os.system", "command": f"touch {marker}"}
     commands: list[tuple[Any, tuple[str, ...]]] = [
-        (plain_command(evaluate.OWN, evaluate.main), (f"run={run}",)),
+        (evaluate.entry, (f"run={run}",)),
         (
-            plain_command(predict.OWN, predict.main),
+            predict.entry,
             (f"run={run}", "input=test", f"out={tmp_path / 'out'}"),
         ),
-        (plain_command(robustness.OWN, robustness.main), (f"run={run}", "degradations=noise")),
-        (plain_command(consistency.OWN, consistency.main), (f"run={run}",)),
+        (robustness.entry, (f"run={run}", "degradations=noise")),
+        (consistency.entry, (f"run={run}",)),
     ]
     for name in ("transform", "model", "scheme"):
         assert name in NODES

@@ -21,7 +21,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.data.cache import file_state, sample_file
 from rgbt.data.cache import folder as cache_folder
-from rgbt.data.cache.__main__ import main
+from rgbt.data.cache.__main__ import entry
 from rgbt.data.cache.dataset import CachedDataset, _cache_name, cached_dataset, default_folder
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
@@ -751,17 +751,17 @@ def test_command_fills_and_removes_cache(
     case: Case, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("rgbt.data.cache.__main__.built", lambda node, overrides: case.source)
-    arguments = {"cache": str(case.cache), "remove": "false"}
-    assert main(arguments, []) == 0
+    cache = f"cache={case.cache}"
+    assert entry.run([cache]) == 0
     size = sum(path.stat().st_size for path in case.cache.glob("arrays-*/*"))
     assert capsys.readouterr().out.endswith(f": {size / 1e6:.1f} MB\n")
-    assert main({**arguments, "remove": "true"}, []) == 0
+    assert entry.run([cache, "remove=true"]) == 0
     assert capsys.readouterr().out.endswith(" MB removed\n")
     assert list(case.cache.iterdir()) == []
-    with pytest.raises(InputError, match="remove: 'maybe' is not a choice"):
-        main({**arguments, "remove": "maybe"}, [])
+    with pytest.raises(InputError, match="'remove' must be true or false"):
+        entry.run([cache, "remove=maybe"])
     with pytest.raises(InputError, match=r"^cache: 'null' is not a folder; expected auto or a"):
-        main({**arguments, "cache": "null"}, [])
+        entry.run(["cache=null"])
 
 
 def test_cached_real_pairs_equal_source(tmp_path: Path) -> None:
@@ -796,5 +796,5 @@ def test_folder_and_file_names_are_those_of_existing_caches(case: Case) -> None:
 
 
 def test_command_refuses_setting_without_effect(case: Case) -> None:
-    with pytest.raises(InputError, match=r"'data\.cache' has no effect here; .*cache=FOLDER"):
-        main({"cache": str(case.cache), "remove": "false"}, ["dataset=synth", "data.cache=/x"])
+    with pytest.raises(InputError, match=r"'data\.cache' has no effect here; did you mean 'cache'"):
+        entry.run([f"cache={case.cache}", "dataset=synth", "data.cache=/x"])

@@ -21,7 +21,7 @@ from rgbt.data.kp_layout import SPLITS
 from rgbt.data.mfnet import MFNet
 from rgbt.data.prepare import __main__ as prepare
 from rgbt.data.prepare import copying as prepare_copy
-from rgbt.data.prepare.__main__ import main
+from rgbt.data.prepare.__main__ import entry
 from rgbt.data.prepare.download import SourceFile, SourceFiles
 from rgbt.data.prepare.kp import plan_kp
 from rgbt.data.prepare.plans import Download
@@ -35,8 +35,8 @@ MF = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["01402D", "0118
 
 def call(dataset: str, source: Path, out: Path, **others: Path | str) -> int:
     """The command; its exit code."""
-    words = {"dataset": dataset, "source": str(source), "out": str(out), "labels": "", "lists": ""}
-    return main(words | {key: str(value) for key, value in others.items()}, [])
+    words = {"dataset": dataset, "source": source, "out": out, **others}
+    return entry.run([f"{key}={value}" for key, value in words.items()]) or 0
 
 
 def files_in(root: Path) -> list[str]:
@@ -632,6 +632,6 @@ def test_arguments_without_effect_are_refused(mfnet: Path, tmp_path: Path) -> No
         call("pst900", mfnet, out, lists=mfnet)
     with pytest.raises(InputError, match=r"source: there is no file or folder '.*nowhere'"):
         call("mfnet", tmp_path / "nowhere", out)
-    with pytest.raises(InputError, match=r"'sources=x' is no argument; did you mean 'source'"):
-        main({}, ["sources=x"])
+    with pytest.raises(InputError, match=r"'sources' has no effect here; did you mean 'source'"):
+        entry.run(["sources=x"])
     assert not out.exists()

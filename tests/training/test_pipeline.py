@@ -330,7 +330,6 @@ def test_evaluate_run_without_newer_settings_opens(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     from rgbt import evaluate
-    from rgbt.config.command import plain_command
 
     done = trained("+experiment=crm", *short(1))
     folder = tmp_path / "runs" / done.name
@@ -338,11 +337,11 @@ def test_evaluate_run_without_newer_settings_opens(
     stored = OmegaConf.load(folder / "config.yaml")
     del stored["domains"], stored["pretrained"], stored["trainer"]["tested"]
     OmegaConf.save(stored, folder / "config.yaml")
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={folder}")
+    code, _, err = call(evaluate.entry, f"run={folder}")
     assert code == 0, err
     (path,) = (folder / "evaluations").glob("*.npz")
     again, first = Counts.load(path), Counts.load(folder / "counts_test.npz")
     assert np.array_equal(again.counts, first.counts)
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={folder}", "head=source")
+    code, _, err = call(evaluate.entry, f"run={folder}", "head=source")
     assert code == 2
     assert "head=source chooses between the heads of two domains" in err

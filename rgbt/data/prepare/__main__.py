@@ -12,21 +12,24 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import Progress
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import conf_dir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.check import check_and_print
 from rgbt.data.prepare.copying import Item, check_out, claimed, write_all
 from rgbt.data.prepare.download import SourceFiles
 from rgbt.data.prepare.plans import Download, Preparable
 
-OWN = {"dataset": None, "source": None, "out": None, "labels": "", "lists": ""}
 OPTIONAL = ("labels", "lists")
 
 
@@ -39,27 +42,45 @@ def preparable() -> dict[str, Preparable]:
     return {name: each for name, each in classes.items() if isinstance(each, Preparable)}
 
 
-def main(arguments: dict[str, str], others: list[str]) -> int:
-    """Copy the needed files of a download to a new folder and check them; it can be resumed.
+@dataclass(frozen=True)
+class Options:
+    """What to prepare, and where."""
 
-    dataset   mfnet, pst900, kp or freiburg
-    source    the download: a zip archive, or the folder into which it was unpacked; for kp the
-              folder of KAIST, for freiburg the folder with train.zip and test.zip
-    out       a new folder outside the download
-    labels    kp: folder or archive of the labels of MS-UDA, if the source has none
-    lists     mfnet and kp: folder of lists, used instead of those of the download or set numbers
-    """
-    if others:
-        raise InputError(f"'{others[0]}' is no argument; {nearest(others[0], OWN)}.")
-    name, out = arguments["dataset"], Path(arguments["out"])
+    dataset: Annotated[str, Help("mfnet, pst900, kp or freiburg")]
+    source: Annotated[
+        Path,
+        Help(
+            "the download: a zip archive, or the folder into which it was unpacked; for kp the "
+            "folder of KAIST, for freiburg the folder with train.zip and test.zip"
+        ),
+    ]
+    out: Annotated[Path, Help("a new folder outside the download")]
+    labels: Annotated[
+        Path | None,
+        Help("kp: folder or archive of the labels of MS-UDA, if the source has none"),
+    ] = None
+    lists: Annotated[
+        Path | None,
+        Help("mfnet and kp: folder of lists, used instead of those of the download or set numbers"),
+    ] = None
+
+    @property
+    def paths(self) -> dict[str, Path]:
+        """The paths that are read, by option."""
+        given = {key: getattr(self, key) for key in ("source", *OPTIONAL)}
+        return {key: path for key, path in given.items() if path is not None}
+
+
+def main(options: Options, overrides: list[str]) -> int:
+    """Copy the needed files of a download to a new folder and check them; it can be resumed."""
+    del overrides  # none has an effect
+    name, out, paths = options.dataset, options.out, options.paths
     classes = preparable()
     check_choice("dataset", name, classes)
     preparation = classes[name].preparation
-    given = {key: arguments[key] for key in ("source", *OPTIONAL) if arguments[key]}
-    for key in given:
+    for key in paths:
         if key in OPTIONAL and key not in preparation.options:
             raise InputError(f"{key} has no effect for dataset={name}; omit it.")
-    paths = {key: Path(path) for key, path in given.items()}
     plan = {"dataset": name, **{key: str(path.resolve()) for key, path in paths.items()}}
     check_out(out, tuple(paths.values()), plan)
     with ExitStack() as opened:
@@ -81,7 +102,7 @@ def _copy(items: list[Item], out: Path) -> None:
         write_all(items, out, lambda size: progress.advance(task, size))
 
 
-if __name__ == "__main__":
-    from rgbt.config.command import plain_command
+entry = PlainCommand(Options, main, heeds=())
 
-    plain_command(OWN, main)()
+if __name__ == "__main__":
+    entry()
