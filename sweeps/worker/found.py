@@ -14,9 +14,9 @@ from rgbt.config.schema import build
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.formats import ADVICE, read_provenance, read_result
-from rgbt.tracking.mlflow_fill import shown
 from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
 from rgbt.tracking.other_code import other_code
+from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.terminal import tell
@@ -69,7 +69,7 @@ class Found:
     @property
     def is_of_other_code(self) -> bool:
         """Whether it was made by other code than that of this process."""
-        return other_code(RunFolder(self.folder)) is not None
+        return other_code(self.folder) is not None
 
     def scores(self) -> dict[str, float]:
         """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
@@ -111,11 +111,6 @@ class Found:
         if evaluation is None:
             return self.folder / "counts_test.npz"
         return self.folder / evaluation.path
-
-
-def in_percent(name: str, value: float) -> float:
-    """A score as MLflow shows it (percent, Var as it is), with all its digits."""
-    return 100 * value if shown(name, 1.0) == 100 else value
 
 
 def open_runs(config: DictConfig) -> Runs:

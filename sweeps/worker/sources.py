@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 from rgbt.checks import InputError, RunError
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.points import COLOUR, Point, colour
 from sweeps.settings import Settings
-from sweeps.worker.found import Found, Runs, in_percent
+from sweeps.worker.found import Found, Runs
 from sweeps.worker.plan import Plan, Planner
 from sweeps.worker.trial_store import Claim, Ledger
 from sweeps.worker.work import Report

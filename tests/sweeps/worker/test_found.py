@@ -14,8 +14,9 @@ from rgbt.metrics import names, scores
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import read_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.percent import in_percent
 from sweeps.points import Evaluation
-from sweeps.worker.found import FETCHED, Found, Runs, in_percent, open_runs
+from sweeps.worker.found import FETCHED, Found, Runs, open_runs
 from tests.sweeps.fakes import DATASET, counts, finish
 
 DEAD_STORE = "http://127.0.0.1:9"
