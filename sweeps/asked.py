@@ -142,9 +142,9 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableR
         InputError: no such table, scale or metric; no seeds.
     """
     from rgbt.config.compose import conf_dir
+    from sweeps.table.load_table import load_table
     from sweeps.table.request import TableRequest, seeds_of
     from sweeps.table.scoring import check_metrics
-    from sweeps.table.table import load_table
     from sweeps.worker.storage import NAME
 
     scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
@@ -152,7 +152,7 @@ def wanted_of(name: str, arguments: Arguments, extra: tuple[str, ...]) -> TableR
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"
-    check_metrics(table, (row for row in table.rows if table.runnable(row)))
+    check_metrics(table)
     if not re.fullmatch(NAME, name):
         raise InputError(
             f"table={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone; "
@@ -179,7 +179,7 @@ def _weights(word: str) -> tuple[str, str]:
 def runs_of(place: Place) -> RunStore:
     """Where finished runs are found, as the overrides of the tracker say."""
     from rgbt.config.compose import compose
-    from sweeps.worker.run_store import open_run_store
+    from sweeps.run_config import open_run_store
 
     with composing(place.base):
         config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])

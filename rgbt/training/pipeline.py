@@ -26,7 +26,6 @@ from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.files.atomic import is_held
 from rgbt.spec.naming import TAGS
 from rgbt.spec.run_key import DOMAINS, SHARED, earlier_config, earlier_run, run_key
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.terminal import tell
 
@@ -120,7 +119,7 @@ def finish_earlier(
 def warn_of_other_code(needed: Sequence[Earlier]) -> None:
     """Say which finished runs that a run needs were made by other code: fresh=true keeps them."""
     for earlier in needed:
-        made_by = other_code(RunFolder(earlier.folder)) if earlier.is_finished else None
+        made_by = other_code(earlier.folder) if earlier.is_finished else None
         if made_by is not None:
             tell(
                 f"warning: the upstream run {earlier.folder} ({earlier.key}) was made by other "

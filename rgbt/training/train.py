@@ -81,7 +81,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         folder = RunFolder(path)
         folder.clean()
         _show_again(folder, tracking, asked)
-        warn_of_result(folder)
+        warn_of_result(path)
         _tell_other_files(folder, config)
         _tell_unmeasured(folder, build(config.consistency))
     else:
@@ -240,7 +240,7 @@ class Run:
                 tell(trainer.checkpoints.warning)
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
         self.folder.begin_at(state.step)
-        warn_of_steps(self.folder, state.step)
+        warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)

@@ -1,4 +1,4 @@
-"""The figures of a study as PNGs, or a sentence why one cannot be drawn."""
+"""The figures of a study as PNGs, or the reason why one cannot be drawn."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEWEST_FOR_CONTOUR = 4
-"""Trials with both parameters from which a surface between them says anything."""
+"""Fewest trials with both parameters from which a surface is drawn."""
 
 
 CONTOUR_STYLE: Any = {
@@ -46,11 +47,10 @@ class StudyFigure:
 
 
 def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure]:
-    """Write ``<name>.png`` of every figure that suits the study.
+    """Write ``<name>.png`` of every figure for this kind of study.
 
-    A list has points without parameters, hence no figures of a search; a grid has those that do
-    not speak of a search that goes on. A figure of an earlier call that cannot be drawn any more is
-    removed.
+    The points of a list have no parameters, hence no figures; a grid has those that do not show
+    the course of a search. A figure of an earlier call that can no longer be drawn is removed.
 
     Args:
         data: the study.
@@ -59,23 +59,23 @@ def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure
     """
     pictures = []
     for name, title, make in _figures(data, shares):
-        made = make()
+        figure = make()
         path = folder / f"{name}.png"
-        if isinstance(made, str):
+        if isinstance(figure, str):
             path.unlink(missing_ok=True)
-            pictures.append(StudyFigure(name, title, None, made))
+            pictures.append(StudyFigure(name, title, None, figure))
         else:
-            made.suptitle(f"{data.name}: {title}", fontsize=10)
-            made.savefig(path)
+            figure.suptitle(f"{data.name}: {title}", fontsize=10)
+            figure.savefig(path)
             pictures.append(StudyFigure(name, title, path))
     return pictures
 
 
-Made = tuple[str, str, Callable[[], "Figure | str"]]
+FigureMaker = tuple[str, str, Callable[[], "Figure | str"]]
 
 
-def _figures(data: StudyData, shares: Importances) -> Iterator[Made]:
-    """(file name, title, how it is made) of the figures that suit this kind of study."""
+def _figures(data: StudyData, shares: Importances) -> Iterator[FigureMaker]:
+    """(file name, title, function) of the figures for this kind of study."""
     if data.kind == "list":
         return
     if data.kind == "search":
@@ -87,18 +87,9 @@ def _figures(data: StudyData, shares: Importances) -> Iterator[Made]:
     yield "parallel", "Parallel coordinates, dark lines are best", lambda: _parallel(data)
     for index, metric in enumerate(data.metrics):
         end = "" if len(data.metrics) == 1 else "_" + re.sub(r"\W+", "_", metric)
-        yield f"slices{end}", f"{metric} over each parameter", _bound(_slices, data, index)
-        yield f"contour{end}", f"{metric} over two parameters", _contour_of(data, shares, index)
-
-
-def _bound(
-    make: Callable[[StudyData, int], Figure | str], data: StudyData, index: int
-) -> Callable[[], Figure | str]:
-    return lambda: make(data, index)
-
-
-def _contour_of(data: StudyData, shares: Importances, index: int) -> Callable[[], Figure | str]:
-    return lambda: _contour(data, shares, index)
+        yield f"slices{end}", f"{metric} over each parameter", partial(_slices, data, index)
+        contour = partial(_contour, data, shares, index)
+        yield f"contour{end}", f"{metric} over two parameters", contour
 
 
 def _history(data: StudyData) -> Figure | str:

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweeps.sheet import results as table_results
 
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.asked import OF_THE_TABLE, settings_of
 from sweeps.point import Point
+from sweeps.rendering import publish
 from sweeps.reproduce import OWN, entry
-from sweeps.settings import EXECUTION, SweepSettings
+from sweeps.settings import SweepSettings
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
 from sweeps.worker.point_list import Outcome, PointList
 from tests.commands import Call, assert_one_sentence
@@ -63,9 +64,9 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
 
 
 def _outcome(point: Point, state: str, index: int) -> Outcome:
-    found: Any = FakeResult(f"k{index}", {None: right(40 + index)})
+    found: Any = FakeResult(f"k{index}", {OWN_COUNTS: right(40 + index)})
     if state == "finished":
-        return Outcome(point, "finished", found=(found,), keys=(f"k{index}",))
+        return Outcome(point, "finished", results=(found,), keys=(f"k{index}",))
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]
 
 
@@ -135,7 +136,7 @@ def test_a_disk_that_is_full_costs_the_files_but_not_the_table(
         raise OSError(28, "No space left on device", str(path))
 
     driven("finished")
-    monkeypatch.setattr(table_results, "write_atomic", full)
+    monkeypatch.setattr(publish, "write_atomic", full)
     code, out, err = call(entry, "table=my/small", "tracking=none")
     assert code == 1
     assert "40.00" in out
@@ -246,7 +247,7 @@ def test_mistakes_cost_one_sentence(
 
 
 def test_every_key_of_execution_is_a_key_of_the_command() -> None:
-    assert set(OWN) - set(OF_THE_TABLE) == set(EXECUTION)
+    assert set(OWN) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
 
 
 def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() -> None:

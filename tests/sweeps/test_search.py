@@ -12,10 +12,10 @@ import sweeps.search as searching
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
 from sweeps import attributes as names
+from sweeps.run_config import open_run_store
 from sweeps.search import Search, _probe, search
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
-from sweeps.worker.run_store import open_run_store
 from sweeps.worker.storage import load_study, open_storage
 from sweeps.worker.trial_store import TrialStore
 from tests.sweeps.fakes import settings as plain_settings
@@ -163,10 +163,10 @@ def test_ends_that_a_setting_does_not_take_are_refused_before_the_first_trial(
     space = {"masker.sigma_div": {"type": "float", "low": low, "high": high}}
     search = replace(wanted, parameters=parse_space(space))
     if refused is None:
-        assert _probe(search).runs
+        assert _probe(search, settings()).key
         return
     with pytest.raises(InputError, match=r"'masker.sigma_div' must be a number from 0.001 to"):
-        _probe(search)
+        _probe(search, settings())
 
 
 def test_a_search_without_a_finished_trial_ends_in_an_error(

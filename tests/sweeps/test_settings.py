@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from sweeps.settings import EXECUTION, Objective, SweepSettings, read_settings
+from sweeps.settings import Objective, SweepSettings, read_settings
 
 FILE = conf_dir() / "hydra" / "sweeper" / "study.yaml"
 
@@ -30,7 +30,6 @@ def changed(node: DictConfig, **values: Any) -> DictConfig:
 def test_the_file_of_the_sweeper_holds_every_setting_and_no_other(composed: DictConfig) -> None:
     keys = set(map(str, composed)) - {"_target_"}
     assert keys == set(SweepSettings.__dataclass_fields__)
-    assert set(EXECUTION) < keys
     settings = read_settings(composed)
     assert settings.objectives == (Objective("val/mIoU", "maximize"),)
     assert (settings.workers, settings.replicates, settings.retries) == (1, 1, 0)
@@ -121,7 +120,7 @@ def test_a_wrong_setting_is_told_in_one_sentence(
 
 def test_objectives_that_are_told_while_a_run_trains() -> None:
     followed = {
-        metric: Objective(metric, "maximize").is_followed
+        metric: Objective(metric, "maximize").is_reported
         for metric in (
             "val/mIoU",
             "val/night/mIoU",

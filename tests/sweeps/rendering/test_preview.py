@@ -29,7 +29,7 @@ class Trained:
     """Stands for a finished run of ten seconds."""
 
     key = "k"
-    is_of_other_code = False
+    other_code = None
 
     def __init__(self, folder: Any) -> None:
         self.folder = folder

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from rgbt.tracking.run_result import RunResult
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
 from sweeps.worker.point_list import Outcome
-from sweeps.worker.run_store import RunResult
 from tests.sweeps.fakes import finish
 
 
@@ -16,7 +16,7 @@ def made(folder: Path, label: str, **scores: float) -> Outcome:
     test: Mapping[str, float] = {name.replace("__", "/"): value for name, value in scores.items()}
     run = finish(folder / label.replace(" ", "_"), test=test)
     key = run.path.name
-    return Outcome(Point(label, ()), "finished", found=(RunResult(key, run.path),), keys=(key,))
+    return Outcome(Point(label, ()), "finished", results=(RunResult(run.path),), keys=(key,))
 
 
 def test_a_row_is_the_mean_and_the_sample_sd_over_seeds(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from rgbt.tracking.terminal import rich_table
 from sweeps import attributes
-from sweeps.report.study_data import importances, pruning, read, short_names
+from sweeps.report.study_data import importances, pruning_savings, read, short_names
 from sweeps.report.tables import (
     counts_grid,
     failed_grid,
@@ -194,7 +194,7 @@ def test_share_of_steps_saved_by_pruning() -> None:
         values = [1.0] if state == "COMPLETE" else None
         add(study, values, state=state, reported={10: 0.5, last: 1.0})
     add(study, state="PRUNED")  # reported nothing: not told
-    saved = pruning(read(study))
+    saved = pruning_savings(read(study))
     assert saved is not None
     assert saved.trials == 2
     assert saved.share == pytest.approx(130 / 400)
@@ -205,7 +205,7 @@ def test_a_pruned_trial_of_three_seeds_saves_the_other_two_as_well() -> None:
     study = new_study("maximize")
     add(study, [1.0], reported={100: 1.0}, runs=["a", "b", "c"])
     add(study, state="PRUNED", reported={40: 1.0}, runs=["d", "e", "f"])
-    saved = pruning(read(study))
+    saved = pruning_savings(read(study))
     assert saved is not None
     assert saved.share == pytest.approx(260 / 600)
 
@@ -214,7 +214,7 @@ def test_steps_saved_cannot_be_told_without_reports_of_complete_trials() -> None
     study = new_study("maximize")
     add(study, [1.0])
     add(study, state="PRUNED", reported={10: 1.0})
-    assert pruning(read(study)) is None
+    assert pruning_savings(read(study)) is None
     assert len(counts_grid(read(study)).header) == 6
 
 

@@ -7,8 +7,8 @@ import yaml
 
 from rgbt.checks import InputError
 from sweeps.reproduce import entry
+from sweeps.table.load_table import load_table
 from sweeps.table.new_table import write_new
-from sweeps.table.table import load_table
 from tests.commands import Call, assert_one_sentence
 
 

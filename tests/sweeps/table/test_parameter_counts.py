@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from sweeps.table.parameter_counts import million_parameters, parameter_cells
+from sweeps.run_config import million_parameters
+from sweeps.table.parameter_counts import parameter_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import table

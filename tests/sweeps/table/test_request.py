@@ -106,7 +106,7 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
     asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
     assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)
     alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
-    assert (alone.places(), alone.points(), alone.runs([])) == ([], [], {})
+    assert (alone.row_seeds(), alone.points(), alone.runs([])) == ([], [], {})
     assert alone.models() == set()
 
 
@@ -163,6 +163,6 @@ def test_rows_of_different_networks_take_weights_of_their_own() -> None:
     )
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
-    assert wanted.typed() == ("x=1", *given[:2])
+    assert wanted.typed_overrides() == ("x=1", *given[:2])
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
         wanted_of("spatialseg/table7", arguments, ("weights.mask2former_swinb=x",))

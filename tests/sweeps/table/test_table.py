@@ -13,7 +13,8 @@ from rgbt.checks import InputError
 from rgbt.config.schema import build
 from rgbt.metrics.named import parse
 from rgbt.spec.run_key import run_key
-from sweeps.table.table import Column, Row, Table, load_table, table_names
+from sweeps.table.load_table import load_table, table_names
+from sweeps.table.table import Column, Row, Table
 from tests.sweeps.composed import row_config
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}

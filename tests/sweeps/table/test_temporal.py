@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
-from sweeps.table.table import Row, load_table
+from sweeps.table.table import Row
 from tests.sweeps.composed import row_config
 
 NUMBERS = (1, 2, 3, 4, 5)

@@ -174,7 +174,7 @@ def test_when_the_hours_are_spent_what_runs_is_finished_and_nothing_begun(
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path, late, hours=1.0)
-    desk.driver._began = desk.driver._beaten = 0.0
+    desk.driver._began = desk.driver._last_heartbeat = 0.0
 
     def tick(works: Any) -> None:
         now[0] += 0.01
@@ -221,7 +221,7 @@ def owners(count: int) -> list[Owner]:
 def test_two_drivers_on_one_journal_run_twelve_points_once(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     desks = [
-        list_desk(runs, plans(12), storage=open_storage(None, runs), me=me, workers=2, wait=True)
+        list_desk(runs, plans(12), storage=open_storage(None, runs), owner=me, workers=2, wait=True)
         for me in owners(2)
     ]
     together(desks)
@@ -237,7 +237,7 @@ def test_three_drivers_of_a_search_make_twenty_trials_with_parameters_of_their_o
 ) -> None:
     runs = tmp_path / "runs"
     desks = [
-        search_desk(runs, storage=open_storage(None, runs), me=me, trials=20) for me in owners(3)
+        search_desk(runs, storage=open_storage(None, runs), owner=me, trials=20) for me in owners(3)
     ]
     together(desks)
     trials = desks[0].store.trials()
@@ -252,7 +252,7 @@ from pathlib import Path
 from sweeps.worker import driver
 from sweeps.worker.storage import open_storage
 from tests.sweeps.fakes import list_desk, plans
-driver.POLL_S, driver.LOOK_S = 0.001, 0.002
+driver.POLL_S, driver.CLAIM_S = 0.001, 0.002
 runs = Path(sys.argv[1])
 storage = open_storage(None, runs)
 print("ready", flush=True)
@@ -293,7 +293,7 @@ def killed(desk: Desk) -> None:
             raise KeyboardInterrupt
 
     desk.view._look = gone
-    desk.driver._give_back = lambda: None  # type: ignore[method-assign]
+    desk.driver._release_all = lambda: None  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         desk.run()
 
@@ -307,7 +307,7 @@ def test_points_of_a_driver_that_is_gone_are_run_by_the_next(
     tmp_path: Path, owner: Owner, seconds: float, taken_over: bool
 ) -> None:
     storage = memory()
-    killed(list_desk(tmp_path, plans(2), hang, storage=storage, me=owner))
+    killed(list_desk(tmp_path, plans(2), hang, storage=storage, owner=owner))
     silent(storage, 0, seconds)
     desk = list_desk(tmp_path, plans(2), storage=storage).run()
     ran = [("x=0",), ("x=1",)] if taken_over else [("x=1",)]
@@ -320,7 +320,7 @@ def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
     tmp_path: Path, owner: Owner
 ) -> None:
     storage = memory()
-    before = search_desk(tmp_path, hang, storage=storage, me=owner, trials=3)
+    before = search_desk(tmp_path, hang, storage=storage, owner=owner, trials=3)
     killed(before)
     if owner == DEAD:
         silent(storage, 0)
@@ -335,7 +335,7 @@ def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
 def test_an_orphan_that_still_trains_is_adopted_and_not_started_twice(tmp_path: Path) -> None:
     storage = memory()
     points = plans(1)
-    killed(list_desk(tmp_path, points, hang, storage=storage, me=GONE))
+    killed(list_desk(tmp_path, points, hang, storage=storage, owner=GONE))
     folder = tmp_path / points[0].key
     seen: list[str] = []
     with held_by_another(folder) as process:
@@ -356,8 +356,8 @@ def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     storage = memory()
-    killed(search_desk(tmp_path, hang, storage=storage, me=GONE, trials=1))
-    a, b = (search_desk(tmp_path, storage=storage, me=me, trials=1) for me in owners(2))
+    killed(search_desk(tmp_path, hang, storage=storage, owner=GONE, trials=1))
+    a, b = (search_desk(tmp_path, storage=storage, owner=me, trials=1) for me in owners(2))
     seen = [list(b.store.stale_trials(())), []]
     assert len(seen[0]) == 1
     monkeypatch.setattr(b.store, "orphans", lambda mine: seen.pop(0) if seen else [])
@@ -371,7 +371,7 @@ def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
 def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: Path) -> None:
     storage = memory()
     points = plans(2)
-    other = list_desk(tmp_path, points, storage=storage, me=ALIVE)
+    other = list_desk(tmp_path, points, storage=storage, owner=ALIVE)
     task = other.driver.source.next()
     assert task is not None
     rounds: list[int] = []
@@ -549,7 +549,7 @@ def test_a_search_that_was_cut_in_two_asks_the_same_points(tmp_path: Path) -> No
 def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
     """This machine slept; the other driver took the trial for an orphan's."""
     storage = memory()
-    other = list_desk(tmp_path, plans(1), storage=storage, me=ALIVE)
+    other = list_desk(tmp_path, plans(1), storage=storage, owner=ALIVE)
 
     def taken_over(call: Call) -> Process:
         other.store.complete(0, [99.0], {})
@@ -561,11 +561,11 @@ def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path:
 
 def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_path: Path) -> None:
     storage = memory()
-    other = search_desk(tmp_path, storage=storage, me=ALIVE, objectives=UP)
+    other = search_desk(tmp_path, storage=storage, owner=ALIVE, objectives=UP)
 
     def taken_over(call: Call) -> Process:
         if len(desk.executor.calls) == 1:
-            other.store.release(0, "its driver was gone", again=False)
+            other.store.release(0, "its driver was gone", requeue=False)
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path, taken_over, storage=storage, trials=1, objectives=UP)
@@ -575,7 +575,7 @@ def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_pat
 
 def test_points_that_cannot_be_composed_count_as_failures(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, planner=PickyPlanner(), trials=5, max_failures=1).run()
-    assert len(desk.view.refusals) == 1
+    assert len(desk.view.rejections) == 1
 
 
 def test_a_search_tries_a_failed_point_again_too(tmp_path: Path) -> None:

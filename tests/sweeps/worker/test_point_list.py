@@ -12,6 +12,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import code
+from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.worker import point_list
@@ -23,14 +24,14 @@ from sweeps.worker.point_list import (
     other_code_line,
     preview_points,
 )
-from sweeps.worker.run_store import RunResult, RunStore
+from sweeps.worker.run_store import RunStore
 from tests.sweeps.fakes import counts, finish, plan_of, settings
 
 
 def made(folder: Path, seconds: float) -> Outcome:
     run = finish(folder)
     (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
-    return Outcome(Point("p", ()), "finished", found=(RunResult(run.path.name, run.path),))
+    return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
 
 
 def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
@@ -117,11 +118,11 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
     for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
         run = finish(tmp_path / name)
         run.add_provenance({"code": digest, "diff": ""})
-        found.append(RunResult(name, run.path))
-    outcomes = [Outcome(Point("p", ()), "finished", found=tuple(found[:2]))] * 2
+        found.append(RunResult(run.path))
+    outcomes = [Outcome(Point("p", ()), "finished", results=tuple(found[:2]))] * 2
     assert other_code_line(outcomes[:0]) == ""
-    assert other_code_line([Outcome(Point("p", ()), "finished", found=(found[1],))]) == ""
-    outcomes.append(Outcome(Point("q", ()), "finished", found=(found[2],)))
+    assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
+    outcomes.append(Outcome(Point("q", ()), "finished", results=(found[2],)))
     assert other_code_line(outcomes) == (
         "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
     )

@@ -59,7 +59,7 @@ def test_in_a_log_every_begin_and_end_is_a_line(console: Make) -> None:
         view.update([one])
         view.ended(one, "finished", "")
         view.ended(one, "failed", "ValueError: [red]not a colour[/red] [1,2]")
-        view.refused("p", "x does not fit.")
+        view.rejected("p", "x does not fit.")
     lines = [line[9:] for line in text.getvalue().splitlines()]
     assert lines == [
         "begins   Ny/4 seed=1",

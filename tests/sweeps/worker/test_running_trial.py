@@ -10,11 +10,12 @@ import pytest
 
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.worker import running_trial as works
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.run_store import RunResult, RunStore
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import (
     LOGS,
     ExecutionContext,
@@ -102,7 +103,7 @@ def test_a_run_is_started_followed_and_found(tmp_path: Path) -> None:
     assert bench.work.score == 0.2
     assert bench.work.done_share == 0.5, "step 2 of 4"
     (found,) = bench.run()
-    assert found == RunResult(key, tmp_path / key)
+    assert found == RunResult(tmp_path / key)
     (call,) = bench.executor.calls
     assert (call.module, call.words) == ("rgbt.run", ("x=1",))
     assert call.log == tmp_path / LOGS / f"{key}.log"
@@ -129,14 +130,14 @@ def test_what_is_finished_already_needs_no_process_and_gets_the_tags(tmp_path: P
 def test_fresh_trains_again_what_other_code_made_and_only_that(tmp_path: Path) -> None:
     plan, key = single()
     made_by_other_code(finish(tmp_path / key))
-    assert Bench(tmp_path, plan).run()[0].is_of_other_code, "without fresh it is taken"
+    assert Bench(tmp_path, plan).run()[0].other_code, "without fresh it is taken"
 
     for calls in (1, 0):  # and given again, nothing is left to do
         bench = Bench(tmp_path, plan)
         bench.runs.fresh = True
         (found,) = bench.run()
         assert len(bench.executor.calls) == calls
-        assert (found.folder, found.is_of_other_code) == (tmp_path / key, False)
+        assert (found.folder, found.other_code) == (tmp_path / key, None)
     assert [path.name for path in (tmp_path / "replaced").iterdir()] == [f"{key}-1"]
 
 
@@ -158,7 +159,7 @@ def test_every_seed_is_a_run_and_only_the_first_is_reported(tmp_path: Path) -> N
 def test_scores_are_means_over_the_seeds_of_what_all_have(tmp_path: Path) -> None:
     finish(tmp_path / "a", val={"mIoU": 0.5}, test={"mIoU": 0.25, "Var": 9.0, "class/car": None})
     finish(tmp_path / "b", val={"mIoU": 0.25}, test={"mIoU": 0.75, "Var": 1.0, "class/car": 0.5})
-    found = [RunResult(key, tmp_path / key) for key in "ab"]
+    found = [RunResult(tmp_path / key) for key in "ab"]
     assert mean_scores(found) == {"val/mIoU": 37.5, "test/mIoU": 50.0, "test/Var": 5.0}
 
 
@@ -380,7 +381,7 @@ def test_further_evaluations_follow_the_run(tmp_path: Path) -> None:
         ("rgbt.evaluate", ("modality=thermal", "regions=ring9")),
     ]
     assert bench.executor.calls[1].value("run") == str(found.folder)
-    assert found.counts(RING).counts[0, 0, 0, 0] == 7
+    assert found.counts(RING.path).counts[0, 0, 0, 0] == 7
     assert Bench(tmp_path, plan).work.advance() is not None, "all there: nothing is started"
 
 
@@ -414,7 +415,7 @@ def test_both_protocols_of_virtual_views_are_one_call(tmp_path: Path) -> None:
         ("rgbt.consistency", (place[0], "frames=next", place[1], "dataset.root=/x")),
     ]
     for evaluation in (ALIGNED, RELEASED, NEXT):
-        assert found.counts(evaluation).counts[0, 0, 0, 0] == 5
+        assert found.counts(evaluation.path).counts[0, 0, 0, 0] == 5
     assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
 
 
@@ -436,7 +437,7 @@ def test_a_run_that_has_measured_its_consistency_itself_is_not_measured_again(
     bench = Bench(tmp_path, plan, at_its_end)
     (found,) = bench.run()
     assert [call.module for call in bench.executor.calls] == ["rgbt.run"]
-    assert found.counts(ALIGNED).counts[0, 0, 0, 0] == 6
+    assert found.counts(ALIGNED.path).counts[0, 0, 0, 0] == 6
 
 
 def test_a_consistency_that_cannot_be_measured_fails_the_point(tmp_path: Path) -> None:
@@ -462,9 +463,7 @@ def test_evaluations_of_a_run_made_elsewhere_cannot_be_made_here(
     plan = plan_of(point(evaluations=(RING,)))
     finish(tmp_path / "copy")
     bench = Bench(tmp_path, plan)
-    monkeypatch.setattr(
-        bench.runs, "find", lambda key, dataset: RunResult(key, tmp_path / "copy", "7")
-    )
+    monkeypatch.setattr(bench.runs, "find", lambda key, dataset: RunResult(tmp_path / "copy", "7"))
     with pytest.raises(TrialError, match="made on another machine: .*thermal, ring9"):
         bench.run()
     assert bench.executor.calls == []

@@ -85,7 +85,7 @@ def test_a_database_whose_tables_another_process_is_making_is_tried_again(
             raise RuntimeError("table studies already exists")
         return "open"
 
-    assert stores._patiently(opening, "sqlite:///x") == "open"
+    assert stores._retry(opening, "sqlite:///x") == "open"
     assert len(tries) == 3
 
 

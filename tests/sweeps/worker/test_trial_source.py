@@ -16,11 +16,16 @@ from optuna.trial import TrialState
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour
 from sweeps.settings import Objective
-from sweeps.worker.trial_source import ClaimedTrial, PointListSource, known, reason_of, short
+from sweeps.worker.list_source import ListSource, finished_runs, is_evaluated, reason_of
+from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.sampler_source import short_override
+from sweeps.worker.trial_source import ClaimedTrial
 from sweeps.worker.trial_store import TrialClaim
 from tests.sweeps.fakes import (
     DEAD,
@@ -53,10 +58,15 @@ def done(desk: Desk, task: ClaimedTrial, value: float = 25.0) -> None:
     desk.store.complete(task.number, [value], {names.RESULTS: {"test/mIoU": value}})
 
 
-def standing(desk: Desk, index: int = 0) -> Any:
+def known(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...] | None:
+    results = finished_runs(plan, runs)
+    return results if results is not None and is_evaluated(plan, results) else None
+
+
+def status(desk: Desk, index: int = 0) -> Any:
     source = desk.driver.source
-    assert isinstance(source, PointListSource)
-    return source.standing(desk.plans[index], desk.store.by_key())
+    assert isinstance(source, ListSource)
+    return source.status(desk.plans[index], desk.store.by_key())
 
 
 def is_exhausted(desk: Desk, *, wait: bool = False) -> bool:
@@ -65,7 +75,7 @@ def is_exhausted(desk: Desk, *, wait: bool = False) -> bool:
 
 def test_points_of_a_list_are_claimed_in_order_and_noted(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2))
-    source = PointListSource(
+    source = ListSource(
         desk.plans,
         desk.store,
         desk.runs,
@@ -86,13 +96,13 @@ def test_a_list_is_over_when_nothing_waits_or_with_wait_when_nothing_runs(tmp_pa
     desk = list_desk(tmp_path, plans(1))
     assert not is_exhausted(desk)
     task = taken(desk)
-    assert standing(desk).state == "running"
+    assert status(desk).state == "running"
     assert is_exhausted(desk)
     assert not is_exhausted(desk, wait=True)
     done(desk, task)
     assert is_exhausted(desk, wait=True)
-    assert standing(desk).state == "finished"
-    assert standing(desk).found[0].key == desk.plans[0].key
+    assert status(desk).state == "finished"
+    assert status(desk).results[0].key == desk.plans[0].key
 
 
 def test_the_same_point_twice_in_a_list_is_one_point(tmp_path: Path) -> None:
@@ -105,23 +115,23 @@ def test_a_failed_point_waits_for_a_retry_that_somebody_asks_for(tmp_path: Path)
     storage = memory()
     first = list_desk(tmp_path, plans(1), storage=storage)
     first.store.fail(taken(first).number, "a bad day", {})
-    assert standing(first).state == "failed"
-    assert standing(first).reason == "a bad day"
+    assert status(first).state == "failed"
+    assert status(first).reason == "a bad day"
     assert first.driver.source.next() is None
 
     plain = list_desk(tmp_path, plans(1), storage=storage)
     assert plain.driver.source.next() is None
     again = list_desk(tmp_path, plans(1), storage=storage, retry="failed")
-    assert standing(again).state == "waiting"
+    assert status(again).state == "waiting"
     again.store.fail(taken(again).number, "another bad day", {})
-    assert standing(again).reason == "another bad day"
+    assert status(again).reason == "another bad day"
     assert again.driver.source.next() is None, "forgiven once, not for ever"
 
 
 def test_a_point_is_tried_as_often_as_retries_say_all_drivers_together(tmp_path: Path) -> None:
     storage = memory()
     a = list_desk(tmp_path, plans(1), storage=storage, retries=2)
-    b = list_desk(tmp_path, plans(1), storage=storage, retries=2, me=DEAD)
+    b = list_desk(tmp_path, plans(1), storage=storage, retries=2, owner=DEAD)
     for desk in (a, b, a):
         task = taken(desk)
         desk.store.fail(task.number, "a bad day", {})
@@ -137,7 +147,7 @@ def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
     assert before.driver.source.next() is None
     (tmp_path / before.plans[0].key / "result.json").unlink()
     desk = list_desk(tmp_path, plans(1), storage=storage)
-    assert standing(desk).state == "waiting"
+    assert status(desk).state == "waiting"
     assert taken(desk).number == 1
 
 
@@ -155,7 +165,7 @@ def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: 
     before.store.fail(taken(before).number, "a bad day", {})
     finish(tmp_path / before.plans[0].key)
     desk = list_desk(tmp_path, plans(1), storage=storage)
-    assert standing(desk).state in ("finished", "waiting")
+    assert status(desk).state in ("finished", "waiting")
 
 
 def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) -> None:
@@ -170,7 +180,7 @@ def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) 
         (tmp_path / run.key / "evaluations").mkdir()
         found = runs.find(run.key, run.dataset)
         assert found is not None
-        shutil.copyfile(found.folder / "counts_test.npz", found.counts_file(ring))
+        shutil.copyfile(found.folder / "counts_test.npz", found.folder / ring.path)
     both = known(plan, runs)
     assert both is not None
     assert [found.key for found in both] == [run.key for run in plan.runs]
@@ -209,7 +219,7 @@ def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
     assert desk.driver.source.next() is None
     assert is_exhausted(desk)
     assert not is_exhausted(desk, wait=True)
-    desk.store.release(task.number, "given back", again=True)
+    desk.store.release(task.number, "given back", requeue=True)
     assert not is_exhausted(desk), "somebody has to take it up"
     again = taken(desk)
     assert again.plan.key == task.plan.key
@@ -258,7 +268,7 @@ def test_a_point_that_cannot_be_composed_fails_and_is_told(tmp_path: Path) -> No
     (trial,) = desk.store.trials()
     assert trial.state.name == "FAIL"
     assert reason_of(trial) == "x does not fit."
-    ((label, reason),) = desk.view.refusals
+    ((label, reason),) = desk.view.rejections
     assert label == trial.user_attrs[names.LABEL]
     assert reason == "x does not fit."
     assert is_exhausted(desk)
@@ -316,7 +326,7 @@ def test_a_hopeless_trial_is_told_by_the_pruner(tmp_path: Path) -> None:
     ],
 )
 def test_overrides_are_short_for_people(override: str, shown: str) -> None:
-    assert short(override) == shown
+    assert short_override(override) == shown
 
 
 def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
@@ -335,18 +345,18 @@ def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_p
     finish(tmp_path / run.key)
     found = runs.find(run.key, run.dataset)
     assert found is not None
-    file = found.counts_file(ring)
+    file = found.folder / ring.path
     file.parent.mkdir()
     shutil.copyfile(found.folder / "counts_test.npz", file)
-    assert found.has(ring)
+    assert found.has_counts(ring.path)
     os.utime(file, (0, 0))
-    assert found.has(ring), "of a run made elsewhere there is no checkpoint"
+    assert found.has_counts(ring.path), "of a run made elsewhere there is no checkpoint"
     (found.folder / "best.pt").touch()  # the run was trained again since
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     assert known(plan, runs) is None
     replace(Counts.load(found.folder / "counts_test.npz"), dataset="other").save(file)
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     replace(Counts.load(found.folder / "counts_test.npz"), split="val").save(file)
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     file.write_bytes(b"half")
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)

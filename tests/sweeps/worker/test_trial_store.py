@@ -37,9 +37,9 @@ def states(store: TrialStore) -> list[str]:
     return [each.state.name for each in store.trials()]
 
 
-def searching(storage: Any, me: Owner | None = None) -> TrialStore:
+def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
     """A ledger of a search; every driver has a study object and a sampler of its own."""
-    return store_on(storage, me, sampler=build_sampler("random", 0, {}, 1))
+    return store_on(storage, owner, sampler=build_sampler("random", 0, {}, 1))
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
@@ -47,7 +47,7 @@ def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
     asked = store.ask(total)
     assert asked is not None
     x = asked.suggest_float("x", 0, 1)
-    store.note(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
+    store.set_attributes(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
     return asked.number, x
 
 
@@ -63,7 +63,7 @@ def test_a_claim_is_a_running_trial_with_all_that_is_known_of_the_point(store: T
     assert found.params == {"x": 3}
     assert found.user_attrs[names.KEY] == "k"
     assert found.user_attrs[names.LABEL] == "point k"
-    assert found.user_attrs[names.OWNER] == str(Owner.me())
+    assert found.user_attrs[names.OWNER] == str(Owner.this_process())
     assert abs(found.user_attrs[names.HEARTBEAT] - time.time()) < 60
 
 
@@ -87,7 +87,7 @@ def test_a_point_that_is_done_is_not_claimed_again_unless_that_is_past(
     else:
         store.prune(0, "hopeless", {})
     assert claim(store) is None
-    assert claim(store, past=[0]) == 2
+    assert claim(store, replaced=[0]) == 2
 
 
 def test_a_failed_trial_does_not_keep_its_point(store: TrialStore) -> None:
@@ -182,14 +182,14 @@ def test_the_last_sign_of_a_driver_is_renewed() -> None:
     store = store_on(storage, DEAD)
     claim(store)
     silent(storage, 0)
-    store.beat([0])
+    store.send_heartbeat([0])
     assert stale_trials(store_on(storage)) == []
 
 
 def test_a_sign_for_a_trial_that_another_driver_finished_does_no_harm(store: TrialStore) -> None:
     claim(store)
     store.complete(0, [1.0], {})
-    store.beat([0])
+    store.send_heartbeat([0])
     store.fail(0, "too late", {})
     store.complete(0, [2.0], {})
     assert trial(store, 0).state.name == "COMPLETE"
@@ -252,7 +252,7 @@ def test_a_search_trial_asked_for_a_moment_ago_is_no_orphan_though_nobody_signed
 
 def test_a_released_point_of_a_list_can_be_claimed_again(store: TrialStore) -> None:
     claim(store)
-    store.release(0, "its driver was gone", again=False)
+    store.release(0, "its driver was gone", requeue=False)
     assert store.trials() == []
     assert claim(store) == 1
 
@@ -261,14 +261,14 @@ def test_a_released_search_trial_comes_back_with_its_parameters() -> None:
     storage = memory()
     number, x = taken(searching(storage, GONE), 1)
     mine = searching(storage)
-    mine.release(number, "its driver was gone", again=True)
+    mine.release(number, "its driver was gone", requeue=True)
     assert states(mine) == ["WAITING"]
     again = mine.ask(1)
     assert again is not None
     assert again.suggest_float("x", 0, 1) == x
     assert again.user_attrs[names.KEY] == f"x={x}"
     assert states(mine) == ["RUNNING"]
-    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.me())
+    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.this_process())
 
 
 def test_a_search_trial_without_a_point_yet_is_dropped_and_another_one_asked_for() -> None:
@@ -276,7 +276,7 @@ def test_a_search_trial_without_a_point_yet_is_dropped_and_another_one_asked_for
     gone = searching(storage, GONE)
     gone.ask(1)
     mine = searching(storage)
-    mine.release(0, "its driver was gone", again=True)
+    mine.release(0, "its driver was gone", requeue=True)
     assert states(mine) == []
     assert mine.ask(1) is not None
 
@@ -285,8 +285,8 @@ def test_two_drivers_that_release_an_orphan_one_after_the_other_queue_it_once() 
     storage = memory()
     number, _ = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
-    a.release(number, "gone", again=True)
-    b.release(number, "gone", again=True)
+    a.release(number, "gone", requeue=True)
+    b.release(number, "gone", requeue=True)
     assert states(a) == ["WAITING"]
 
 
@@ -296,7 +296,7 @@ def test_a_crash_between_queueing_an_orphan_and_dropping_it_queues_it_once() -> 
     a, b = searching(storage), searching(storage)
     a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
     assert stale_trials(b) == [number]
-    b.release(number, "gone", again=True)
+    b.release(number, "gone", requeue=True)
     assert states(b) == ["WAITING"]
 
 
@@ -308,12 +308,12 @@ def test_an_orphan_that_another_driver_released_and_took_up_is_not_queued_again(
     number, _ = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
     (seen,) = stale_trials(b)
-    a.release(number, "gone", again=True)
+    a.release(number, "gone", requeue=True)
     again = a.ask(1)
     assert again is not None
     if finished:
         a.complete(again.number, [1.0], {})
-    b.release(seen, "gone", again=True)
+    b.release(seen, "gone", requeue=True)
     assert states(b) == ["COMPLETE" if finished else "RUNNING"]
 
 
@@ -322,7 +322,7 @@ def test_giving_back_a_trial_that_another_driver_has_finished_changes_nothing() 
     mine, other = searching(storage, DEAD), searching(storage)
     number, _ = taken(mine)
     other.complete(number, [1.0], {})
-    mine.release(number, "its driver was stopped", again=True)
+    mine.release(number, "its driver was stopped", requeue=True)
     assert states(mine) == ["COMPLETE"]
 
 
