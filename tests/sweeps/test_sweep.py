@@ -41,8 +41,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
         del settings
         return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
 
-    monkeypatch.setattr(sweeping, "work_off", run_points)
-    monkeypatch.setattr(sweeping, "survey", preview_points)
+    monkeypatch.setattr(sweeping, "run_points", run_points)
+    monkeypatch.setattr(sweeping, "preview_points", preview_points)
     monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
     return found
 

@@ -360,7 +360,7 @@ def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
     a, b = (search_desk(tmp_path, storage=storage, owner=me, trials=1) for me in owners(2))
     seen = [list(b.store.stale_trials(())), []]
     assert len(seen[0]) == 1
-    monkeypatch.setattr(b.store, "orphans", lambda mine: seen.pop(0) if seen else [])
+    monkeypatch.setattr(b.store, "stale_trials", lambda mine: seen.pop(0) if seen else [])
     a.run()
     b.run()
     assert a.numbers("COMPLETE") == [1]
@@ -389,10 +389,10 @@ def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: 
 
 
 def test_a_driver_says_that_it_is_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drivers, "BEAT_S", 0.0)
+    monkeypatch.setattr(drivers, "HEARTBEAT_S", 0.0)
     beats: list[list[int]] = []
     desk = list_desk(tmp_path, plans(1))
-    monkeypatch.setattr(desk.store, "beat", lambda numbers: beats.append(list(numbers)))
+    monkeypatch.setattr(desk.store, "send_heartbeat", lambda numbers: beats.append(list(numbers)))
     desk.run()
     assert [0] in beats
 

@@ -94,7 +94,7 @@ def test_a_long_message_is_cut(tmp_path: Path) -> None:
 def test_what_an_earlier_process_said_is_no_reason(tmp_path: Path) -> None:
     log, start = log_of(tmp_path, "", before="rgbt: an old mistake é\n")
     said = failure_reason(3, log, start)
-    assert said.startswith("it left with exit code 3 and said nothing")
+    assert said.startswith("it ended with exit code 3 and no output")
     assert str(log) in said
     assert "exit code 3" in failure_reason(3, tmp_path / "no.log", 0)
 

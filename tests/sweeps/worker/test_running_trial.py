@@ -177,7 +177,7 @@ def say(text: str, code: int) -> Behaviour:
     [
         (fail, "ValueError: a bad day"),
         (say("rgbt: masker.sigma_div must be positive, got -1.", 2), "masker.sigma_div must be"),
-        (leave(3), "it left with exit code 3 and said nothing"),
+        (leave(3), "it ended with exit code 3 and no output"),
         (leave(-9), "stopped by SIGKILL (the system kills what takes too much memory)"),
         (leave(-11), "stopped by SIGSEGV"),
         (leave(0), "the run ended, but not as"),
