@@ -12,7 +12,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
-from sweeps.run_config import PlannedRun, checked_config, planned_run
+from sweeps.run_specs import PlannedRun, plan_run, specify_run
 from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
@@ -97,8 +97,8 @@ def _probe(wanted: Search, settings: SweepSettings) -> PlannedRun:
         InputError: an end of a range that a setting does not accept, a point that cannot be
             composed, a missing data set, or an objective that the runs do not measure.
     """
-    checked_config((*wanted.fixed, *_end_of(wanted.parameters, "high")))
-    lowest = planned_run((*wanted.fixed, *_end_of(wanted.parameters, "low")), {})
+    specify_run((*wanted.fixed, *_end_of(wanted.parameters, "high")))
+    lowest = plan_run((*wanted.fixed, *_end_of(wanted.parameters, "low")), {})
     for objective in settings.objectives:
         split = objective.metric.partition("/")[0]
         if objective.is_consistency and split not in lowest.consistency_splits:

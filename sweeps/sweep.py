@@ -21,7 +21,7 @@ from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
-from sweeps.run_config import open_run_store
+from sweeps.run_specs import open_run_store
 from sweeps.search import Search, search
 from sweeps.settings import SweepSettings, read_settings
 from sweeps.space.grid import GridPoint, SweptValues, distributions, grid_points, list_points, split

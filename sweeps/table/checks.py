@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, check_choice
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
 from rgbt.metrics.named import OF_PAIRS
 from sweeps.table.table import Column, Factor, Row, Table
 

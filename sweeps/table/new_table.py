@@ -16,7 +16,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import PIXELS
 from rgbt.files.atomic import write_atomic
-from sweeps.run_config import checked_config
+from sweeps.run_specs import specify_run
 from sweeps.table.load_table import OWN as FOLDER
 from sweeps.table.load_table import PUBLISHED, load_table
 
@@ -116,7 +116,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     for point in points:
         chosen = [f"{f.key}={value}" for f, value in zip(factors, point, strict=True)]
         every = [f"+experiment={experiment}", *chosen]
-        checked_config(every)
+        specify_run(every)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, _text(name, experiment, factors, points).encode())
     return path

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from rgbt.checks import InputError
-from sweeps.run_config import million_parameters
+from sweeps.run_specs import million_parameters
 from sweeps.table.cells import NO_VALUE, CellId, TableCell
 from sweeps.table.request import TableRequest
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from rgbt.config.compose import with_pixels
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-from sweeps.run_config import PlannedRun, planned_run
+from sweeps.run_specs import PlannedRun, plan_run
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Planner:
             InputError: a configuration or a data set that does not fit, in one sentence.
         """
         runs = tuple(
-            planned_run((*self.base, *overrides), self._fingerprints) for overrides in point.runs()
+            plan_run((*self.base, *overrides), self._fingerprints) for overrides in point.runs()
         )
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:

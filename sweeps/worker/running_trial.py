@@ -15,7 +15,7 @@ from rgbt.files.atomic import is_held
 from rgbt.tracking.folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.run_config import PlannedRun
+from sweeps.run_specs import PlannedRun
 from sweeps.worker.executors import GRACE_S, Job
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_monitor import MetricsReader, failure_reason, signal_lock_holder

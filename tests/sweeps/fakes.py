@@ -21,7 +21,7 @@ from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
-from sweeps.run_config import PlannedRun
+from sweeps.run_specs import PlannedRun
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers

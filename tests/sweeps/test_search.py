@@ -12,7 +12,7 @@ import sweeps.search as searching
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
 from sweeps import attributes as names
-from sweeps.run_config import open_run_store
+from sweeps.run_specs import open_run_store
 from sweeps.search import Search, _probe, search
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space

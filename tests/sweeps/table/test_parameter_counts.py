@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from sweeps.run_config import million_parameters
+from sweeps.run_specs import million_parameters
 from sweeps.table.parameter_counts import parameter_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row

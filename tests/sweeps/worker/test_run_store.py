@@ -17,7 +17,7 @@ from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.percent import in_percent
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.run_config import open_run_store
+from sweeps.run_specs import open_run_store
 from sweeps.worker.run_store import FETCHED, RunStore
 from tests.sweeps.fakes import DATASET, counts, finish
 

@@ -1,4 +1,4 @@
-"""Composes and checks the configuration of a run; other modules of sweeps do not read its nodes."""
+"""Specifications of runs, composed from overrides, and what sweeps take from them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
+from rgbt.config.component import Component, build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check, check_node
-from rgbt.spec.run_key import run_key
+from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.specify import specify
 from sweeps.worker.run_store import RunStore
 
 
@@ -39,26 +40,18 @@ class PlannedRun:
     consistency_splits: tuple[str, ...] = ()
 
 
-def checked_config(overrides: Sequence[str]) -> DictConfig:
-    """The checked configuration of one run.
+def specify_run(overrides: Sequence[str]) -> RunSpec:
+    """The specification of one run.
 
     Raises:
         InputError: Hydra or a component refuses an override, in the words of the command line.
     """
     with composing(overrides):
-        config = compose(overrides)
-        check(config)
-    return config
+        return specify(compose(overrides), overrides)
 
 
-def open_run_store(config: DictConfig) -> RunStore:
-    """Finished runs in the folder of runs and in the tracker of a configuration."""
-    runs_dir = Path(config.runs_dir).expanduser().resolve()
-    return RunStore(runs_dir, build(config.tracking), fresh=config.fresh)
-
-
-def planned_run(overrides: tuple[str, ...], fingerprints: dict[str, str]) -> PlannedRun:
-    """Compose and check one run.
+def plan_run(overrides: tuple[str, ...], fingerprints: dict[str, str]) -> PlannedRun:
+    """Specify one run and read its data set.
 
     Args:
         overrides: of `python -m rgbt.run`.
@@ -67,23 +60,24 @@ def planned_run(overrides: tuple[str, ...], fingerprints: dict[str, str]) -> Pla
     Raises:
         InputError: a configuration or a data set that does not fit, in one sentence.
     """
-    config = checked_config(overrides)
-    dataset = json.dumps(OmegaConf.to_container(config.dataset, resolve=True), sort_keys=True)
-    key = run_key(config)
-    node = config.consistency
+    spec = specify_run(overrides)
+    views = spec.consistency.values
+    key = spec.key
+    dataset = json.dumps(spec.dataset.plain, sort_keys=True)
     if dataset not in fingerprints:
-        fingerprints[dataset] = _fingerprint(build(config.dataset))
+        fingerprints[dataset] = _fingerprint(spec.dataset)
     return PlannedRun(
         key=key,
         dataset=fingerprints[dataset],
         overrides=overrides,
-        steps=int(config.trainer.max_steps),
-        pixel_factor=float(config.scale.pixel_factor),
-        consistency_splits=tuple(node.splits) if node.sets else (),
+        steps=spec.trainer.max_steps,
+        pixel_factor=spec.scale.pixel_factor,
+        consistency_splits=tuple(views["splits"]) if views["sets"] else (),
     )
 
 
-def _fingerprint(dataset: Any) -> str:
+def _fingerprint(component: Component) -> str:
+    dataset: Any = component.build()
     if not any(dataset.has(split) for split in dataset.splits):
         paths = ", ".join(dict.fromkeys(dataset.splits.values()))
         raise InputError(
@@ -91,6 +85,12 @@ def _fingerprint(dataset: Any) -> str:
             "name its folder with dataset.root=..."
         )
     return str(dataset.fingerprint())
+
+
+def open_run_store(config: DictConfig) -> RunStore:
+    """Finished runs in the folder of runs and in the tracker of a composed configuration."""
+    runs_dir = Path(config.runs_dir).expanduser().resolve()
+    return RunStore(runs_dir, build(config.tracking), fresh=config.fresh)
 
 
 def million_parameters(overrides: Sequence[str]) -> float:
@@ -108,10 +108,7 @@ def million_parameters(overrides: Sequence[str]) -> float:
     """
     import torch
 
-    with composing(overrides):
-        node = compose(overrides).model
-        check_node(node, "model")
-        with torch.device("meta"):
-            network = build(node)
+    with composing(overrides), torch.device("meta"):
+        network = build(compose(overrides).model)
     count: int = sum(parameter.numel() for parameter in network.parameters())
     return count / 1e6
