@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 from sweeps import attributes
 from sweeps.report.axes import Dimension, dimension
 from sweeps.report.drawing import history, intermediate, pareto, slices
-from sweeps.report.figures import StudyFigure, _contour, draw
+from sweeps.report.figures import StudyFigure, _contour, _most_important, _without_contour, draw
 from sweeps.report.study_data import Importances, importances, read
 
 NONE = "no trial is complete yet."
@@ -91,7 +91,7 @@ def test_contour_leaves_the_style_of_others_alone() -> None:
 
     before = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     data = read(filled("maximize"))
-    assert not isinstance(_contour(data, importances(data), 0), str)
+    assert _contour(data, _most_important(importances(data), 0), 0).axes
     after = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     assert after == before
     assert pyplot.get_fignums() == []
@@ -150,7 +150,8 @@ def test_contour_of_parameters_that_never_meet_says_so() -> None:
         value = trial.suggest_float("a" if index % 2 else "b", 0, 1)
         study.tell(trial, value)
     data = read(study)
-    reason = _contour(data, importances(data), 0)
+    shares = importances(data)
+    reason = _without_contour(data, shares, _most_important(shares, 0), 0)
     assert reason in (f"only 0 complete trials have both {x} and {y}." for x, y in ("ab", "ba"))
 
 
@@ -159,8 +160,7 @@ def test_contour_shows_the_two_most_important_parameters_of_its_objective() -> N
     data = read(filled("maximize", "minimize"))
     wanted = ({"optimizer.lr", "masker.patch_size"}, {"masker.patch_size", "masker"})
     for index, names in enumerate(wanted):
-        figure = _contour(data, Importances(shares, ""), index)
-        assert not isinstance(figure, str)
+        figure = _contour(data, _most_important(Importances(shares, ""), index), index)
         axis = figure.axes[0]
         assert {axis.get_xlabel(), axis.get_ylabel()} == names
         if "optimizer.lr" in names:

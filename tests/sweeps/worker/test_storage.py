@@ -94,11 +94,11 @@ import sys
 from pathlib import Path
 import optuna, sqlalchemy  # loaded before the start, so that all open at the same time
 from sweeps.settings import Objective
-from sweeps.worker.storage import begin_study, open_storage
+from sweeps.worker.storage import open_study, open_storage
 print("ready", flush=True)
 sys.stdin.readline()
 storage = open_storage(sys.argv[1], Path("."))
-study = begin_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
+study = open_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
 study.add_trial(optuna.trial.create_trial(value=1.0))
 """
 

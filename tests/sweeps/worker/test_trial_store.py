@@ -38,7 +38,7 @@ def states(store: TrialStore) -> list[str]:
 
 
 def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
-    """A ledger of a search; every driver has a study object and a sampler of its own."""
+    """The store of a search; every driver has a study object and a sampler of its own."""
     return store_on(storage, owner, sampler=build_sampler("random", 0, {}, 1))
 
 
@@ -108,14 +108,14 @@ def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
     tmp_path: Path, kind: str, keys: str
 ) -> None:
     opened = opener(tmp_path, kind)
-    ledgers = [store_on(opened()) for _ in range(2)]
+    stores = [store_on(opened()) for _ in range(2)]
     got: list[list[str]] = [[], []]
     at_once = threading.Barrier(2)
 
     def work(index: int) -> None:
         for key in keys:
             at_once.wait()
-            if claim(ledgers[index], key) is not None:
+            if claim(stores[index], key) is not None:
                 got[index].append(key)
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
@@ -124,7 +124,7 @@ def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
     for thread in threads:
         thread.join()
     assert sorted(got[0] + got[1]) == list(keys)
-    assert states(ledgers[0]) == ["RUNNING"] * len(keys)
+    assert states(stores[0]) == ["RUNNING"] * len(keys)
 
 
 @pytest.mark.parametrize(("kind", "total"), [("journal", 20), ("sqlite", 7)])
@@ -132,7 +132,7 @@ def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
     tmp_path: Path, kind: str, total: int
 ) -> None:
     opened = opener(tmp_path, kind)
-    ledgers = [searching(opened()) for _ in range(3)]
+    stores = [searching(opened()) for _ in range(3)]
     drawn: list[float] = []
 
     def work(store: TrialStore) -> None:
@@ -141,12 +141,12 @@ def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
             if asked is not None:
                 drawn.append(asked.suggest_float("x", 0, 1))
 
-    threads = [threading.Thread(target=work, args=(store,)) for store in ledgers]
+    threads = [threading.Thread(target=work, args=(store,)) for store in stores]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert states(ledgers[0]) == ["RUNNING"] * total, "none was told: running ones count"
+    assert states(stores[0]) == ["RUNNING"] * total, "none was told: running ones count"
     assert len(set(drawn)) == len(drawn) == total
 
 
