@@ -96,7 +96,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) ->
     assert rows[2]["reason"] == "flow"
 
 
-def test_a_table_given_as_a_file_goes_by_paper_and_name(
+def test_reproduce_table_file_is_named_by_paper(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     asked = driven("finished")
@@ -108,7 +108,7 @@ def test_a_table_given_as_a_file_goes_by_paper_and_name(
     assert (place / "runs/tables/my/mine_demo/table.md").exists()
 
 
-def test_a_failed_cell_is_told_and_the_table_still_comes(
+def test_reproduce_failed_cell_prints_table(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     driven("finished", "failed")
@@ -129,7 +129,7 @@ def test_cells_of_other_drivers_are_no_failure(
     assert_one_sentence(err, "wait=true")
 
 
-def test_a_disk_that_is_full_costs_the_files_but_not_the_table(
+def test_reproduce_full_disk_prints_table_without_files(
     call: Call, place: Path, driven: Callable[..., Asked], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:
@@ -143,7 +143,7 @@ def test_a_disk_that_is_full_costs_the_files_but_not_the_table(
     assert_one_sentence(err, "No space left on device; the files were not written")
 
 
-def test_a_table_that_cannot_be_run_shows_what_is_printed(
+def test_reproduce_unrunnable_table_shows_published_values(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     asked = driven("finished")
@@ -246,11 +246,11 @@ def test_mistakes_cost_one_sentence(
     assert_one_sentence(err, sentence)
 
 
-def test_every_key_of_execution_is_a_key_of_the_command() -> None:
+def test_reproduce_options_are_sweep_settings() -> None:
     assert set(OWN) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
 
 
-def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() -> None:
+def test_settings_of_command_have_sweeper_defaults() -> None:
     given = {key: value for key, value in OWN.items() if value is not None}
     plain = settings_of(given)
     assert (plain.workers, plain.storage, plain.gpus, plain.submitit) == (1, None, None, {})

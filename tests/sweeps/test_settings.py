@@ -27,7 +27,7 @@ def changed(node: DictConfig, **values: Any) -> DictConfig:
     return changed_node
 
 
-def test_the_file_of_the_sweeper_holds_every_setting_and_no_other(composed: DictConfig) -> None:
+def test_sweeper_file_holds_all_settings(composed: DictConfig) -> None:
     keys = set(map(str, composed)) - {"_target_"}
     assert keys == set(SweepSettings.__dataclass_fields__)
     settings = read_settings(composed)
@@ -37,7 +37,7 @@ def test_the_file_of_the_sweeper_holds_every_setting_and_no_other(composed: Dict
     assert settings.pruner is None
 
 
-def test_every_setting_of_the_file_is_explained_or_says_itself_what_it_is() -> None:
+def test_sweeper_file_explains_every_setting() -> None:
     lines = [line for line in FILE.read_text().splitlines() if line[:1].isalpha()]
     silent = [line.partition(":")[0] for line in lines if "#" not in line]
     assert silent in ([], ["sampler"])
@@ -62,7 +62,7 @@ def test_values_are_taken_as_their_types(composed: DictConfig) -> None:
     assert settings.points == (("a=1", "b=[2,3]"), ("a=4",))
 
 
-def test_interpolations_of_spaces_grids_and_points_are_left_to_the_runs(
+def test_read_settings_keeps_interpolations(
     composed: DictConfig,
 ) -> None:
     space = {"masker.patch_size": {"type": "categorical", "choices": ["${px:8}", "${px:64}"]}}

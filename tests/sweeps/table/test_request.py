@@ -31,7 +31,7 @@ def wanted(scale: str = "demo", **others: object) -> TableRequest:
     return TableRequest("own/t", table(ROWS, COLUMNS, at=at, **others), scale, (0, 2), ("a.b=1",))
 
 
-def test_a_point_per_run_with_the_rows_that_share_it() -> None:
+def test_points_share_runs_of_equal_rows() -> None:
     points = wanted().points()
     assert [point.label for point in points] == [
         "small (and 1 more) seed=0",
@@ -46,7 +46,7 @@ def test_a_point_per_run_with_the_rows_that_share_it() -> None:
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 
 
-def test_at_paper_scale_the_rows_differ_and_the_users_overrides_win() -> None:
+def test_points_at_paper_scale_use_user_overrides() -> None:
     points = wanted("paper").points()
     assert len(points) == 6
     assert points[1].overrides == (
@@ -78,7 +78,7 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         )
 
 
-def test_a_run_is_evaluated_for_the_columns_that_its_rows_have() -> None:
+def test_points_evaluate_columns_of_their_rows() -> None:
     columns = (
         Column(name="rgb", metric="mIoU"),
         Column(name="thermal", metric="mIoU", modality="thermal"),

@@ -39,7 +39,7 @@ def test_an_owner_is_read_back_from_its_text() -> None:
     assert Owner.parse("node:7:12:345") == Owner("node:7", 12, "345")
 
 
-def test_a_process_on_this_machine_is_alive_exactly_until_it_ends(
+def test_owner_local_process_alive_until_exit(
     child: subprocess.Popen[str],
 ) -> None:
     assert child.stdout is not None
@@ -54,7 +54,7 @@ def test_a_process_on_this_machine_is_alive_exactly_until_it_ends(
     assert not owner.is_alive(heartbeat=time.time())
 
 
-def test_a_later_process_with_the_same_number_is_somebody_else() -> None:
+def test_owner_reused_pid_is_not_alive() -> None:
     assert not Owner(HOST, os.getpid(), "12").is_alive(heartbeat=time.time())
 
 
@@ -64,6 +64,6 @@ def test_on_another_machine_only_the_last_sign_counts() -> None:
     assert not other.is_alive(time.time() - 2 * STALE_S)
 
 
-def test_a_driver_that_did_not_say_who_it_is_counts_by_its_last_sign() -> None:
+def test_owner_unknown_depends_on_heartbeat() -> None:
     assert Owner.unknown().is_alive(time.time())
     assert not Owner.unknown().is_alive(time.time() - 2 * STALE_S)

@@ -29,7 +29,7 @@ def runs(tmp_path: Path) -> RunStore:
     return RunStore(tmp_path, NoTracking())
 
 
-def test_a_finished_run_is_found_and_an_unfinished_one_is_not(runs: RunStore) -> None:
+def test_find_returns_finished_runs_only(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
     RunFolder(runs.runs_dir / "b").append(1, "val", {"mIoU": 0.5})
     found = runs.find("a", DATASET)
@@ -42,13 +42,13 @@ def test_a_finished_run_is_found_and_an_unfinished_one_is_not(runs: RunStore) ->
     assert not (runs.runs_dir / FETCHED).exists()
 
 
-def test_a_run_on_other_files_of_the_data_set_is_told(runs: RunStore) -> None:
+def test_find_run_on_other_data_raises(runs: RunStore) -> None:
     finish(runs.runs_dir / "a", dataset="another-fingerprint")
     with pytest.raises(RunError, match=r"a was made on other files .*another-, now fingerpr"):
         runs.find("a", DATASET)
 
 
-def test_scores_are_in_percent_but_for_the_variance_and_without_what_is_missing(
+def test_scores_are_in_percent_except_var(
     tmp_path: Path,
 ) -> None:
     val = {"mIoU": 0.512345678, "Var": 9.25, "day/mIoU": 0.5, "day/Var": 4.0, "class/car": None}
@@ -67,13 +67,13 @@ def test_scores_are_in_percent_but_for_the_variance_and_without_what_is_missing(
     )
 
 
-def test_every_score_of_a_run_but_the_variances_becomes_percent() -> None:
+def test_in_percent_scales_every_score_except_var() -> None:
     for name in scores.summary(counts(), "released"):
         factor = 1 if name.split("/")[-1] == names.VAR else 100
         assert in_percent(name, 0.123456) == pytest.approx(factor * 0.123456)
 
 
-def test_counts_of_a_run_and_of_its_further_evaluations_have_files_of_their_own(
+def test_counts_of_evaluations_have_own_files(
     tmp_path: Path,
 ) -> None:
     finish(tmp_path)
@@ -90,7 +90,7 @@ def test_counts_of_a_run_and_of_its_further_evaluations_have_files_of_their_own(
     assert found.counts(ring.path).counts[0, 0, 0, 0] == 7
 
 
-def test_the_commit_is_that_of_the_first_process_with_a_mark_for_changes(tmp_path: Path) -> None:
+def test_commit_is_of_first_process_with_change_mark(tmp_path: Path) -> None:
     run = finish(tmp_path)
     found = RunResult(tmp_path)
     assert found.commit is None
@@ -133,13 +133,13 @@ def test_a_stopped_run_says_why(runs: RunStore) -> None:
     assert not (runs.runs_dir / "nothing began").exists()
 
 
-def test_a_run_that_finished_while_it_was_stopped_is_not_shown_as_stopped(runs: RunStore) -> None:
+def test_mark_stopped_ignores_finished_run(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
     runs.mark_stopped("a", "pruned at step 2")
     assert "rgbt.stopped" not in tags_of(runs.runs_dir / "a")
 
 
-def test_a_store_that_is_away_is_told_once_and_runs_here_are_found(
+def test_run_store_unreachable_mlflow_warns_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -218,7 +218,7 @@ def machines(tmp_path_factory: pytest.TempPathFactory) -> Machines:
 
 
 @pytest.mark.slow
-def test_a_run_made_elsewhere_is_found_in_mlflow_with_its_files(machines: Machines) -> None:
+def test_find_fetches_remote_run_from_mlflow(machines: Machines) -> None:
     made = machines.send("a")
     here = machines.runs("here")
     found = here.find("a", DATASET)
@@ -242,7 +242,7 @@ def test_a_run_made_elsewhere_is_found_in_mlflow_with_its_files(machines: Machin
 
 
 @pytest.mark.slow
-def test_tags_added_to_a_run_here_arrive_in_mlflow_beside_the_old_ones(machines: Machines) -> None:
+def test_tag_keeps_existing_tags_in_mlflow(machines: Machines) -> None:
     made = machines.send("b")
     there = machines.runs("there")
     there.tag(RunResult(made.path), {"rgbt.table/two": "other row"})

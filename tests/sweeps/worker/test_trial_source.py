@@ -73,7 +73,7 @@ def is_exhausted(desk: Desk, *, wait: bool = False) -> bool:
     return desk.driver.source.is_exhausted(wait=wait)
 
 
-def test_points_of_a_list_are_claimed_in_order_and_noted(tmp_path: Path) -> None:
+def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2))
     source = ListSource(
         desk.plans,
@@ -92,7 +92,7 @@ def test_points_of_a_list_are_claimed_in_order_and_noted(tmp_path: Path) -> None
     assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
 
 
-def test_a_list_is_over_when_nothing_waits_or_with_wait_when_nothing_runs(tmp_path: Path) -> None:
+def test_list_source_exhausted_depends_on_wait(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1))
     assert not is_exhausted(desk)
     task = taken(desk)
@@ -105,13 +105,13 @@ def test_a_list_is_over_when_nothing_waits_or_with_wait_when_nothing_runs(tmp_pa
     assert status(desk).results[0].key == desk.plans[0].key
 
 
-def test_the_same_point_twice_in_a_list_is_one_point(tmp_path: Path) -> None:
+def test_list_source_duplicate_point_is_one_trial(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, [*plans(1), *plans(1)])
     taken(desk)
     assert desk.driver.source.next() is None
 
 
-def test_a_failed_point_waits_for_a_retry_that_somebody_asks_for(tmp_path: Path) -> None:
+def test_list_source_failed_point_waits_for_retry(tmp_path: Path) -> None:
     storage = memory()
     first = list_desk(tmp_path, plans(1), storage=storage)
     first.store.fail(taken(first).number, "a bad day", {})
@@ -128,7 +128,7 @@ def test_a_failed_point_waits_for_a_retry_that_somebody_asks_for(tmp_path: Path)
     assert again.driver.source.next() is None, "forgiven once, not for ever"
 
 
-def test_a_point_is_tried_as_often_as_retries_say_all_drivers_together(tmp_path: Path) -> None:
+def test_list_source_retries_are_shared_by_drivers(tmp_path: Path) -> None:
     storage = memory()
     a = list_desk(tmp_path, plans(1), storage=storage, retries=2)
     b = list_desk(tmp_path, plans(1), storage=storage, retries=2, owner=DEAD)
@@ -159,7 +159,7 @@ def test_other_points_in_the_study_are_left_alone(tmp_path: Path) -> None:
     assert is_exhausted(desk)
 
 
-def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: Path) -> None:
+def test_list_source_failed_point_finished_by_hand(tmp_path: Path) -> None:
     storage = memory()
     before = list_desk(tmp_path, plans(1), storage=storage)
     before.store.fail(taken(before).number, "a bad day", {})
@@ -168,7 +168,7 @@ def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: 
     assert status(desk).state in ("finished", "waiting")
 
 
-def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) -> None:
+def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
     ring = ExtraEvaluation(regions="ring9")
     plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring,)))
     runs = list_desk(tmp_path, []).runs
@@ -231,7 +231,7 @@ def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
 SMALL = {"x": {"type": "categorical", "choices": [7]}}
 
 
-def test_a_duplicate_of_a_finished_point_is_answered_without_a_run(tmp_path: Path) -> None:
+def test_sampler_source_copies_finished_duplicate(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     done(desk, taken(desk), 31.0)
     assert desk.driver.source.next() is None
@@ -243,9 +243,7 @@ def test_a_duplicate_of_a_finished_point_is_answered_without_a_run(tmp_path: Pat
     assert is_exhausted(desk)
 
 
-def test_a_duplicate_of_a_running_point_is_dropped_and_the_search_goes_on_later(
-    tmp_path: Path, quick: None
-) -> None:
+def test_sampler_source_drops_running_duplicate(tmp_path: Path, quick: None) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     task = taken(desk)
     assert desk.driver.source.next() is None
@@ -256,13 +254,13 @@ def test_a_duplicate_of_a_running_point_is_dropped_and_the_search_goes_on_later(
     assert desk.numbers("COMPLETE") == [0, desk.store.trials()[1].number]
 
 
-def test_a_failed_point_of_a_search_may_be_tried_again_by_the_sampler(tmp_path: Path) -> None:
+def test_sampler_source_may_repeat_failed_point(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     desk.store.fail(taken(desk).number, "a bad day", {})
     assert taken(desk).number == 1
 
 
-def test_a_point_that_cannot_be_composed_fails_and_is_told(tmp_path: Path) -> None:
+def test_sampler_source_wrong_point_fails_and_is_reported(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, planner=PickyPlanner(), trials=1)
     assert desk.driver.source.next() is None
     (trial,) = desk.store.trials()
@@ -293,7 +291,7 @@ def test_evaluations_are_reported_once_each_in_percent(tmp_path: Path) -> None:
     assert math.isnan(reported.get(8, math.nan))
 
 
-def test_a_variance_is_reported_as_it_is_and_nothing_of_two_objectives(tmp_path: Path) -> None:
+def test_pruning_callback_keeps_var_and_skips_two_objectives(tmp_path: Path) -> None:
     var = Objective("val/Var", "minimize")
     desk = search_desk(tmp_path, objectives=(var,), trials=1)
     report = taken(desk).report
@@ -329,7 +327,7 @@ def test_overrides_are_short_for_people(override: str, shown: str) -> None:
     assert short_override(override) == shown
 
 
-def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
+def test_reason_of_trial_without_reason() -> None:
     store = store_on(memory())
     number = store.claim(TrialClaim("k", {}))
     assert number == 0
@@ -337,7 +335,7 @@ def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
     assert reason_of(store.trials()[0]) == "no reason was noted"
 
 
-def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_path: Path) -> None:
+def test_has_counts_ignores_outdated_evaluation(tmp_path: Path) -> None:
     ring = ExtraEvaluation(regions="ring9")
     plan = plan_of(Point("p", (), evaluations=(ring,)))
     runs = list_desk(tmp_path, []).runs
