@@ -46,7 +46,7 @@ class Search:
     identity: Sequence[Any]
 
 
-def search(wanted: Search, settings: SweepSettings) -> None:
+def search(request: Search, settings: SweepSettings) -> None:
     """Run trials until the budget is spent, then report the study.
 
     Raises:
@@ -64,41 +64,41 @@ def search(wanted: Search, settings: SweepSettings) -> None:
         )
     sampler, pruner = _sampler_and_pruner(settings)
     if settings.dry_run:
-        _preview(wanted, settings)
+        _preview(request, settings)
         return
-    probe = _probe(wanted, settings)
-    storage = open_storage(settings.storage, wanted.runs.runs_dir)
-    wanted.runs.create_tables()
+    probe = _probe(request, settings)
+    storage = open_storage(settings.storage, request.runs.runs_dir)
+    request.runs.create_tables()
     attributes = {
         names.KIND: "search",
         names.SIGNATURE: signature(
-            wanted.parameters,
+            request.parameters,
             settings.objectives,
             settings.replicates,
-            [*wanted.identity, probe.dataset],
+            [*request.identity, probe.dataset],
         ),
     }
-    study = open_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
+    study = open_study(request.study, storage, settings.objectives, attributes, sampler, pruner)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     store = TrialStore(study, storage, Owner.this_process())
-    tell(f"study {wanted.study}: run the same command on other machines to share it.")
-    _drive(wanted, settings, store)
-    _check_result(store, wanted.study)
-    runs_dir = wanted.runs.runs_dir
-    links = report(study, study_folder(runs_dir, wanted.study), wanted.runs.tracking)
+    tell(f"study {request.study}: run the same command on other machines to share it.")
+    _drive(request, settings, store)
+    _check_result(store, request.study)
+    runs_dir = request.runs.runs_dir
+    links = report(study, study_folder(runs_dir, request.study), request.runs.tracking)
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
 
 
-def _probe(wanted: Search, settings: SweepSettings) -> PlannedRun:
+def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
     """The run at the lowest point of the space; the highest one is checked too.
 
     Raises:
         InputError: an end of a range that a setting does not accept, a point that cannot be
             composed, a missing data set, or an objective that the runs do not measure.
     """
-    specify_run((*wanted.fixed, *_end_of(wanted.parameters, "high")))
-    lowest = plan_run((*wanted.fixed, *_end_of(wanted.parameters, "low")), {})
+    specify_run((*request.fixed, *_end_of(request.parameters, "high")))
+    lowest = plan_run((*request.fixed, *_end_of(request.parameters, "low")), {})
     for objective in settings.objectives:
         split = objective.metric.partition("/")[0]
         if objective.is_consistency and split not in lowest.consistency_splits:
@@ -120,15 +120,15 @@ def _end_of(parameters: tuple[Parameter, ...], end: Literal["low", "high"]) -> l
     return list(as_overrides(suggest(FixedTrial(values), parameters)))
 
 
-def _drive(wanted: Search, settings: SweepSettings, store: TrialStore) -> None:
+def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
     def num_done() -> int:
         return sum(trial.state.is_finished() for trial in store.trials())
 
-    view = ProgressView(wanted.study, settings.trials, settings.workers, num_done)
+    view = ProgressView(request.study, settings.trials, settings.workers, num_done)
     source = SamplerSource(
-        wanted.fixed, wanted.parameters, store, Planner(), settings, view.rejected
+        request.fixed, request.parameters, store, Planner(), settings, view.rejected
     )
-    drive(view, source, store, wanted.runs, settings)
+    drive(view, source, store, request.runs, settings)
 
 
 def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
@@ -156,17 +156,17 @@ def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any
     return str(node["kind"]), seed, options
 
 
-def _preview(wanted: Search, settings: SweepSettings) -> None:
+def _preview(request: Search, settings: SweepSettings) -> None:
     """Say what would be searched, and what there is; write nothing."""
-    study = find_study(wanted.study, settings.storage, wanted.runs.runs_dir)
+    study = find_study(request.study, settings.storage, request.runs.runs_dir)
     trials = [] if study is None else counted_trials(study)
     states = Counter(trial.state.name.lower() for trial in trials)
-    sys.stdout.write(f"study {wanted.study}: {dict(states) or 'not begun'}\n")
-    for parameter in wanted.parameters:
+    sys.stdout.write(f"study {request.study}: {dict(states) or 'not begun'}\n")
+    for parameter in request.parameters:
         sys.stdout.write(f"  {parameter}\n")
     for objective in settings.objectives:
         sys.stdout.write(f"  {objective.direction} {objective.metric}\n")
-    sys.stdout.write(f"  python -m rgbt.run {command_line(wanted.fixed)} ...\n")
+    sys.stdout.write(f"  python -m rgbt.run {command_line(request.fixed)} ...\n")
     if settings.trials is not None:
         left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")

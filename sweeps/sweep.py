@@ -78,7 +78,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         tell("no list of values was given (such as seed=0,1,2): this is one point.")
     name = settings.study or _name(config, list(points[0].params), [p.overrides for p in points])
     kind = "list" if settings.points else "grid"
-    _grid(_point_list(name, kind, points, (runs, base)), settings)
+    _grid(_point_list(name, kind, points, runs, base), settings)
 
 
 def _params(settings: SweepSettings) -> list[str]:
@@ -114,9 +114,8 @@ def _points(settings: SweepSettings, fixed: Sequence[str], swept: SweptValues) -
 
 
 def _point_list(
-    name: str, kind: str, points: Sequence[GridPoint], place: tuple[RunStore, tuple[str, ...]]
+    name: str, kind: str, points: Sequence[GridPoint], runs: RunStore, base: tuple[str, ...]
 ) -> PointList:
-    runs, base = place
     every = tuple(
         Point(
             label=_label(point) or name,

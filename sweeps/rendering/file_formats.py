@@ -102,8 +102,8 @@ def tidy_csv(scored: ScoredTable) -> str:
             printed = published(row, column)
             ours = (_plain(cell.mean), _plain(cell.sd), cell.seeds)
             theirs = ("" if printed is None else printed, _plain(scored.difference(row, column)))
-            place = (scored.name, row.label, column.name)
-            rows.append((*place, *ours, *theirs, reason, " ".join(cell.keys)))
+            cell_id = (scored.name, row.label, column.name)
+            rows.append((*cell_id, *ours, *theirs, reason, " ".join(cell.keys)))
     return csv_text(rows)
 
 

@@ -12,11 +12,11 @@ from sweeps.table.cells import NO_VALUE, TableCell, is_counted, is_of_runs, metr
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
-BESIDE = 3
-"""Columns up to which ours, published and difference stand beside each other; else below."""
+MAX_ON_ONE_LINE = 3
+"""Most columns with ours, published and difference on one line; more columns use several lines."""
 
 WITH_SD = 12
-"""Columns up to which the standard deviation stands behind its mean; else on a line of its own."""
+"""Most columns with the standard deviation behind its mean; with more it has its own line."""
 
 BESIDE_OURS = ("published", "difference")
 """Header of the columns that belong to the one before."""
@@ -45,9 +45,9 @@ class LineBuilder:
         return max((len(each.rstrip("0")) for each in digits), default=2)
 
     @property
-    def beside(self) -> bool:
+    def on_one_line(self) -> bool:
         """Whether a row is one line."""
-        return len(self.columns) <= BESIDE
+        return len(self.columns) <= MAX_ON_ONE_LINE
 
     @property
     def sd_apart(self) -> bool:
@@ -57,15 +57,15 @@ class LineBuilder:
 
     def header(self, columns: Sequence[TextCell]) -> tuple[TextCell, ...]:
         """Above the fields of a line, from the names of the columns."""
-        if not self.beside:
+        if not self.on_one_line:
             return (TextCell(), TextCell("seeds"), *columns)
         words = tuple(map(TextCell, BESIDE_OURS))
         named = zip(self.columns, columns, strict=True)
-        beside = [(text, *(words if column.printed else ())) for column, text in named]
-        return (TextCell("seeds"), *(text for texts in beside for text in texts))
+        pairs = [(text, *(words if column.printed else ())) for column, text in named]
+        return (TextCell("seeds"), *(text for texts in pairs for text in texts))
 
     def row(self, row: Row) -> list[TableLine]:
-        """The lines of one row: all in one where they fit beside each other."""
+        """The lines of one row: a single one for few columns."""
         printed = [column for column in self.columns if published(row, column) is not None]
         runs = any((row.label, column.name) in self.scored.cells for column in self.columns)
         label = TextCell(row.label, notes=self.notes(*self._label_notes(row)))
@@ -78,7 +78,7 @@ class LineBuilder:
             kinds["published"] = self._published
         if any(not math.isnan(self.scored.difference(row, column)) for column in self.columns):
             kinds["difference"] = self._difference
-        if self.beside:
+        if self.on_one_line:
             return [TableLine("all", label, (self._seeds(row), *self._triples(row)))]
         lines: list[TableLine] = []
         for kind, text in kinds.items():
@@ -97,7 +97,7 @@ class LineBuilder:
             return []
         rhos = [TextCell(_signed(order.rho)) for order in orders]
         rows = [TextCell(str(order.rows)) for order in orders]
-        if self.beside:
+        if self.on_one_line:
             apart = [self._apart(texts) for texts in (rhos, rows)]
             labels = TextCell("order of rows: rho"), TextCell("n")
             pairs = zip(labels, apart, strict=True)
@@ -117,8 +117,8 @@ class LineBuilder:
 
     def _triples(self, row: Row) -> list[TextCell]:
         """Ours, published and difference of every column; ours alone where it is not printed."""
-        beside = (self._published, self._difference)
-        kinds = [(self._ours, *(beside if column.printed else ())) for column in self.columns]
+        others = (self._published, self._difference)
+        kinds = [(self._ours, *(others if column.printed else ())) for column in self.columns]
         pairs = zip(self.columns, kinds, strict=True)
         return [kind(row, column) for column, each in pairs for kind in each]
 
@@ -127,7 +127,7 @@ class LineBuilder:
         return [*needs, *self._same_runs(row), *(row.remarks if not row.doubtful else ())]
 
     def _same_runs(self, row: Row) -> list[str]:
-        """That the row is another one again: at scale=demo networks of all sizes are one."""
+        """A note on an equal row: at scale=demo networks of all sizes are one."""
         counted = list(filter(is_counted, self.columns))
         for other in self.scored.table.rows:
             if other.label == row.label:
@@ -151,15 +151,15 @@ class LineBuilder:
         return TextCell("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
 
     def _ours(self, row: Row, column: Column) -> TextCell:
-        place = (row.label, column.name)
-        cell = self.scored.cells.get(place)
+        cell_id = (row.label, column.name)
+        cell = self.scored.cells.get(cell_id)
         if cell is None:
             return TextCell(DASH)
         notes = self.notes(cell.reason and _sentence(cell))
         if math.isnan(cell.mean):
             return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
         spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
-        rank = self.scored.ranks_ours.get(place, 0)
+        rank = self.scored.ranks_ours.get(cell_id, 0)
         return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
 
     def _sd(self, row: Row, column: Column) -> TextCell:

@@ -18,7 +18,7 @@ TRAINED = "trained, not evaluated for all columns"
 
 
 def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
-    """One line per run: state, seconds or the reason why it failed, command."""
+    """One line per run: state, seconds, key, the reason of a failure."""
     rows = [
         (
             outcome.point.label,

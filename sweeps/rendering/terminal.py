@@ -126,7 +126,7 @@ def _rich(text: TextCell, tail_width: int, *, plain: bool) -> RichText:
 
 
 def _tail(text: TextCell) -> str:
-    """What stands behind the number: spread and footnotes."""
+    """Spread and footnotes, behind the number."""
     return text.whole.removeprefix(text.text) + _bracketed(text)
 
 

@@ -76,7 +76,7 @@ class StudyData:
         """The Pareto front, best first objective first; with one objective its best trials."""
         if not self.complete:
             return []
-        # The copy has the complete trials alone, so that its numbers are places in our list.
+        # The copy has the complete trials alone, so that its numbers are indices of our list.
         best = [self.complete[trial.number] for trial in self.copy().best_trials]
         return sorted(best, key=self.rank)
 
@@ -178,7 +178,11 @@ def importances(data: StudyData) -> Importances:
         return Importances({}, "")
     if count < MIN_TRIALS:
         return Importances({}, f"they need {MIN_TRIALS} complete trials, and there are {count}.")
-    varied = [name for name in data.distributions if _is_varied(data, name)]
+    values = {
+        name: {trial.params[name] for trial in data.complete if name in trial.params}
+        for name in data.distributions
+    }
+    varied = [name for name in values if len(values[name]) > 1]
     if not varied:
         return Importances({}, "no parameter took two values.")
     by_objective = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
@@ -188,10 +192,6 @@ def importances(data: StudyData) -> Importances:
         return Importances({}, remark)
     ordered = dict(sorted(shares.items(), key=lambda item: _descending(item[1])))
     return Importances(ordered, remark)
-
-
-def _is_varied(data: StudyData, name: str) -> bool:
-    return len({trial.params[name] for trial in data.complete if name in trial.params}) > 1
 
 
 def _descending(shares: tuple[float, ...]) -> tuple[float, ...]:
@@ -205,7 +205,7 @@ def _of_objective(data: StudyData, index: int, names: list[str]) -> dict[str, fl
         return dict.fromkeys(names, math.nan)
     sign = -1.0 if data.maximize[index] else 1.0
     with warnings.catch_warnings():
-        # The sign is right, and how rough the shares are is said in words (`_remarks`).
+        # The sign is right, and `_remarks` says how uncertain the shares are.
         warnings.filterwarnings("ignore", "PedAnovaImportanceEvaluator computes", UserWarning)
         warnings.filterwarnings("ignore", "Some regimes for parameter", UserWarning)
         return optuna.importance.get_param_importances(
@@ -213,11 +213,11 @@ def _of_objective(data: StudyData, index: int, names: list[str]) -> dict[str, fl
         )
 
 
-def _remarks(data: StudyData, varied: list[str], found: list[dict[str, float]]) -> list[str]:
+def _remarks(data: StudyData, varied: list[str], by_objective: list[dict[str, float]]) -> list[str]:
     constant = [name for name in data.distributions if name not in varied]
     flat = [
         metric
-        for metric, shares in zip(data.metrics, found, strict=True)
+        for metric, shares in zip(data.metrics, by_objective, strict=True)
         if all(map(math.isnan, shares.values()))
     ]
     count = len(data.complete)
@@ -251,9 +251,9 @@ def pruning_savings(data: StudyData) -> PruningSavings | None:
     pruned = [trial for trial in data.of_state("PRUNED") if trial.intermediate_values]
     if full <= 0:
         return None
-    wanted = sum(full * _num_runs(trial) for trial in [*pruned, *data.complete])
+    full_steps = sum(full * _num_runs(trial) for trial in [*pruned, *data.complete])
     saved = sum(full * _num_runs(t) - max(t.intermediate_values) for t in pruned)
-    return PruningSavings(len(pruned), max(saved, 0) / wanted)
+    return PruningSavings(len(pruned), max(saved, 0) / full_steps)
 
 
 def _num_runs(trial: FrozenTrial) -> int:

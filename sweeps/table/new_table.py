@@ -24,7 +24,7 @@ OWN = {"table": None, "experiment": None}
 
 RINGS = 5
 END = "\n..."
-"""PyYAML's mark behind a value that stands alone."""
+"""PyYAML's mark behind a single value."""
 
 LOG_FROM = 8.0
 """Ratio of the largest to the smallest value from which the axis of the figure is logarithmic."""

@@ -52,7 +52,8 @@ class TableRequest:
         (row,) = (row for row in self.table.rows if row.label == label)
         experiment, *others = self.table.overrides(row, self.scale)
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
-        weights = _weights_of(others, self.weights)
+        file = self.weights.get(_model_of(others) or "")
+        weights = () if file is None else readable_paths([f"model.weights={file}"])
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
     def row_seeds(self) -> list[tuple[str, int]]:
@@ -115,11 +116,6 @@ class TableRequest:
 def _model_of(overrides: Sequence[str]) -> str | None:
     named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
     return named[-1] if named else None
-
-
-def _weights_of(overrides: Sequence[str], weights: Mapping[str, str]) -> tuple[str, ...]:
-    file = weights.get(_model_of(overrides) or "")
-    return () if file is None else tuple(readable_paths([f"model.weights={file}"]))
 
 
 def seeds_of(text: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""A table computed: mean and spread over seeds, beside the printed values.
+"""A computed table: mean and spread over seeds, compared with the printed values.
 
 Rows that cannot be run and columns that cannot be computed have no cells; without any run only
 columns of parameters have some.
@@ -112,6 +112,8 @@ def score(
     whole = {cell_id: cell for cell_id, cell in cells.items() if cell.seeds == len(seeds)}
     cells |= sizes or {}
     whole |= sizes or {}
+    pairs = (((row.label, c.name), published(row, c)) for row in table.rows for c in table.columns)
+    printed = {cell_id: value for cell_id, value in pairs if value is not None}
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
@@ -121,14 +123,9 @@ def score(
         cells=cells,
         orders={column.name: _order(table, column, whole) for column in table.columns},
         ranks_ours=_ranks(table, {cell_id: cell.mean for cell_id, cell in whole.items()}),
-        ranks_published=_ranks(table, _printed(table)),
+        ranks_published=_ranks(table, printed),
         commits=Counter(commit for commit in made_by.values() if commit is not None),
     )
-
-
-def _printed(table: Table) -> dict[CellId, float]:
-    pairs = (((row.label, c.name), published(row, c)) for row in table.rows for c in table.columns)
-    return {cell_id: printed for cell_id, printed in pairs if printed is not None}
 
 
 def _ranks(table: Table, values: Mapping[CellId, float]) -> dict[CellId, int]:

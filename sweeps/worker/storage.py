@@ -91,6 +91,12 @@ def _checked(storage: str | None, runs_dir: Path) -> str:
     return url
 
 
+def storage_file(url: str) -> Path | None:
+    """The file of a storage; None for a database server."""
+    path = url.removeprefix("sqlite:///")
+    return None if "://" in path else Path(path).expanduser()
+
+
 def _database(url: str, *, create: bool = True) -> optuna.storages.RDBStorage:
     import optuna
 
@@ -204,8 +210,8 @@ def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study |
     import optuna
 
     url = _checked(storage, runs_dir)
-    path = Path(url.removeprefix("sqlite:///")).expanduser()
-    if "://" not in str(path) and not url.startswith("postgres") and not path.exists():
+    file = storage_file(url)
+    if file is not None and not file.exists():
         return None
     if url.endswith(".journal"):
         opened = open_storage(storage, runs_dir)

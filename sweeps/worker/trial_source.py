@@ -46,7 +46,7 @@ class TrialSource(Protocol):
 
 
 def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
-    """What is stored with a trial of a point, beside its key."""
+    """User attributes of a trial of a point, except its key."""
     return {
         names.LABEL: plan.point.label,
         names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],

@@ -219,15 +219,15 @@ def test_slices_have_one_panel_per_parameter() -> None:
 
 def test_dimensions_scale_to_their_own_range() -> None:
     # log10 of 0.1, 1, 10 is -1, 0, 1; a category is its place; NaN stays.
-    assert Dimension("x", (0.1, 1.0, 10.0), is_log=True).places().tolist() == [0.0, 0.5, 1.0]
-    assert Dimension("x", (2.0, 3.0, 6.0)).places().tolist() == [0.0, 0.25, 1.0]
-    assert Dimension("x", (3.0, 3.0)).places().tolist() == [0.5, 0.5]
+    assert Dimension("x", (0.1, 1.0, 10.0), is_log=True).positions().tolist() == [0.0, 0.5, 1.0]
+    assert Dimension("x", (2.0, 3.0, 6.0)).positions().tolist() == [0.0, 0.25, 1.0]
+    assert Dimension("x", (3.0, 3.0)).positions().tolist() == [0.5, 0.5]
     chosen = Dimension("c", (2.0, math.nan), categories=("a", "b", "c"))
-    assert chosen.places()[0] == 1.0
-    assert math.isnan(chosen.places()[1])
+    assert chosen.positions()[0] == 1.0
+    assert math.isnan(chosen.positions()[1])
     assert chosen.ticks() == [(0.0, "a"), (0.5, "b"), (1.0, "c")]
     ticks = Dimension("x", (0.1, 10.0), is_log=True).ticks()
-    assert (0.5, "1") in [(round(place, 6), text) for place, text in ticks]
+    assert (0.5, "1") in [(round(position, 6), text) for position, text in ticks]
 
 
 def test_dimension_unset_conditional_parameter_is_nan() -> None:
