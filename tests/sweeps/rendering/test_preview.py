@@ -66,7 +66,7 @@ def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> N
     (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
     wanted, (first, second) = asked(FRAMES)
     found: Any = (Trained(tmp_path),)
-    outcomes = [replace(first, found=found, keys=("k",)), second]
+    outcomes = [replace(first, results=found, keys=("k",)), second]
     assert summary(wanted, outcomes, 1)[1:] == [
         "Time left with workers=1: 10 s.",
         "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "
