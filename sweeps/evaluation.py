@@ -33,7 +33,7 @@ class ExtraEvaluation:
 
     @property
     def label(self) -> str:
-        """For people: "thermal, ring9", "rgb, ring5, source head" or "consistency, aligned".
+        """As shown: "thermal, ring9", "rgb, ring5, source head" or "consistency, aligned".
 
         Under a degradation: "default, ring5, occluded-0.5".
         """
@@ -45,7 +45,7 @@ class ExtraEvaluation:
 
     @property
     def command(self) -> tuple[str, ...]:
-        """Module that makes it and what it is asked, beside the run.
+        """Module that makes it, and its arguments except the run.
 
         One call makes both protocols of virtual views, aligned and released.
         """
@@ -54,8 +54,8 @@ class ExtraEvaluation:
         head = () if self.head == "as trained" else (f"head={self.head}",)
         failing = () if self.degradation is None else (f"degradation={self.degradation}",)
         severity = () if self.severity is None else (f"severity={self.severity:g}",)
-        asked = (f"modality={self.modality}", f"regions={self.regions}")
-        return ("rgbt.evaluate", *asked, *head, *failing, *severity)
+        arguments = (f"modality={self.modality}", f"regions={self.regions}")
+        return ("rgbt.evaluate", *arguments, *head, *failing, *severity)
 
     @property
     def path(self) -> str:

@@ -12,8 +12,8 @@ from sweeps.evaluation import ExtraEvaluation
 Value = str | int | float | bool | None
 
 COLOUR = "mlflow.runColor"
-"""Tag with the colour of a run in MLflow's charts, which else comes from a hash of its id: of
-twenty colours two runs of four share one in every fourth grid."""
+"""Tag with the colour of a run in MLflow's charts. By default a hash of the run's id: two runs
+of four share one of the twenty colours in every fourth grid."""
 
 
 def colour(study: str, index: int) -> str:
@@ -43,7 +43,7 @@ class Point:
     """One cell of a table, point of a grid or trial of a search.
 
     Attributes:
-        label: what a person sees, e.g. "Ny/4 seed=1".
+        label: as shown, e.g. "Ny/4 seed=1".
         overrides: of `python -m rgbt.run`.
         params: what a grid or a search chose, by key.
         tags: MLflow tags that the runs get.

@@ -20,7 +20,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.config.words import readable_paths
 from rgbt.tracking.provenance import without_passwords
-from sweeps.worker.storage import JOURNAL, load_study, open_storage, study_names
+from sweeps.worker.storage import JOURNAL, load_study, open_storage, storage_file, study_names
 
 if TYPE_CHECKING:
     import optuna
@@ -83,7 +83,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
         tracking: where a run of kind "study" is recorded.
 
     Returns:
-        where everything is, as (name, place).
+        links to everything, as (name, address).
     """
     from rich.console import Group
     from rich.text import Text
@@ -100,11 +100,11 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     grids = tables(data, shares)
     out.mkdir(parents=True, exist_ok=True)
     pictures = draw(data, shares, out)
-    said = remarks(shares, pictures)
-    text = markdown(data, grids, said)
+    lines = remarks(shares, pictures)
+    text = markdown(data, grids, lines)
     write_atomic(out / "study.md", (text + gallery(pictures)).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
-    show(Group(*map(rich_table, grids), Text("\n".join(said))))
+    show(Group(*map(rich_table, grids), Text("\n".join(lines))))
     drawn = [picture.path for picture in pictures if picture.path is not None]
     links = record(
         tracking,
@@ -119,15 +119,15 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     return [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}"), *links]
 
 
-def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str:
+def markdown(data: StudyData, grids: Sequence[Grid], remark_lines: Sequence[str]) -> str:
     """The report in Markdown, without figures: MLflow's descriptions cannot show them."""
     from sweeps.report.tables import markdown_table
 
     way = ["highest" if up else "lowest" for up in data.maximize]
-    wanted = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
-    begun = f"Begun by `{without_passwords(data.command)}`.\n" if data.command else ""
-    head = f"# Study {data.name}\n\nKind: {data.kind}. Objectives: {wanted}.\n{begun}"
-    remarked = "".join(f"- {line}\n" for line in said)
+    objectives = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
+    created = f"Begun by `{without_passwords(data.command)}`.\n" if data.command else ""
+    head = f"# Study {data.name}\n\nKind: {data.kind}. Objectives: {objectives}.\n{created}"
+    remarked = "".join(f"- {line}\n" for line in remark_lines)
     return "\n".join([head, *map(markdown_table, grids), remarked])
 
 
@@ -138,7 +138,7 @@ def gallery(pictures: Sequence[StudyFigure]) -> str:
 
 
 def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
-    """What a person should know: how good the importances are, and which figures there are not."""
+    """Remarks below the tables: on the importances, and why figures are missing."""
     missing: dict[str, list[str]] = {}
     for picture in pictures:
         if picture.path is None:
@@ -149,23 +149,23 @@ def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
 
 
 def metrics(data: StudyData) -> dict[str, float]:
-    """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
-    from sweeps.report.study_data import pruning
+    """Metrics of a study in MLflow: the best of each objective, trials by state, steps saved."""
+    from sweeps.report.study_data import pruning_savings
     from sweeps.report.tables import WORDS
 
-    found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
+    numbers = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
     for index, metric in enumerate(data.metrics):
         values = [trial.values[index] for trial in data.complete]
         if values:
-            found[f"best/{metric}"] = max(values) if data.maximize[index] else min(values)
-    saved = pruning(data)
+            numbers[f"best/{metric}"] = max(values) if data.maximize[index] else min(values)
+    saved = pruning_savings(data)
     if saved is not None:
-        found["steps_saved"] = 100.0 * saved.share
-    return found
+        numbers["steps_saved"] = 100.0 * saved.share
+    return numbers
 
 
 def study_folder(runs_dir: Path, name: str) -> Path:
-    """Where the report of a study goes: "spatialseg/table3" makes one folder, and a clear one."""
+    """Folder of the report of a study; characters such as / in its name are replaced."""
     safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:NAME_LENGTH]
     if safe != name:
         safe += "-" + hashlib.sha256(name.encode()).hexdigest()[:6]
@@ -178,22 +178,20 @@ def dashboard_command(storage: str | None, runs_dir: Path) -> str:
 
 
 def _check_exists(storage: str | None, runs_dir: Path) -> None:
-    """Refuse a file that is not there: opening it would make an empty one."""
-    place = str(runs_dir / JOURNAL) if storage is None else storage
-    path = Path(place.removeprefix("sqlite:///")).expanduser()
-    is_file = "://" not in place or place.startswith("sqlite:///")
-    if is_file and not path.is_file():
+    """Refuse a missing file: opening it would create an empty one."""
+    file = storage_file(storage or str(runs_dir / JOURNAL))
+    if file is not None and not file.is_file():
         raise InputError(
-            f"there is no file of studies {path}; give the folder of runs with runs_dir=... or the "
+            f"there is no file of studies {file}; give the folder of runs with runs_dir=... or the "
             "storage with storage=..."
         )
 
 
-def show_links(places: Sequence[Link]) -> None:
-    """Print where everything is, one "name  place" pair per line."""
+def show_links(links: Sequence[Link]) -> None:
+    """Print links, one "name  address" pair per line."""
     from rgbt.tracking.terminal import place_lines, show
 
-    show(place_lines(places))
+    show(place_lines(links))
 
 
 entry = PlainCommand(Options, main, heeds=("tracking",))

@@ -23,6 +23,7 @@ from rgbt.tracking.folder import MetricLine, RunFolder
 from rgbt.tracking.formats import SentForm
 from rgbt.tracking.mlflow_client import Store
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
+from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced import description_of
 from rgbt.tracking.tables import ResultTables, result_grids
 
@@ -46,7 +47,6 @@ FILES = (
     "figures/*.png",
 )
 TABLE_FILE = "tables/iou.json"
-FRACTIONS = {names.MIOU, names.MACC, names.MPRECISION, names.MF1, names.PIXEL_ACCURACY}
 
 
 @dataclass
@@ -191,18 +191,6 @@ def _later(folder: RunFolder, sent: Sent) -> dict[str, Any]:
                 time_ms = round(1000 * lines[-1].time)
                 found[key] = Metric(label, shown(name, value), time_ms, 0)
     return found
-
-
-def shown(name: str, value: float) -> float:
-    """A value as MLflow shows it: scores in percent with two decimals, as the papers print them.
-
-    Its charts write 0.62 for a fraction, and its tables all sixteen digits. The folder keeps the
-    exact value.
-    """
-    first, last = name.split("/")[0], name.split("/")[-1]
-    if last in FRACTIONS or first in ("region", "class", names.TC, names.CA):
-        return round(100 * value, 2)
-    return round(value, 2) if last == names.VAR else value
 
 
 def _profile(tables: ResultTables, folder: RunFolder) -> list[Any]:

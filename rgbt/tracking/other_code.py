@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.formats import read_provenance
 from rgbt.tracking.provenance import code
 from rgbt.tracking.terminal import tell
 
 COMMIT_LENGTH = 7
 
 
-def other_code(folder: RunFolder) -> str | None:
+def other_code(folder: Path) -> str | None:
     """What made a run, if it was other code than that of this process; None if it was the same.
 
     Compared is the digest of the package's source, so that changed documents and tests are no
@@ -29,13 +30,13 @@ def other_code(folder: RunFolder) -> str | None:
         such as "commit abc1234 of 2026-11-20, now def5678 with uncommitted changes".
     """
     now = code()
-    for entry in _contributing(folder.provenance()):
+    for entry in _contributing(read_provenance(folder / "provenance.json")):
         if _differs(entry, _diff(folder, entry), now):
             return f"{_version(entry)} of {str(entry.get('started'))[:10]}, now {_now(entry, now)}"
     return None
 
 
-def warn_of_result(folder: RunFolder) -> None:
+def warn_of_result(folder: Path) -> None:
     """Say so where a finished run was made by other code."""
     made_by = other_code(folder)
     if made_by is not None:
@@ -45,13 +46,13 @@ def warn_of_result(folder: RunFolder) -> None:
         )
 
 
-def warn_of_steps(folder: RunFolder, step: int) -> None:
+def warn_of_steps(folder: Path, step: int) -> None:
     """Say so where a run that resumes at a step was trained by other code before."""
     made_by = other_code(folder)
     if made_by is not None:
         tell(
             f"warning: the first {step} steps were trained by other code ({made_by}); to train all "
-            f"steps by the present code, remove {folder.path} and rerun the command."
+            f"steps by the present code, remove {folder} and rerun the command."
         )
 
 
@@ -79,11 +80,11 @@ def _differs(entry: Mapping[str, Any], diff: str | None, now: Mapping[str, Any])
     return bool(entry["git_commit"] != now["git_commit"] or is_other_diff)
 
 
-def _diff(folder: RunFolder, entry: Mapping[str, Any]) -> str | None:
+def _diff(folder: Path, entry: Mapping[str, Any]) -> str | None:
     """Uncommitted changes of an entry; None where the folder does not hold them."""
     if not entry.get("diff"):
         return ""
-    path = folder.path / str(entry["diff"])
+    path = folder / str(entry["diff"])
     return path.read_text() if path.is_file() else None
 
 

@@ -22,7 +22,6 @@ from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
 from rgbt.files.atomic import is_held
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.terminal import tell
 from rgbt.training.train import train
@@ -81,7 +80,7 @@ def _warn_of_other_code(run: RunSpec) -> None:
     """Name the finished upstream runs that other code made: fresh=true does not repeat them."""
     for dependency in run.dependencies:
         spec = dependency.run
-        made_by = other_code(RunFolder(spec.folder)) if spec.is_finished else None
+        made_by = other_code(spec.folder) if spec.is_finished else None
         if made_by is not None:
             tell(
                 f"warning: the upstream run {spec.folder} ({dependency.key}) was made by other "

@@ -72,7 +72,7 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         folder = RunFolder(spec.folder)
         folder.clean()
         _show_again(folder, tracking, description)
-        warn_of_result(folder)
+        warn_of_result(folder.path)
         _warn_of_other_files(folder, spec)
         _warn_of_missing_consistency(folder, spec.consistency.build())
     else:
@@ -231,7 +231,7 @@ class Run:
                 tell(trainer.checkpoints.warning)
             tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
         self.folder.begin_at(state.step)
-        warn_of_steps(self.folder, state.step)
+        warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)

@@ -1,1 +1,1 @@
-"""A scored table for people: terminal, Markdown, CSV, LaTeX, figure."""
+"""Formats of a scored table: terminal, Markdown, CSV, LaTeX, figure."""

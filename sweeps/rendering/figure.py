@@ -96,8 +96,8 @@ def _over_factor(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
     figure = Figure(figsize=(7.5, 1.2 + 2.4 * len(columns)), layout="constrained")
     panels = figure.subplots(len(columns), 1, sharex=True, squeeze=False)[:, 0]
     for axes, column in zip(panels, columns, strict=True):
-        places = [row.x or 0.0 for row in rows]
-        ours, theirs = _series(scored, [(row, column) for row in rows], places, places)
+        positions = [row.x or 0.0 for row in rows]
+        ours, theirs = _series(scored, [(row, column) for row in rows], positions, positions)
         lower, upper = draw_pair(axes, ours, theirs, across=False, joined=True)
         axes.set_ylabel(column.name)
         for row in scored.table.rows:
@@ -130,9 +130,9 @@ def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
     figure = Figure(figsize=(max(size[0], 6.4), size[1]), layout="constrained")
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
-        places = [float(index) for index in range(len(rows))]
-        beside = [place + SHIFT for place in places]
-        ours, theirs = _series(scored, [(row, column) for row in rows], places, beside)
+        positions = [float(index) for index in range(len(rows))]
+        beside = [position + SHIFT for position in positions]
+        ours, theirs = _series(scored, [(row, column) for row in rows], positions, beside)
         draw_pair(axes, ours, theirs, across=True, joined=False)
         axes.set_xlabel(column.name)
         axes.grid(axis="y", alpha=0.25)
@@ -153,12 +153,12 @@ def _profiles(scored: ScoredTable) -> Figure:
     figure = Figure(figsize=(0.6 + width * abreast, 1 + 2.1 * height), layout="constrained")
     panels = figure.subplots(height, abreast, sharex=True, squeeze=False).ravel()
     for axes, row in zip(panels, rows, strict=False):
-        places = [float(index) for index in range(len(columns))]
+        positions = [float(index) for index in range(len(columns))]
         pairs = [(row, column) for column in columns]
-        draw_pair(axes, *_series(scored, pairs, places, places), across=False, joined=True)
+        draw_pair(axes, *_series(scored, pairs, positions, positions), across=False, joined=True)
         axes.set_title(row.label, fontsize=9)
         rotation = 0 if max(len(column.name) for column in columns) <= 2 else 90
-        axes.set_xticks(places, [column.name for column in columns], rotation=rotation)
+        axes.set_xticks(positions, [column.name for column in columns], rotation=rotation)
         axes.tick_params(labelsize=7)
     for axes in panels[len(rows) :]:
         axes.set_visible(False)

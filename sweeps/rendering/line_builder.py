@@ -7,16 +7,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rgbt.tracking.tables import number
-from sweeps.rendering.text_cell import Footnotes, TableLine, Text
+from sweeps.rendering.text_cell import Footnotes, TableLine, TextCell
 from sweeps.table.cells import NO_VALUE, TableCell, is_counted, is_of_runs, metric_of
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
-BESIDE = 3
-"""Columns up to which ours, published and difference stand beside each other; else below."""
+MAX_ON_ONE_LINE = 3
+"""Most columns with ours, published and difference on one line; more columns use several lines."""
 
 WITH_SD = 12
-"""Columns up to which the standard deviation stands behind its mean; else on a line of its own."""
+"""Most columns with the standard deviation behind its mean; with more it has its own line."""
 
 BESIDE_OURS = ("published", "difference")
 """Header of the columns that belong to the one before."""
@@ -45,9 +45,9 @@ class LineBuilder:
         return max((len(each.rstrip("0")) for each in digits), default=2)
 
     @property
-    def beside(self) -> bool:
+    def on_one_line(self) -> bool:
         """Whether a row is one line."""
-        return len(self.columns) <= BESIDE
+        return len(self.columns) <= MAX_ON_ONE_LINE
 
     @property
     def sd_apart(self) -> bool:
@@ -55,21 +55,21 @@ class LineBuilder:
         spread = any(cell.seeds > 1 for cell in self.scored.cells.values())
         return len(self.columns) > WITH_SD and spread
 
-    def header(self, columns: Sequence[Text]) -> tuple[Text, ...]:
+    def header(self, columns: Sequence[TextCell]) -> tuple[TextCell, ...]:
         """Above the fields of a line, from the names of the columns."""
-        if not self.beside:
-            return (Text(), Text("seeds"), *columns)
-        words = tuple(map(Text, BESIDE_OURS))
+        if not self.on_one_line:
+            return (TextCell(), TextCell("seeds"), *columns)
+        words = tuple(map(TextCell, BESIDE_OURS))
         named = zip(self.columns, columns, strict=True)
-        beside = [(text, *(words if column.printed else ())) for column, text in named]
-        return (Text("seeds"), *(text for texts in beside for text in texts))
+        pairs = [(text, *(words if column.printed else ())) for column, text in named]
+        return (TextCell("seeds"), *(text for texts in pairs for text in texts))
 
     def row(self, row: Row) -> list[TableLine]:
-        """The lines of one row: all in one where they fit beside each other."""
+        """The lines of one row: a single one for few columns."""
         printed = [column for column in self.columns if published(row, column) is not None]
         runs = any((row.label, column.name) in self.scored.cells for column in self.columns)
-        label = Text(row.label, notes=self.notes(*self._label_notes(row)))
-        kinds: dict[str, Callable[[Row, Column], Text]] = {}
+        label = TextCell(row.label, notes=self.notes(*self._label_notes(row)))
+        kinds: dict[str, Callable[[Row, Column], TextCell]] = {}
         if runs:
             kinds["ours"] = self._ours
         if runs and self.sd_apart:
@@ -78,15 +78,15 @@ class LineBuilder:
             kinds["published"] = self._published
         if any(not math.isnan(self.scored.difference(row, column)) for column in self.columns):
             kinds["difference"] = self._difference
-        if self.beside:
+        if self.on_one_line:
             return [TableLine("all", label, (self._seeds(row), *self._triples(row)))]
         lines: list[TableLine] = []
         for kind, text in kinds.items():
             word = "± sd" if kind == "sd" else kind
-            seeds = self._seeds(row) if kind == "ours" else Text()
+            seeds = self._seeds(row) if kind == "ours" else TextCell()
             texts = (text(row, column) for column in self.columns)
             lines.append(
-                TableLine(kind, label if not lines else Text(), (Text(word), seeds, *texts))
+                TableLine(kind, label if not lines else TextCell(), (TextCell(word), seeds, *texts))
             )
         return lines
 
@@ -95,28 +95,30 @@ class LineBuilder:
         orders = [self.scored.orders[column.name] for column in self.columns]
         if not any(order.rows for order in orders):
             return []
-        rhos = [Text(_signed(order.rho)) for order in orders]
-        rows = [Text(str(order.rows)) for order in orders]
-        if self.beside:
+        rhos = [TextCell(_signed(order.rho)) for order in orders]
+        rows = [TextCell(str(order.rows)) for order in orders]
+        if self.on_one_line:
             apart = [self._apart(texts) for texts in (rhos, rows)]
-            labels = Text("order of rows: rho"), Text("n")
+            labels = TextCell("order of rows: rho"), TextCell("n")
             pairs = zip(labels, apart, strict=True)
-            return [TableLine("order", label, (Text(), *texts)) for label, texts in pairs]
+            return [TableLine("order", label, (TextCell(), *texts)) for label, texts in pairs]
         return [
-            TableLine("order", Text("order of rows"), (Text("rho"), Text(), *rhos)),
-            TableLine("order", Text(), (Text("n"), Text(), *rows)),
+            TableLine("order", TextCell("order of rows"), (TextCell("rho"), TextCell(), *rhos)),
+            TableLine("order", TextCell(), (TextCell("n"), TextCell(), *rows)),
         ]
 
-    def _apart(self, texts: Sequence[Text]) -> list[Text]:
+    def _apart(self, texts: Sequence[TextCell]) -> list[TextCell]:
         """A text per column, with room for what is published of it."""
         pairs = zip(self.columns, texts, strict=True)
-        apart = [(text, Text(), Text()) if column.printed else (text,) for column, text in pairs]
+        apart = [
+            (text, TextCell(), TextCell()) if column.printed else (text,) for column, text in pairs
+        ]
         return [text for each in apart for text in each]
 
-    def _triples(self, row: Row) -> list[Text]:
+    def _triples(self, row: Row) -> list[TextCell]:
         """Ours, published and difference of every column; ours alone where it is not printed."""
-        beside = (self._published, self._difference)
-        kinds = [(self._ours, *(beside if column.printed else ())) for column in self.columns]
+        others = (self._published, self._difference)
+        kinds = [(self._ours, *(others if column.printed else ())) for column in self.columns]
         pairs = zip(self.columns, kinds, strict=True)
         return [kind(row, column) for column, each in pairs for kind in each]
 
@@ -125,7 +127,7 @@ class LineBuilder:
         return [*needs, *self._same_runs(row), *(row.remarks if not row.doubtful else ())]
 
     def _same_runs(self, row: Row) -> list[str]:
-        """That the row is another one again: at scale=demo networks of all sizes are one."""
+        """A note on an equal row: at scale=demo networks of all sizes are one."""
         counted = list(filter(is_counted, self.columns))
         for other in self.scored.table.rows:
             if other.label == row.label:
@@ -140,41 +142,41 @@ class LineBuilder:
         cells = (self.scored.cells.get((row.label, column.name)) for column in self.columns)
         return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
 
-    def _seeds(self, row: Row) -> Text:
+    def _seeds(self, row: Row) -> TextCell:
         """How many seeds the row's values are means of."""
         columns = filter(is_of_runs, self.columns)
         cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
         there = [cell.seeds for cell in cells if cell is not None]
         counts = sorted({seeds for seeds in there if seeds} or set(there))
-        return Text("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
+        return TextCell("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
 
-    def _ours(self, row: Row, column: Column) -> Text:
-        place = (row.label, column.name)
-        cell = self.scored.cells.get(place)
+    def _ours(self, row: Row, column: Column) -> TextCell:
+        cell_id = (row.label, column.name)
+        cell = self.scored.cells.get(cell_id)
         if cell is None:
-            return Text(DASH)
+            return TextCell(DASH)
         notes = self.notes(cell.reason and _sentence(cell))
         if math.isnan(cell.mean):
-            return Text(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
+            return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
         spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
-        rank = self.scored.ranks_ours.get(place, 0)
-        return Text(f"{cell.mean:.2f}", spread, rank, notes)
+        rank = self.scored.ranks_ours.get(cell_id, 0)
+        return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
 
-    def _sd(self, row: Row, column: Column) -> Text:
+    def _sd(self, row: Row, column: Column) -> TextCell:
         cell = self.scored.cells.get((row.label, column.name))
-        return Text(DASH if cell is None else number(cell.sd))
+        return TextCell(DASH if cell is None else number(cell.sd))
 
-    def _published(self, row: Row, column: Column) -> Text:
+    def _published(self, row: Row, column: Column) -> TextCell:
         printed = published(row, column)
         if printed is None:
-            return Text(DASH)
+            return TextCell(DASH)
         doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
         rank = self.scored.ranks_published.get((row.label, column.name), 0)
         notes = self.notes(*doubts)
-        return Text(f"{printed:.{self.decimals}f}", rank=rank, notes=notes)
+        return TextCell(f"{printed:.{self.decimals}f}", rank=rank, notes=notes)
 
-    def _difference(self, row: Row, column: Column) -> Text:
-        return Text(_signed(self.scored.difference(row, column)))
+    def _difference(self, row: Row, column: Column) -> TextCell:
+        return TextCell(_signed(self.scored.difference(row, column)))
 
 
 def _sentence(cell: TableCell) -> str:

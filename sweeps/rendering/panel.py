@@ -1,4 +1,4 @@
-"""How one panel of a table's figure is drawn: our values and the published ones."""
+"""One panel of a table's figure: our values and the published ones."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Series:
     """Values along an axis; NaN: there is none.
 
     Attributes:
-        places: where they stand.
+        positions: along the axis.
         means: values.
         sds: half lengths of the error bars; NaN: none.
     """
 
-    places: tuple[float, ...]
+    positions: tuple[float, ...]
     means: tuple[float, ...]
     sds: tuple[float, ...]
 
@@ -74,9 +74,9 @@ def draw_pair(
     for target, series, colour, label, face in named:
         if not series.known():
             continue
-        values, places = series.means, series.places
+        values, positions = series.means, series.positions
         bars = None if all(map(math.isnan, series.sds)) else series.sds
-        x, y = (values, places) if across else (places, values)
+        x, y = (values, positions) if across else (positions, values)
         xerr, yerr = (bars, None) if across else (None, bars)
         marker = style | {"ls": line, "color": colour, "mfc": face, "label": label}
         target.errorbar(x, y, yerr, xerr, **marker)

@@ -1,1 +1,1 @@
-"""What a study has found: tables, figures, and records in MLflow."""
+"""Report of a study: tables, figures, and records in MLflow."""

@@ -1,4 +1,4 @@
-"""Axes of the figures of a study: parameters of any kind as numbers, places and few clear ticks."""
+"""Axes of the figures of a study: parameters of any kind as numbers, positions and few ticks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Dimension:
 
     Attributes:
         name: of the parameter or objective.
-        values: by trial; a category is its place among the categories; NaN: the trial has none.
+        values: by trial; a category is its index; NaN: the trial has none.
         is_log: whether it is searched on a logarithmic scale.
         categories: their names; (): the values are numbers.
         is_integer: whether there is nothing between whole numbers.
@@ -45,14 +45,14 @@ class Dimension:
     categories: tuple[str, ...] = ()
     is_integer: bool = False
 
-    def places(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def positions(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Values scaled to 0..1; 0.5 where all are one; NaN where the trial has none."""
         low, high = self._ends()
         scaled = self._scaled(np.asarray(self.values, np.float64))
         return np.full_like(scaled, 0.5) if high == low else (scaled - low) / (high - low)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """(place in 0..1, text) of a few values."""
+        """(position in 0..1, text) of a few values."""
         from matplotlib.ticker import MaxNLocator
 
         low, high = self._ends()
@@ -69,10 +69,10 @@ class Dimension:
             values = log_locator(high - low).tick_values(10**low, 10**high)
         else:
             values = MaxNLocator(5, integer=self.is_integer).tick_values(low, high)
-        places = (self._scaled(np.asarray(values, np.float64)) - low) / (high - low)
+        positions = (self._scaled(np.asarray(values, np.float64)) - low) / (high - low)
         return [
             (float(p), f"{v:.3g}")
-            for p, v in zip(places, values, strict=True)
+            for p, v in zip(positions, values, strict=True)
             if -0.01 <= p <= 1.01
         ]
 
@@ -94,11 +94,11 @@ def dimension(data: StudyData, name: str) -> Dimension:
         found = (float(trial.params.get(name, math.nan)) for trial in data.complete)
         is_log, is_integer = bool(getattr(distribution, "log", False)), _is_integer(distribution)
         return Dimension(name, tuple(found), is_log=is_log, is_integer=is_integer)
-    places = [
+    positions = [
         float(choices.index(trial.params[name])) if name in trial.params else math.nan
         for trial in data.complete
     ]
-    return Dimension(name, tuple(places), categories=tuple(map(data.shown, choices)))
+    return Dimension(name, tuple(positions), categories=tuple(map(data.shown, choices)))
 
 
 def _is_integer(distribution: BaseDistribution) -> bool:
@@ -149,10 +149,12 @@ def log_locator(decades: float) -> Any:
     return LogLocator(subs=subs, numticks=7)
 
 
-def vertical_axis(axis: Axes, place: int, ticks: Sequence[tuple[float, str]]) -> None:
+def vertical_axis(axis: Axes, position: int, ticks: Sequence[tuple[float, str]]) -> None:
     """One of the parallel coordinates; `ticks` as of `Dimension.ticks`."""
-    axis.axvline(place, 0.0, 1.0, color="#555555", linewidth=0.8, zorder=3)
+    axis.axvline(position, 0.0, 1.0, color="#555555", linewidth=0.8, zorder=3)
     box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.8}
     for height, text in ticks:
-        axis.plot([place, place + 0.03], [height, height], color="#555555", linewidth=0.8, zorder=3)
-        axis.text(place + 0.05, height, text, va="center", fontsize=8, bbox=box, zorder=4)
+        axis.plot(
+            [position, position + 0.03], [height, height], color="#555555", linewidth=0.8, zorder=3
+        )
+        axis.text(position + 0.05, height, text, va="center", fontsize=8, bbox=box, zorder=4)

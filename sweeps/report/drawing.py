@@ -74,19 +74,19 @@ def _mark_ends(axis: Axes, data: StudyData) -> None:
             axis.plot(numbers, [0.03] * len(numbers), marker, **style)
 
 
-def importance_bars(data: StudyData, found: Importances) -> Figure:
+def importance_bars(data: StudyData, importances: Importances) -> Figure:
     """Share of every parameter, a bar for each objective."""
-    names = list(found.shares)
+    names = list(importances.shares)
     count = len(data.metrics)
     figure = new_figure(8.0, 1.3 + (0.22 + 0.2 * count) * len(names))
     axis = figure.subplots()
     height = 0.8 / count
     for index, metric in enumerate(data.metrics):
-        places = np.arange(len(names)) + (index - (count - 1) / 2) * height
-        shares = [found.shares[name][index] for name in names]
+        positions = np.arange(len(names)) + (index - (count - 1) / 2) * height
+        shares = [importances.shares[name][index] for name in names]
         known = [0.0 if math.isnan(share) else share for share in shares]
         colour = COLOURS[index % len(COLOURS)]
-        bars = axis.barh(places, known, 0.92 * height, color=colour, label=f"for {metric}")
+        bars = axis.barh(positions, known, 0.92 * height, color=colour, label=f"for {metric}")
         texts = ["-" if math.isnan(share) else f"{share:.0%}" for share in shares]
         axis.bar_label(bars, texts, padding=3, fontsize=8)
     axis.set_yticks(range(len(names)), names)
@@ -111,15 +111,15 @@ def parallel(data: StudyData) -> Figure:
     width = max(1.5, 0.4 + 0.08 * max(map(len, texts)))
     figure = new_figure(max(7.0, width * len(dimensions)), 5.0)
     axis = figure.subplots()
-    heights = np.array([item.places() for item in dimensions])
+    heights = np.array([item.positions() for item in dimensions])
     has_missing = bool(np.isnan(heights).any())
     heights = np.where(np.isnan(heights), MISSING, heights)
     colours, mappable = _by_first_objective(data)
     # The best last, so that they lie on top.
     for index in sorted(range(len(data.complete)), key=lambda i: data.rank(data.complete[i]))[::-1]:
         axis.plot(heights[:, index], color=colours[index], linewidth=1.1, alpha=0.75)
-    for place, item in enumerate(dimensions):
-        vertical_axis(axis, place, item.ticks())
+    for position, item in enumerate(dimensions):
+        vertical_axis(axis, position, item.ticks())
     if has_missing:
         axis.text(-0.08, MISSING, "not set", ha="right", va="center", fontsize=8, color="#555555")
     logs = ["\n(log)" if item.is_log else "" for item in dimensions]
@@ -218,9 +218,9 @@ def _number_points(axis: Axes, trials: Sequence[FrozenTrial], x: int, y: int) ->
     taken: list[Any] = []
     for trial in trials:
         point = (trial.values[x], trial.values[y])
-        place = axis.transData.transform(point)
-        if all(np.hypot(*(place - other)) >= APART for other in taken):
-            taken.append(place)
+        position = axis.transData.transform(point)
+        if all(np.hypot(*(position - other)) >= APART for other in taken):
+            taken.append(position)
             axis.annotate(str(trial.number), point, (5, 4), textcoords="offset points", fontsize=8)
 
 

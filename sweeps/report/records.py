@@ -1,4 +1,4 @@
-"""Finished tables and studies in MLflow: a run of its own that holds their files."""
+"""Tables and studies in MLflow: one run each, which holds their files."""
 
 from __future__ import annotations
 
@@ -37,30 +37,36 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
     tags: Mapping[str, str],
     note: str,
 ) -> list[Link]:
-    """Put a table or a study into MLflow; one that is there already is brought up to date.
+    """Write a table or a study to MLflow, or update it there.
 
-    A store that cannot be used costs a line on stderr.
+    An unreachable store is a warning only.
 
     Args:
         tracking: as the configuration builds it; nothing is done without MLflow.
-        name: what it is found by, e.g. "spatialseg/table3 demo".
+        name: its identifier, e.g. "spatialseg/table3 demo".
         kind: tag of the run.
-        files: artifacts; a name that is there already is replaced.
+        files: artifacts; one of the same name is replaced.
         metrics: numbers; those that are not finite are left out, letters that MLflow refuses in a
             name become "_".
         tags: more tags.
         note: description of the run, in Markdown.
 
     Returns:
-        where a person sees it.
+        links to it.
     """
     if not isinstance(tracking, MlflowTracking):
         return []
     every = {"kind": kind, RECORD: name, "mlflow.note.content": _cut(note), **tags}
     try:
+        from mlflow.entities import RunTag
+
         store = tracking.store()
         run_id = _run(store, name)
-        store.client.log_batch(run_id, metrics=_metrics(metrics), tags=_tags(every))
+        store.client.log_batch(
+            run_id,
+            metrics=_metrics(metrics),
+            tags=[RunTag(key, value) for key, value in every.items()],
+        )
         for path in files:
             store.client.log_artifact(run_id, str(path))
         store.client.set_terminated(run_id)
@@ -68,7 +74,7 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
         reason = (str(error).splitlines() or [""])[0][:120]
         tell(
             f"the {kind} was not sent to MLflow ({type(error).__name__}: "
-            f"{without_passwords(reason)}); the same command sends it later."
+            f"{without_passwords(reason)}); rerun the command to send it."
         )
         return []
     shown = pages_of(tracking.uri, run_id)
@@ -77,17 +83,17 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
 
 
 def _run(store: Store, name: str) -> str:
-    """The run that holds `name`, made where there is none."""
-    found = _oldest(store, name)
-    if found is not None:
-        return found
-    # Tagged in the same call: a run that nothing finds would stay as running for ever.
+    """The run of `name`, created if it does not exist."""
+    existing = _oldest(store, name)
+    if existing is not None:
+        return existing
+    # Tagged in the same call: a run without the tag would never be found again.
     tags = {RECORD: name}
-    made = store.client.create_run(store.experiment_id, run_name=name, tags=tags).info.run_id
-    # Another driver of the same table may have ended at this moment: both keep the older run.
-    kept = _oldest(store, name) or made
-    if kept != made:
-        store.client.delete_run(made)
+    created = store.client.create_run(store.experiment_id, run_name=name, tags=tags).info.run_id
+    # Another driver of the same table may end at this moment: both keep the older run.
+    kept = _oldest(store, name) or created
+    if kept != created:
+        store.client.delete_run(created)
     return kept
 
 
@@ -109,14 +115,8 @@ def _metrics(metrics: Mapping[str, float]) -> list[Any]:
     return [Metric(n, value, now, 0) for n, value in named.items() if math.isfinite(value)]
 
 
-def _tags(tags: Mapping[str, str]) -> list[Any]:
-    from mlflow.entities import RunTag
-
-    return [RunTag(name, value) for name, value in tags.items()]
-
-
 def _cut(note: str) -> str:
-    """The note as far as whole lines fit."""
+    """The note, cut at the end of a line where it is too long."""
     if len(note) <= NOTE_LENGTH:
         return note
     more = "\n\n(the rest is in the artifacts)\n"

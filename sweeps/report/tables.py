@@ -9,7 +9,7 @@ from rgbt.metrics import names as metric_names
 from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps import attributes
-from sweeps.report.study_data import Importances, StudyData, pruning, short_names
+from sweeps.report.study_data import Importances, StudyData, pruning_savings, short_names
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -33,19 +33,19 @@ WORDS = {
     "RUNNING": "running",
     "WAITING": "waiting",
 }
-"""Optuna's states as people are told them."""
+"""Optuna's states as shown."""
 
 
 def tables(data: StudyData, shares: Importances) -> list[Grid]:
     """What the terminal and the Markdown file show, in order; empty tables are left out."""
-    found = [counts_grid(data), trials_grid(data), failed_grid(data), importance_grid(data, shares)]
-    return [grid for grid in found if grid.rows]
+    grids = [counts_grid(data), trials_grid(data), failed_grid(data), importance_grid(data, shares)]
+    return [grid for grid in grids if grid.rows]
 
 
 def counts_grid(data: StudyData) -> Grid:
     """Number of trials by state, and the share of training steps that pruning saved."""
     counts = data.counts()
-    saved = pruning(data)
+    saved = pruning_savings(data)
     header = ["trials", *WORDS.values()]
     row = [str(sum(counts.values())), *(str(counts[state]) for state in WORDS)]
     if saved is not None and saved.trials:
@@ -55,13 +55,13 @@ def counts_grid(data: StudyData) -> Grid:
 
 
 def trials_grid(data: StudyData) -> Grid:
-    """The trials that a person wants to see.
+    """The most important trials.
 
     Of a search the best `TOP` by the objective, or the Pareto front of several; of a grid or list
     the points in their order.
     """
     if data.kind != "search":
-        points = data.standing
+        points = data.latest
         rest = len(points) - POINTS
         more = f" (the first {POINTS}; {rest} more in trials.csv)" if rest > 0 else ""
         return _grid(data, f"Points{more}", points[:POINTS], with_label=True)
@@ -75,8 +75,8 @@ def trials_grid(data: StudyData) -> Grid:
 
 
 def failed_grid(data: StudyData) -> Grid:
-    """Failed trials with their reasons; not those whose point a later trial stands for."""
-    failed = [trial for trial in data.standing if trial.state.name == "FAIL"]
+    """Failed trials with their reasons; without those that were retried."""
+    failed = [trial for trial in data.latest if trial.state.name == "FAIL"]
     again = data.counts()["FAIL"] - len(failed)
     title = "Failed trials" + (f" ({again} more were tried again)" if again else "")
     rows = [
@@ -124,7 +124,7 @@ def markdown_table(grid: Grid) -> str:
 
 
 def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_label: bool) -> Grid:
-    """Trials with what they are, val and test scores beside each other, and their runs."""
+    """Trials with their parameters or labels, val and test scores side by side, and their runs."""
     names = [] if with_label else list(data.distributions)
     short = short_names(data.distributions)
     scores = _shown_scores(data, trials)
@@ -150,21 +150,21 @@ def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_la
 def _scores(data: StudyData, trial: FrozenTrial) -> dict[str, float]:
     """Objectives and other scores of a trial by name, in percent (Var as it is)."""
     values = trial.values or ()
-    told = dict(zip(data.metrics, values, strict=True)) if values else {}
+    objectives = dict(zip(data.metrics, values, strict=True)) if values else {}
     results = dict(trial.user_attrs.get(attributes.RESULTS) or {})
-    return {**{name: score for name, score in results.items() if score is not None}, **told}
+    return {**{name: score for name, score in results.items() if score is not None}, **objectives}
 
 
 def _score_names(data: StudyData, trials: Sequence[FrozenTrial]) -> list[str]:
     """Objectives first, then every other score that some trial has."""
-    found = dict.fromkeys(data.metrics)
+    names = dict.fromkeys(data.metrics)
     for trial in trials:
-        found |= dict.fromkeys(_scores(data, trial))
-    return list(found)
+        names |= dict.fromkeys(_scores(data, trial))
+    return list(names)
 
 
 def _shown_scores(data: StudyData, trials: Sequence[FrozenTrial]) -> list[str]:
-    """Objectives and the scores of `ALWAYS`, each of the validation beside that of the test."""
+    """Objectives and the scores of `ALWAYS`, validation and test side by side."""
     known = _score_names(data, trials)
     ends = [metric.removeprefix("val/").removeprefix("test/") for metric in data.metrics]
     stems = dict.fromkeys([*ends, *ALWAYS])

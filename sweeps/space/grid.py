@@ -1,4 +1,4 @@
-"""Points that a command line or a file names one by one: grids and lists."""
+"""Points of a grid or a list, from a command line or a file."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ class GridPoint:
     """One point of a grid or a list.
 
     Attributes:
-        params: what is particular to it: key -> value as Hydra reads it, lists and mappings as
-            they were typed.
+        params: varied keys -> values as Hydra reads them, lists and mappings as they were typed.
         overrides: all that make it, the fixed ones first.
     """
 
@@ -38,10 +37,10 @@ class GridPoint:
 def split(
     overrides: Iterable[str], config_loader: ConfigLoader
 ) -> tuple[tuple[str, ...], SweptValues, dict[str, dict[str, Any]]]:
-    """Sort the overrides of ``-m`` by what they say: one value, several, or a range.
+    """Split the overrides of ``-m`` into single values, lists of values, and ranges.
 
-    As with Hydra's own sweeper a key that comes twice counts where it came first, with what it
-    said last.
+    Like in Hydra's own sweeper, a repeated key keeps its first position and its last
+    value.
 
     Args:
         overrides: as typed, e.g. ``["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1"]``.
@@ -76,16 +75,16 @@ def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
 
 
 def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[GridPoint]:
-    """Points that are written out, so that values go in pairs (Hydra's issue 3082).
+    """Points written out one by one, so that values vary together (Hydra's issue 3082).
 
     Args:
         points: the overrides of each.
-        fixed: overrides of every point; where a point says the same key, the point's counts.
+        fixed: overrides of every point; a point's own override of the same key has priority.
 
     Raises:
         InputError: a point without overrides, or one that is a sweep itself.
     """
-    found = []
+    result = []
     for own in points:
         parsed = _parsed(own)
         sweeps = [_typed(one) for one in parsed if one.is_sweep_override()]
@@ -98,14 +97,14 @@ def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[G
             raise InputError("points: a point needs at least one override; take out the empty one.")
         taken = {_bare(one) for one in parsed}
         others = [_typed(one) for one in _parsed(fixed) if _bare(one) not in taken]
-        found.append(_point(others, own))
-    return found
+        result.append(_point(others, own))
+    return result
 
 
 def distributions(points: Sequence[GridPoint]) -> dict[str, BaseDistribution]:
-    """What Optuna is told of the parameters of a grid or a list, so that it can draw them.
+    """Distributions of the parameters of a grid or a list, for Optuna's figures.
 
-    Numbers are ranges, which Optuna lets grow in a study; other choices it does not.
+    Numbers are ranges, which may grow in a study; other choices may not.
     """
     values: dict[str, list[Value]] = {}
     for key, value in (pair for point in points for pair in point.params.items()):

@@ -1,4 +1,4 @@
-"""A search whose ranges come from a file and from the command line, which wins."""
+"""Merges the ranges of a search file with the command line, which has priority."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def merge_space(
     swept: SweptValues,
     intervals: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Parameter, ...]:
-    """What is searched, the command line having the last word on every key.
+    """The parameters of a search; the command line has priority for every key.
 
     Args:
         space: as in ``conf/search``.
@@ -53,7 +53,9 @@ def _without(space: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, An
         when = entry.get("when") or {}
         # What is gone without being fixed was ruled out itself.
         impossible = any(other not in left and other not in fixed for other in when)
-        unmet = any(fixed[other] not in _listed(when[other]) for other in when if other in fixed)
+        unmet = any(
+            fixed[other] not in _alternatives(when[other]) for other in when if other in fixed
+        )
         if key in fixed or impossible or unmet:
             continue
         open_conditions = {other: wanted for other, wanted in when.items() if other not in fixed}
@@ -61,5 +63,5 @@ def _without(space: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, An
     return left
 
 
-def _listed(wanted: Any) -> Iterable[Any]:
+def _alternatives(wanted: Any) -> Iterable[Any]:
     return wanted if isinstance(wanted, list | tuple) else [wanted]

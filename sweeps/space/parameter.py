@@ -1,4 +1,4 @@
-"""One entry of a search space: what it may hold, and what is said when it holds something else."""
+"""One parameter of a search space, read from its entry in a file and checked."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Parameter:
     when: tuple[tuple[str, tuple[Choice, ...]], ...] = ()
 
     def __str__(self) -> str:
-        """For a person: "masker.sigma_div: 0.5 to 32, logarithmic"."""
+        """As shown: "masker.sigma_div: 0.5 to 32, logarithmic"."""
         words = ["one of " + " ".join(map(str, self.choices))] if self.choices else self._range()
         words += [f"when {key} is {' or '.join(map(str, wanted))}" for key, wanted in self.when]
         return f"{self.key}: {', '.join(words)}"
@@ -70,7 +70,7 @@ def read_parameter(key: str, entry: Any, earlier: Mapping[str, Parameter]) -> Pa
         InputError: the first mistake.
     """
     if not _is_key(key):
-        raise _wrong(key, "expected a key as it stands before the = of an override")
+        raise _wrong(key, "expected a key such as masker.sigma_div")
     if not isinstance(entry, Mapping):
         raise _wrong(
             key, f"expected a mapping such as {{type: float, low: 0, high: 1}}, got {entry!r}"
@@ -162,7 +162,7 @@ def _conditions(
     given = entry.get("when") or {}
     if not isinstance(given, Mapping):
         raise _wrong(key, f"when must be a mapping such as {{loss: set_criterion}}, got {given!r}")
-    found = []
+    conditions = []
     for other, wanted in given.items():
         if other not in earlier:
             raise _wrong(
@@ -172,8 +172,8 @@ def _conditions(
         values = tuple(_choice(key, item) for item in alternatives)
         for value in values:
             _check_possible(key, earlier[other], value)
-        found.append((str(other), values))
-    return tuple(found)
+        conditions.append((str(other), values))
+    return tuple(conditions)
 
 
 def _check_possible(key: str, other: Parameter, value: Choice) -> None:

@@ -36,7 +36,7 @@ class PerTrialSampler(BaseSampler):
         return f"{self.make(0)} per trial"
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        """Begin a trial, also one that another process began and this one goes on with."""
+        """Begin a trial, also one that another process began and this one resumes."""
         inner = self.make(trial_seed(self.seed, trial.number))
         with self._lock:
             self._inner[trial.number] = inner

@@ -1,6 +1,6 @@
-"""Who chooses the next point of a search, and which trials are not worth going on with.
+"""Samplers and pruners of a search.
 
-Options are those of Optuna's constructors, as far as a file can say them.
+Options are those of Optuna's constructors, as far as a YAML file can hold them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SAMPLERS = {
     "nsga2": "NSGAIISampler",
     "cmaes": "CmaEsSampler",
 }
-"""Samplers whose memory is the storage: the others (QMC, grid, brute force) count for themselves,
-which neither several drivers nor a search that is resumed can share. nsga2 crosses earlier points
+"""Samplers without state outside the storage: the others (QMC, grid, brute force) keep a counter,
+which neither several drivers nor a resumed search can share. nsga2 crosses earlier points
 and may propose one of them again."""
 
 PRUNERS = {
@@ -49,7 +49,7 @@ PLAIN: dict[str, Any] = {
     "bool | None": bool | None,
     "str | int": str | int,
 }
-"""Annotations of options that a file can say."""
+"""Types of options that a YAML file can hold."""
 
 NOT_OPTIONS = (
     "seed",
@@ -88,7 +88,7 @@ def build_sampler(
         sampler: optuna.samplers.BaseSampler = make(**checked, seed=trial_seed)
         return sampler
 
-    _told("sampler", kind, partial(seeded, 0))
+    _construct("sampler", kind, partial(seeded, 0))
     return PerTrialSampler(seeded, seed)
 
 
@@ -116,7 +116,7 @@ def build_pruner(kind: str, options: Mapping[str, Any], objectives: int = 1) -> 
     make = getattr(optuna.pruners, PRUNERS[kind])
     fixed = {"wrapped_pruner": None} if kind == "patient" else {}
     checked = _options("pruner", kind, make, options)
-    pruner: BasePruner = _told("pruner", kind, partial(make, **fixed, **checked))
+    pruner: BasePruner = _construct("pruner", kind, partial(make, **fixed, **checked))
     return pruner
 
 
@@ -157,8 +157,8 @@ def _annotation(parameter: inspect.Parameter) -> str:
     return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
 
 
-def _told(what: str, kind: str, make: partial[Any]) -> Any:
-    """What `make` makes; values that Optuna itself refuses are the user's mistake."""
+def _construct(what: str, kind: str, make: partial[Any]) -> Any:
+    """Call `make`; values that Optuna itself refuses are the user's mistake."""
     try:
         return make()
     except ValueError as error:

@@ -1,1 +1,1 @@
-"""Who runs what: points in a study, drivers, processes, results found again."""
+"""Execution of trials: studies, drivers, processes, finished runs."""

@@ -1,8 +1,8 @@
-"""How a command becomes a process: here, in a worker that is already warm.
+"""Starts commands as processes of this machine, forked from one that is warmed up.
 
 Importing torch and MLflow takes longer than a small run's first step. A fork server imports them
 once and forks a fresh process for every run: no state is carried from run to run, and the code is
-the one that was there when the driver began, also if somebody edits it meanwhile.
+that of the start of the driver, also if a file is edited meanwhile.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
 GPUS = "CUDA_VISIBLE_DEVICES"
 
 GRACE_S = 20.0
-"""What a process that is asked to stop may take before it is killed."""
+"""Time between SIGTERM and SIGKILL of a process that is stopped."""
 
 
 class Job(Protocol):
@@ -126,8 +126,8 @@ def check_gpus(gpus: tuple[int, ...] | None) -> None:
 
 def own_modules() -> list[str]:
     """Every module of rgbt but the commands themselves, so that later edits reach no run."""
-    found = pkgutil.walk_packages(rgbt.__path__, "rgbt.")
-    names = [module.name for module in found if not module.name.endswith("__main__")]
+    modules = pkgutil.walk_packages(rgbt.__path__, "rgbt.")
+    names = [module.name for module in modules if not module.name.endswith("__main__")]
     return [name for name in names if name not in COMMANDS]
 
 

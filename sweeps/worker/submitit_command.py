@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import submitit
 
 KILL_S = 600.0
-"""How long a job that SLURM told to go waits for SLURM to end it."""
+"""How long a pre-empted job waits for SLURM to end it."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Command:
         """The exit code, negative for a signal."""
         with Path(self.log).open("ab") as log:
             process = self._start(log)
-        told: list[int] = []
+        signals: list[int] = []
 
         def stop(number: int, frame: FrameType | None) -> None:
             del frame
-            if not told:
-                told.append(number)
+            if not signals:
+                signals.append(number)
                 _signal(process, signal.SIGTERM)
                 killer.start()
 
@@ -64,7 +64,7 @@ class Command:
             signal.signal(signal.SIGTERM, before)
             killer.cancel()
             _end(process)
-        if told and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
+        if signals and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
             # SLURM takes the node away. A job that ends before it is ended counts as done and
             # is not queued again.
             time.sleep(KILL_S)

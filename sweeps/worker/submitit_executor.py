@@ -2,7 +2,7 @@
 
 The driver stays where it was started (a login node, inside tmux) and submits as many jobs at a time
 as it has workers. Nothing of a run is kept in submitit: what is submitted is the plain command,
-which continues its own run folder. So a job that SLURM pre-empts and queues again goes on from its
+which continues its own run folder. So a job that SLURM pre-empts and requeues resumes from its
 checkpoint, and so does one that reaches its time limit: submitit's signal shortly before it has
 the job queued again, at most ``max_num_timeout`` times.
 """
@@ -37,10 +37,10 @@ PATIENCE_S = 60.0
 """How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
 
 ASK_S = 5.0
-"""Seconds between two questions after a job that was told to stop."""
+"""Seconds between two queries of a job that was asked to stop."""
 
 FAILED = 1
-"""Exit code of a job that ended without telling one; its log says why."""
+"""Exit code of a job that ended without one; its log holds the reason."""
 
 
 class SubmititExecutor:
@@ -86,7 +86,7 @@ class SubmititExecutor:
         """See `Executor.start`; a job that the cluster refuses fails, saying why.
 
         Raises:
-            InputError: a GPU of the driver's machine is asked for on SLURM.
+            InputError: a GPU of the driver's machine is requested on SLURM.
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         wanted: dict[str, str | None] = dict(environment)

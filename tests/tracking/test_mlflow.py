@@ -21,9 +21,10 @@ from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, shown, write_sent
+from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
+from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 

@@ -24,11 +24,11 @@ def now(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "code", lambda: NOW)
 
 
-def made_by(tmp_path: Path, *entries: dict[str, Any]) -> RunFolder:
+def made_by(tmp_path: Path, *entries: dict[str, Any]) -> Path:
     folder = RunFolder(tmp_path)
     for entry in entries:
         folder.add_provenance({"started": "2026-11-20T08:00:00+00:00", "diff": "", **entry})
-    return folder
+    return folder.path
 
 
 @pytest.mark.parametrize(
@@ -77,11 +77,11 @@ def test_other_code_counts_for_processes_that_left_something(
         folder.begin_at(step)
     entries = json.loads((folder.path / "provenance.json").read_text())
     assert all(SEAL in entry for entry in entries), "the note keeps the check sums"
-    assert (other_code(folder) is not None) == is_other
+    assert (other_code(folder.path) is not None) == is_other
 
 
 def test_other_code_of_a_run_without_provenance_is_unknown(tmp_path: Path) -> None:
-    assert other_code(RunFolder(tmp_path)) is None
+    assert other_code(tmp_path) is None
 
 
 def test_warnings_say_what_made_it_and_what_to_type(
@@ -94,7 +94,7 @@ def test_warnings_say_what_made_it_and_what_to_type(
         f"rgbt: This result was made by other code ({SAID}); fresh=true trains again and keeps "
         "the old run.\n"
         f"rgbt: warning: the first 40 steps were trained by other code ({SAID}); to train all "
-        f"steps by the present code, remove {folder.path} and rerun the command.\n"
+        f"steps by the present code, remove {folder} and rerun the command.\n"
     )
     same = made_by(tmp_path / "same", NOW)
     warn_of_result(same)

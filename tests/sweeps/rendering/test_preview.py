@@ -29,13 +29,13 @@ class Trained:
     """Stands for a finished run of ten seconds."""
 
     key = "k"
-    is_of_other_code = False
+    other_code = None
 
     def __init__(self, folder: Any) -> None:
         self.folder = folder
 
 
-def test_each_command_that_is_called_of_a_run_is_told_once() -> None:
+def test_preview_lists_each_evaluation_command_once() -> None:
     wanted, outcomes = asked((*FRAMES, RGB))
     assert summary(wanted, outcomes, 2) == [
         "2 runs: 2 waiting.",
@@ -46,7 +46,7 @@ def test_each_command_that_is_called_of_a_run_is_told_once() -> None:
     ]
 
 
-def test_a_table_without_further_evaluations_or_without_runs_says_nothing_of_them() -> None:
+def test_preview_without_evaluations_omits_them() -> None:
     assert len(summary(*asked((Column(name="mIoU", metric="mIoU"),)), 1)) == 2
     wanted, _ = asked(FRAMES)
     assert summary(wanted, [], 1) == ["0 runs: none."]
@@ -66,7 +66,7 @@ def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> N
     (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
     wanted, (first, second) = asked(FRAMES)
     found: Any = (Trained(tmp_path),)
-    outcomes = [replace(first, found=found, keys=("k",)), second]
+    outcomes = [replace(first, results=found, keys=("k",)), second]
     assert summary(wanted, outcomes, 1)[1:] == [
         "Time left with workers=1: 10 s.",
         "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "

@@ -1,0 +1,173 @@
+"""A finished run, read from its folder: the one type for it in rgbt, sweeps and analysis.
+
+`rgbt.tracking.folder.RunFolder` writes the folder of a run in progress.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.tracking.folder import Description
+from rgbt.tracking.formats import (
+    ADVICE,
+    read_description,
+    read_marker,
+    read_provenance,
+    read_result,
+    read_tables,
+)
+from rgbt.tracking.other_code import other_code
+from rgbt.tracking.percent import in_percent
+from rgbt.tracking.tables import ResultTables
+
+CHECKPOINT = "best.pt"
+"""The network that evaluations are made with; other machines do not get it."""
+
+COMMIT_LENGTH = 10
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a finished run has left. Every property reads the file anew.
+
+    Attributes:
+        folder: the run folder, or a folder with copies of its files.
+        run_id: of the MLflow run that the copies come from, else "".
+    """
+
+    folder: Path
+    run_id: str = ""
+
+    @property
+    def key(self) -> str:
+        """Config key of the run."""
+        return self.folder.name
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has its result."""
+        return (self.folder / "result.json").exists()
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """``result.json`` (`rgbt.training.train`).
+
+        Raises:
+            InputError: it is missing, damaged, or names no data set.
+        """
+        result = read_result(self.folder)
+        if result is None or "dataset" not in result:
+            raise InputError(
+                f"{self.folder / 'result.json'} is missing or names no data set; {ADVICE}."
+            )
+        return result
+
+    @property
+    def dataset(self) -> str:
+        """Fingerprint of the data set that the run was made on."""
+        return str(self.result["dataset"])
+
+    @property
+    def marker(self) -> dict[str, Any] | None:
+        """``dataset.json``: digests of the names of the images and of the files; or None."""
+        return read_marker(self.folder)
+
+    @property
+    def description(self) -> Description:
+        """Name, tags and parameters; empty where the folder has no ``run.json``."""
+        plain = read_description(self.folder)
+        return Description("", {}, {}) if plain is None else Description(**plain)
+
+    @property
+    def name(self) -> str:
+        """How the run is shown."""
+        return self.description.name
+
+    @property
+    def tags(self) -> dict[str, str]:
+        """Tags by name."""
+        return self.description.tags
+
+    @property
+    def params(self) -> dict[str, str]:
+        """Parameters by dotted key, as text."""
+        return self.description.params
+
+    @property
+    def group(self) -> str:
+        """What all seeds of its configuration share, as the run wrote it; "" without one.
+
+        `rgbt.spec.naming.group_of` writes the group of an older run as it is written now.
+        """
+        return self.tags.get("rgbt.group", "")
+
+    @property
+    def seed(self) -> int | None:
+        """Its seed, or None."""
+        seed = self.tags.get("rgbt.seed", "")
+        return int(seed) if seed else None
+
+    @property
+    def provenance(self) -> list[dict[str, Any]]:
+        """Entries of all processes that worked on the run, first one first."""
+        return read_provenance(self.folder / "provenance.json")
+
+    @property
+    def commit(self) -> str | None:
+        """Git commit of the code that made it; "+" is added for changes that were not committed."""
+        first = next(iter(self.provenance), {})
+        commit = first.get("git_commit")
+        dirty = "+" if first.get("git_dirty") else ""
+        return None if commit is None else f"{commit[:COMMIT_LENGTH]}{dirty}"
+
+    @property
+    def other_code(self) -> str | None:
+        """The code that made it, in words, where it is not that of this process; else None."""
+        return other_code(self.folder)
+
+    @property
+    def tables(self) -> ResultTables | None:
+        """Its tables by region and class, or None."""
+        plain = read_tables(self.folder)
+        return None if plain is None else ResultTables.from_json(plain)
+
+    def scores(self) -> dict[str, float]:
+        """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
+        result = self.result
+        return {
+            f"{split}/{name}": in_percent(name, value)
+            for split in ("val", "test")
+            for name, value in result.get(split, {}).items()
+            if value is not None
+        }
+
+    def counts_path(self, split: str = "test") -> Path:
+        """Path of the counts that the run itself ended with."""
+        return self.folder / f"counts_{split}.npz"
+
+    def counts(self, path: str = "counts_test.npz") -> Counts:
+        """Counts of an evaluation.
+
+        Args:
+            path: of the file, relative to the run folder; default: what the run itself ended with.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        return Counts.load(self.folder / path)
+
+    def has_counts(self, path: str) -> bool:
+        """Whether counts of the test split are at `path`, of this training and no earlier one."""
+        # Compared with the checkpoint: a run may write an evaluation before its result.
+        file, best = self.folder / path, self.folder / CHECKPOINT
+        if not file.exists() or (best.exists() and file.stat().st_mtime < best.stat().st_mtime):
+            return False
+        try:
+            counts = Counts.load(file)
+        except InputError:  # not readable: it is made again
+            return False
+        return counts.dataset == self.dataset and counts.split == "test"
