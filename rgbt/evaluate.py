@@ -5,16 +5,14 @@ Counts are written, and the tables that follow from them are shown.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.config.command import plain_command
-from rgbt.data.domains import TestedHead
 
 if TYPE_CHECKING:
-    from rgbt.evaluation.corrupted import Failure
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 
 OWN = {
     "run": "",
@@ -23,7 +21,7 @@ OWN = {
     "modality": "default",
     "regions": "as trained",
     "head": "as trained",
-    "degradation": "none",
+    "corruption": "none",
     "severity": "",
     "checkpoint": "best",
     "trust": "",
@@ -40,77 +38,45 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
     regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
     head      of a network with a head per domain: own, source or target
-    degradation  of the images: a file of conf/degradation such as thermal_removed or noise, with a
-              severity: degradation=noise severity=16; python -m rgbt.robustness takes all of them
+    corruption  of the images: a file of conf/corruption such as noise, with a severity:
+              corruption=noise severity=16; of one image: corruption=noise:rgb, removed:thermal;
+              python -m rgbt.robustness measures all of them
     checkpoint  best (by validation mIoU) or last
     trust     modules of yours that the run was made with: trust=my_lab; their code is run
     out       file of the counts; default: evaluations/ in the run folder
     overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
-              degradation: degradation.block=16 degradation.seed=1
+              corruption: corruption.block=16 corruption.seed=1
     """
-    from rgbt.build.load_run import open_trained
-    from rgbt.build.session import evaluate, result_tables, view_of
-    from rgbt.config.stored_config import parse_trust
-    from rgbt.evaluation.corrupted import own_words
-    from rgbt.tracking.terminal import result_view, show
+    from rgbt.evaluation.segmentation import evaluate
+    from rgbt.evaluation.segmentation_files import counts_path, overview
+    from rgbt.tracking.terminal import show
     from rgbt.training.overview import announce_stored
 
     if Path(arguments["out"] or "x").is_dir():
         raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
-    words, overrides = own_words(overrides)
-    trust = parse_trust(arguments["trust"])
-    failure = _failure(arguments, words, trust)
-    if arguments["regions"] != OWN["regions"]:
-        overrides = [*overrides, f"metric={arguments['regions']}"]
-    runs_dir = Path(arguments["runs_dir"])
-    run, checkpoint = arguments["run"], arguments["checkpoint"]
-    stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
-    announce_stored(stored)
-    session = stored.session
-    view = view_of(session, arguments["modality"])
-    head = _head(arguments["head"])
-    if failure is not None:
-        session = failure.applied(session, arguments["split"])
-    found = evaluate(session, session.model, arguments["split"], view=view, head=head)
-    counts = found.counts
-    stem = "_".join(
-        [session.dataset.name, counts.split, view, counts.partition]
-        + ([] if head is None else [f"{head}-head"])
-        + ([] if failure is None else [failure.mark])
-        + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
-    )
-    path = Path(arguments["out"] or stored.folder / f"{stem}.npz")
+    network, request = _requests(arguments, overrides)
+    opened = network.open()
+    announce_stored(opened)
+    result = evaluate(opened.session, opened.session.model, request)
+    path = Path(arguments["out"] or counts_path(opened, network, request, result))
     path.parent.mkdir(parents=True, exist_ok=True)
-    counts.save(path)
-    label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
-    label += f", {failure.told}" if failure else ""
-    tables = result_tables(counts, session.regions, label, stored.step)
-    heads = session.domains.told(head or session.domains.tested_head)
-    places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
-    if found.skipped:
-        places.append(("left out", f"{len(found.skipped)} images that cannot be read"))
-    show(result_view(tables, path.parent, places))
+    result.counts.save(path)
+    show(overview(opened, request, result, path))
     return 0
 
 
-def _head(asked: str) -> TestedHead | None:
-    if asked == OWN["head"]:
-        return None
-    check_choice("head", asked, get_args(TestedHead))
-    return cast(TestedHead, asked)
+def _requests(
+    arguments: dict[str, str], overrides: list[str]
+) -> tuple[NetworkRequest, EvaluationRequest]:
+    from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 
-
-def _failure(arguments: dict[str, str], words: list[str], trust: Collection[str]) -> Failure | None:
-    """The degradation and its severity; None where none is asked for."""
-    from rgbt.evaluation.corrupted import choose
-
-    if arguments["degradation"] != OWN["degradation"]:
-        return choose(arguments["degradation"], words, trust).at(arguments["severity"])
-    idle = [*(["severity"] if arguments["severity"] else []), *words]
-    if idle:
-        key = idle[0].partition("=")[0]
-        raise InputError(f"'{key}' has no effect without degradation=..., for example noise.")
-    return None
+    words, others = split_overrides(overrides)
+    network = NetworkRequest.from_options(arguments, others)
+    corruption = requested_corruption(
+        arguments["corruption"], arguments["severity"], words, network.trust
+    )
+    return network, EvaluationRequest.from_options(arguments, arguments["split"], corruption)
 
 
 if __name__ == "__main__":

@@ -7,23 +7,16 @@ labels and confidences of a split instead, to train other networks on
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from rgbt.build.load_run import Stored
-    from rgbt.build.session import Session
-    from rgbt.data.domains import TestedHead
-    from rgbt.data.label_map import LabelMap
-    from rgbt.data.to_predict import ToPredict
-    from rgbt.types import Sample, View
+    from rgbt.evaluation.pseudo_labels import Labelling
+    from rgbt.evaluation.request import EvaluationRequest
 
 OWN = {
     "run": "",
@@ -59,154 +52,63 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     label_map a file of conf/label_map, for a network that knows other classes than the data set:
               vistas_to_freiburg (of 66 classes), cityscapes_to_freiburg, freiburg_to_mfnet
     pseudo_labels  true: of a split, write labels/NAME.png (class indices, 255 where not sure),
-              confidence/NAME.png (16 bit) and pseudo_labels.json; called again it goes on
+              confidence/NAME.png (16 bit) and pseudo_labels.json; called again it resumes
     threshold smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one
     overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
-    from rgbt.build.load_run import open_trained
-    from rgbt.config.stored_config import parse_trust
-    from rgbt.evaluation.pseudo_labels import label_map_of
+    from rgbt.evaluation.images import chosen_images, write_images
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.training.overview import announce_stored
 
-    check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
-    as_labels = arguments["pseudo_labels"] == "true"
-    if not as_labels and arguments["threshold"] != OWN["threshold"]:
-        raise InputError(
-            f"threshold={arguments['threshold']} is for pseudo_labels=true; class maps and "
-            "overlays show every pixel."
-        )
-    label_map = label_map_of(arguments["label_map"])
-    runs_dir = Path(arguments["runs_dir"])
-    run, checkpoint = arguments["run"], arguments["checkpoint"]
-    trust = parse_trust(arguments["trust"])
-    stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
-    announce_stored(stored)
-    if as_labels:
-        _pseudo_labels(arguments, stored, label_map)
-    else:
-        _pictures(arguments, stored.session, label_map)
+    labelling = _labelling(arguments)
+    network = NetworkRequest.from_options(arguments, overrides)
+    request = EvaluationRequest.from_options(arguments, arguments["input"])
+    opened = network.open(labelling.label_map)
+    announce_stored(opened)
+    if arguments["pseudo_labels"] == "true":
+        _pseudo_labels(arguments, opened, request, labelling)
+        return 0
+    session, out = opened.session, Path(arguments["out"])
+    images = chosen_images(session, *(arguments[key] for key in ("input", "rgb", "thermal")))
+    print(write_images(session, images, request, out, labelling.label_map))
     return 0
 
 
-def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMap | None) -> None:
-    from rgbt.build.session import view_of
+def _labelling(arguments: dict[str, str]) -> Labelling:
+    """The options of labels; InputError where they do not fit."""
+    from rgbt.evaluation.pseudo_labels import Labelling, label_map_of
+
+    check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
+    threshold = arguments["threshold"]
+    if arguments["pseudo_labels"] == "false" and threshold != OWN["threshold"]:
+        raise InputError(
+            f"threshold={threshold} is for pseudo_labels=true; class maps and overlays show every "
+            "pixel."
+        )
+    try:
+        least = float(threshold)
+    except ValueError as error:
+        raise InputError(f"threshold={threshold}: expected a number from 0 to 1.") from error
+    return Labelling(least, label_map_of(arguments["label_map"]))
+
+
+def _pseudo_labels(
+    arguments: dict[str, str], opened: Stored, request: EvaluationRequest, labelling: Labelling
+) -> None:
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
-    session, split = stored.session, arguments["input"]
-    if split not in session.dataset.splits or arguments["rgb"] or arguments["thermal"]:
+    session, splits = opened.session, opened.session.dataset.splits
+    if request.split not in splits or arguments["rgb"] or arguments["thermal"]:
         raise InputError(
-            f"input={split}: pseudo-labels are written of a split of {session.dataset.name}; "
-            f"name one of {', '.join(session.dataset.splits)}."
+            f"input={request.split}: pseudo-labels are written of a split of "
+            f"{session.dataset.name}; name one of {', '.join(splits)}."
         )
-    try:
-        threshold = float(arguments["threshold"])
-    except ValueError as error:
-        raise InputError(
-            f"threshold={arguments['threshold']}: expected a number from 0 to 1."
-        ) from error
-    key_or_file = stored.folder.parent.name if arguments["run"] else stored.label
-    found = write_pseudo_labels(
-        session,
-        teacher_of(key_or_file, session.model),
-        split,
-        view_of(session, arguments["modality"]),
-        Path(arguments["out"]),
-        threshold,
-        label_map,
-        _head(arguments["head"]),
-    )
-    show(rich_table(summary(found)))
-    show(place_lines([("pseudo-labels", str(found.folder.resolve()))]))
-
-
-def _pictures(arguments: dict[str, str], session: Session, label_map: LabelMap | None) -> None:
-    import numpy as np
-
-    from rgbt.build.session import view_of
-    from rgbt.engine.progress import progress
-    from rgbt.tracking.pictures import overlay
-
-    view, head = view_of(session, arguments["modality"]), _head(arguments["head"])
-    images, out = _chosen(arguments, session), Path(arguments["out"])
-    images.check_out(out)
-    out.mkdir(parents=True, exist_ok=True)
-    palette = np.array(session.dataset.palette, np.uint8)
-    written = 0
-    with progress() as display:
-        task = display.add_task("predicting", total=len(images.names), note="images")
-        for sample, predicted in _classes(session, images, view, head):
-            classes = predicted if label_map is None else label_map(predicted)
-            painted = overlay(sample.rgb, classes, palette)
-            _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
-            _write(out / f"{sample.name}.png", classes)
-            written += 1
-            display.advance(task)
-    _tell_what_was_left_out(images)
-    print(f"{written} images in {out.resolve()}")
-
-
-def _tell_what_was_left_out(images: ToPredict) -> None:
-    from rgbt.tracking.terminal import tell
-
-    for reason in list(images.skipped.values())[:1]:
-        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
-    for path in images.others[:1]:
-        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
-
-
-def _chosen(arguments: dict[str, str], session: Session) -> ToPredict:
-    """The images that `input`, or `rgb` and `thermal`, name."""
-    from rgbt.data.to_predict import of_files, of_path, of_split
-
-    source, rgb, thermal = (arguments[key] for key in ("input", "rgb", "thermal"))
-    if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
-        raise InputError(
-            "expected either input=FOLDER (or a split, or a file of four channels) or rgb=FILE "
-            "thermal=FILE, got "
-            + (" and ".join(key for key in ("input", "rgb", "thermal") if arguments[key]) or "none")
-            + " of input, rgb and thermal."
-        )
-    dataset = session.dataset
-    if rgb:
-        return of_files(dataset, Path(rgb), Path(thermal))
-    if source in dataset.splits:
-        return of_split(dataset, source)
-    return of_path(dataset, source, session.loading.on_error)
-
-
-def _head(asked: str) -> TestedHead | None:
-    from rgbt.data.domains import TestedHead
-
-    if asked == OWN["head"]:
-        return None
-    check_choice("head", asked, get_args(TestedHead))
-    return cast("TestedHead", asked)
-
-
-def _write(path: Path, image: NDArray[np.uint8]) -> None:
-    import cv2
-
-    from rgbt.files.atomic import write_atomic
-
-    encoded, content = cv2.imencode(".png", image)
-    assert encoded, "8 bit images can be encoded"
-    write_atomic(path, content.tobytes())
-
-
-def _classes(
-    session: Session, images: ToPredict, view: View, head: TestedHead | None
-) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
-    from rgbt.build.session import heads_of
-    from rgbt.data.batches import collate
-    from rgbt.engine.evaluate import predictions
-
-    heads = heads_of(session, view, head)
-    for sample in images.samples(session.loading.on_error):
-        # One image at a time: a folder may hold images of any size.
-        batch = collate([session.transform.test(sample)], "")
-        for found in predictions(session.model, [batch], session.fabric, view, heads):
-            yield sample, found.classes[0].numpy()
+    key_or_file = opened.folder.parent.name if arguments["run"] else opened.label
+    teacher = teacher_of(key_or_file, session.model)
+    labels = write_pseudo_labels(session, teacher, request, labelling, Path(arguments["out"]))
+    show(rich_table(summary(labels)))
+    show(place_lines([("pseudo-labels", str(labels.folder.resolve()))]))
 
 
 if __name__ == "__main__":

@@ -208,8 +208,8 @@ def _without_tags() -> Iterator[None]:
 
 def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
     from rgbt.build.load_run import open_run
-    from rgbt.build.session import view_of
-    from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
+    from rgbt.evaluation.pseudo_labels import Labelling, teacher_of, write_pseudo_labels
+    from rgbt.evaluation.request import EvaluationRequest
 
     folder, node = labels_folder(config, name), config.domains[name]
     assert folder is not None, "the domain takes labels of an earlier run"
@@ -226,8 +226,6 @@ def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
     # The user's own: the same configuration as this command composed.
     own = [target for _, target in targets(OmegaConf.to_container(earlier.config))]
     session = open_run(earlier.folder, place, checkpoint, trust=own).session
-    view = view_of(session, node.teacher_view or "default")
     teacher = teacher_of(earlier.folder.name, session.model)
-    write_pseudo_labels(
-        session, teacher, node.split, view, folder, node.threshold, label_map=None, head=None
-    )
+    request = EvaluationRequest(split=node.split, view=node.teacher_view)
+    write_pseudo_labels(session, teacher, request, Labelling(node.threshold), folder)

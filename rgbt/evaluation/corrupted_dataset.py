@@ -1,4 +1,4 @@
-"""A data set seen under a degradation, so that everything which reads one runs unchanged."""
+"""A data set seen under a corruption, so that everything which reads one runs unchanged."""
 
 from __future__ import annotations
 
@@ -6,74 +6,27 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.corruptions.corruption import Degradation, OfTime
+from rgbt.corruptions.corruption import Corruption, OfTime
+from rgbt.data.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
 
 
-class Source(Protocol):
-    """The data set that is degraded (see `rgbt.data.dataset.LabelledDataset`)."""
-
-    root: Path
-    name: str
-    num_classes: int
-    classes: tuple[str, ...]
-    palette: tuple[tuple[int, int, int], ...]
-    unscored: tuple[str, ...]
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        """Split -> what it is made of."""
-        ...
-
-    def has(self, split: str) -> bool:
-        """Whether anything of `split` is there."""
-        ...
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        ...
-
-    def read(self, name: str) -> Sample:
-        """One sample."""
-        ...
-
-    def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label alone."""
-        ...
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens."""
-        ...
-
-    def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
-        ...
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Hash of names and files."""
-        ...
-
-
-class Degraded:
-    """`source` under a degradation; it is a `rgbt.data.dataset.LabelledDataset` itself.
+class CorruptedDataset:
+    """`source` under a corruption; it is a `rgbt.data.dataset.LabelledDataset` itself.
 
     Names, labels and the fingerprint are those of the source: scores are of the same images. What
     is drawn for an image follows from (seed, its name) alone, whatever is read before it.
 
     Args:
         source: the data set.
-        degradation: what fails.
+        corruption: what fails.
         severity: how much; 0: nothing, samples are those of the source.
         split: that is read; its order is the order of time.
         seed: of what is drawn.
@@ -84,17 +37,17 @@ class Degraded:
 
     def __init__(
         self,
-        source: Source,
-        degradation: Degradation,
+        source: LabelledDataset,
+        corruption: Corruption,
         severity: float,
         *,
         split: str,
         seed: int = 0,
     ) -> None:
         if severity:
-            degradation.check(severity)
+            corruption.check(severity)
         self.source = source
-        self.degradation = degradation
+        self.corruption = corruption
         self.severity = severity
         self.split = split
         self.seed = seed
@@ -121,7 +74,7 @@ class Degraded:
         return self.source.names(split)
 
     def read(self, name: str) -> Sample:
-        """The sample called `name` under the degradation.
+        """The sample called `name` under the corruption.
 
         Raises:
             InputError: as the source; images of two sizes where one frame is shown for another; a
@@ -130,24 +83,25 @@ class Degraded:
         sample = self.source.read(name)
         if not self.severity:
             return sample
-        if isinstance(self.degradation, OfTime):
+        if isinstance(self.corruption, OfTime):
             return self._with_thermal_of(self.shown(name), sample)
 
         def rng_of(purpose: str) -> np.random.Generator:
+            # The word is part of the seed: another one draws other blocks.
             return numpy_generator(self.seed, f"degradation {purpose} of {name}")
 
-        return self.degradation(sample, self.severity, rng_of)
+        return self.corruption(sample, self.severity, rng_of)
 
     def shown(self, name: str) -> str:
         """Name of the frame whose thermal image `name` shows: itself, or an earlier one.
 
         Raises:
-            InputError: the degradation is one of time, and `name` is not of its split.
+            InputError: the corruption is one of time, and `name` is not of its split.
         """
         if self._shown and name not in self._shown:
             raise InputError(
                 f"'{name}' is not of split '{self.split}', whose order says which thermal image is "
-                "shown; read the split that was degraded."
+                "shown; read the split that was corrupted."
             )
         return self._shown.get(name, name)
 
@@ -161,12 +115,12 @@ class Degraded:
         return tuple(path for each in names for path in self.source.files(each))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides what `read` makes of files: as the source's, and the degradation."""
+        """What decides what `read` makes of files: as the source's, and the corruption."""
         listed = hashlib.sha256("\n".join(self._names).encode()).hexdigest()
         return {
             **self.source.decoding(),
-            "degradation": type(self.degradation).__name__,
-            "settings": settings_of(self.degradation),
+            "corruption": type(self.corruption).__name__,
+            "settings": settings_of(self.corruption),
             "severity": self.severity,
             "seed": self.seed,
             "listed": listed,
@@ -182,14 +136,14 @@ class Degraded:
 
     def _other_frames(self) -> dict[str, str]:
         """Name -> name of the frame whose thermal image it shows; {} where time does not matter."""
-        if not self.severity or not isinstance(self.degradation, OfTime):
+        if not self.severity or not isinstance(self.corruption, OfTime):
             return {}
         nights = self.source.nights(self._names) or (False,) * len(self._names)
         found: dict[str, str] = {}
         for dark in (False, True):
             frames = [n for n, night in zip(self._names, nights, strict=True) if night == dark]
-            for place, name in enumerate(frames):
-                found[name] = frames[self.degradation.shown(place, self.severity)]
+            for index, name in enumerate(frames):
+                found[name] = frames[self.corruption.shown(index, self.severity)]
         return found
 
     def _with_thermal_of(self, other: str, sample: Sample) -> Sample:
@@ -206,7 +160,7 @@ class Degraded:
         return replace(sample, thermal=thermal)
 
 
-def settings_of(degradation: Degradation) -> dict[str, Any]:
-    """What a degradation was built with, as values of JSON; the ladder is no part of it."""
+def settings_of(corruption: Corruption) -> dict[str, Any]:
+    """What a corruption was built with, as values of JSON; the ladder is no part of it."""
     known = ("title", "unit", "severities")
-    return {key: value for key, value in vars(degradation).items() if key not in known}
+    return {key: value for key, value in vars(corruption).items() if key not in known}
