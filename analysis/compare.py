@@ -27,7 +27,7 @@ OWN = {
     "metrics": "auto",
     "split": "",
     "frames": "",
-    "degradation": "",
+    "corruption": "",
     "severity": "",
     "missing": "refuse",
     "level": "0.95",
@@ -52,8 +52,8 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
               of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA
     frames    of runs, counts of pairs of frames (python -m rgbt.consistency run=...): aligned or
               released (virtual views), next (consecutive frames); default: of single frames
-    degradation, severity  of runs, counts of failing images (python -m rgbt.robustness run=...):
-              degradation=noise severity=16
+    corruption, severity  of runs, counts of corrupted images (python -m rgbt.robustness run=...):
+              corruption=noise:rgb severity=16
     missing   refuse, or leave_out: compare the images that both hold
     level     of the intervals;  resamples: their number;  seed: of the draws
     method    how intervals over images are taken from the resamples: percentile or bca; auto:
@@ -75,22 +75,22 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     refuse_others(overrides, (), list(OWN))
     check_choice("missing", arguments["missing"], MISSING)
     frames = _frames(arguments["frames"])
-    degradation, severity = arguments["degradation"], arguments["severity"]
-    _check_failing(degradation, severity, frames)
+    corruption, severity = arguments["corruption"], arguments["severity"]
+    _check_corruption(corruption, severity, frames)
     out = out_folder(arguments["out"])
     _check_given(arguments)
     opened = [
         open_counts(arguments[side], arguments["runs_dir"], arguments["split"], frames)
         for side in "ab"
     ]
-    if degradation:
-        opened = [under(each, degradation, severity) for each in opened]
+    if corruption:
+        opened = [under(each, corruption, severity) for each in opened]
     a, b = _counts(opened, arguments["missing"])
     settings = settings_of(arguments)
     metrics = metrics_of(arguments["metrics"], [*a, *b], settings)
     comparison = compare(a, b, metrics, settings)
-    failing = " ".join(word for word in (degradation, severity) if word)
-    labels = [f"{label} ({failing})" if failing else label for label in _labels(opened)]
+    shown = " ".join(word for word in (corruption, severity) if word)
+    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
     notes = absent_classes([*a, *b], settings.absent)
     grid = replace(comparison_grid(comparison, labels), notes=notes)
     said = sentence(comparison, *labels)
@@ -247,11 +247,11 @@ def _frames(text: str) -> Frames:
     return cast("Frames", text)
 
 
-def _check_failing(degradation: str, severity: str, frames: str) -> None:
-    if severity and not degradation:
-        raise InputError("'severity' has no effect without degradation=..., for example noise.")
-    if degradation and frames:
-        raise InputError(f"degradation={degradation} is of single frames; leave frames= out.")
+def _check_corruption(corruption: str, severity: str, frames: str) -> None:
+    if severity and not corruption:
+        raise InputError("'severity' has no effect without corruption=..., for example noise.")
+    if corruption and frames:
+        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
 
 
 def _check_given(arguments: dict[str, str]) -> None:

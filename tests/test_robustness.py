@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from rgbt.evaluation.corrupted import Failure, choose
 from torch import nn
 
 from rgbt import evaluate, robustness
 from rgbt.checks import InputError
 from rgbt.config.command import plain_command
-from rgbt.evaluation.corrupted import Failure, choose
 from rgbt.evaluation.robustness import Asked, Measured, asked_of, measure, weights_digest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions

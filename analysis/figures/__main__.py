@@ -11,7 +11,7 @@ from rgbt.config.command import plain_command
 OF_FIGURES = (
     *("maps", "statistics", "methods", "runs", "runs_dir", "frames", "names", "pick", "rows"),
     *("layout", "split", "part", "regions", "absent", "estimator", "average", "patches", "seed"),
-    *("band", "resamples", "level", "blocks", "size", "format", "suffix", "degradations"),
+    *("band", "resamples", "level", "blocks", "size", "format", "suffix", "corruptions"),
 )
 """Keys that single figures take (`analysis.figures.catalogue`)."""
 
@@ -48,7 +48,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     band         interval over: widest, images, seeds or both; with resamples (10000), level (0.95)
                  and blocks (auto, none, sequence or a number)
     size         of the picture of regions/heat (480x640), 16 to 4096 pixels a side
-    degradations  to show, with commas (robustness): noise,frozen; default: all that were measured
+    corruptions  to show, with commas (robustness): noise:rgb,frozen; default: all that exist
     overrides of data set and partition: dataset=mfnet dataset.root=/data/MFNet metric=ring9;
     stored statistics are of one partition, heat maps alone can be cut anew
     """

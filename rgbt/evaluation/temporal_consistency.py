@@ -123,12 +123,13 @@ def count_pairs(
         InputError: no sets of views, no second frames, or no image that can be read.
     """
     assert request.corruption is None, "pairs are counted of clean images"
-    split, view = request.split, view_of(session, request.view)
+    split = request.split
     _check_second_frames(session, frames)
     decode_ahead(session, split)
     model.eval()
     found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
+    view = view_of(session, request.view)
     heads = heads_of(session, view, request.head)
 
     def predict(batch: Batch) -> Tensor:

@@ -97,7 +97,7 @@ def evaluation_of(column: Column, table: Table) -> Evaluation | None:
         column.modality,
         table.regions,
         head=column.head,
-        degradation=column.degradation,
+        corruption=column.corruption,
         severity=column.severity,
     )
     return None if asked == Evaluation() else asked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
@@ -70,7 +70,7 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], place:
         check_choice(f"{place}, {given[0]}", other, [each.name for each in table.columns])
     _check_frames(column, place)
     _check_head(column, place)
-    _check_degradation(column, place)
+    _check_corruption(column, place)
     _check_sources(column, table, before, f"{place}, {given[0]}")
 
 
@@ -99,31 +99,39 @@ def _check_head(column: Column, place: str) -> None:
         )
 
 
-def _check_degradation(column: Column, place: str) -> None:
-    """Refuse a degradation of what is not predicted, an unknown one, or a severity it has not."""
-    if column.degradation is None:
+def _check_corruption(column: Column, place: str) -> None:
+    """Refuse a corruption of what is not predicted, an unknown one, or a severity it has not."""
+    if column.corruption is None:
         if column.severity is not None:
             raise InputError(
-                f"{place}: 'severity' is of a degradation; add degradation: NAME, or remove it."
+                f"{place}: 'severity' is of a corruption; add corruption: NAME, or remove it."
             )
         return
     if column.metric is None or column.frames is not None:
         raise InputError(
-            f"{place}: 'degradation' is for scores of single frames alone; remove degradation: "
-            f"{column.degradation}."
+            f"{place}: 'corruption' is for scores of single frames alone; remove corruption: "
+            f"{column.corruption}."
         )
-    check_choice(f"{place}, degradation", column.degradation, _files("degradation"))
-    # Below its key, as in a configuration: sentences about it name degradation.severities.
-    file = conf_dir() / "degradation" / f"{column.degradation}.yaml"
-    kind = build(OmegaConf.create({"degradation": OmegaConf.load(file)}).degradation)
+    name, _, image = column.corruption.partition(":")
+    check_choice(f"{place}, corruption", name, _files("corruption"))
+    try:
+        kind = _corruption(name, image)
+        if column.severity is not None:
+            kind.check(column.severity)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
     if column.severity is None and len(kind.severities) > 1:
         known = ", ".join(f"{each:g}" for each in kind.severities)
         raise InputError(f"{place}: {kind.title} needs a severity ({kind.unit}); one of {known}.")
-    if column.severity is not None:
-        try:
-            kind.check(column.severity)
-        except InputError as error:
-            raise InputError(f"{place}: {error}") from None
+
+
+def _corruption(name: str, image: str) -> Any:
+    # Below its key, as in a configuration: sentences about it name corruption.severities.
+    file = conf_dir() / "corruption" / f"{name}.yaml"
+    node = OmegaConf.create({"corruption": OmegaConf.load(file)}).corruption
+    if image:
+        node.image = image
+    return build(node)
 
 
 def _check_frames(column: Column, place: str) -> None:

@@ -49,8 +49,9 @@ class Column:
         frames: of a consistency metric: which two predictions it compares, see
             `rgbt.metrics.pairs`.
         head: of a network with a head per domain which one predicts, see `sweeps.points.Head`.
-        degradation: what fails of the images, a file of ``conf/degradation``; None: they are clean.
-        severity: of the degradation; may be left out where it has one alone.
+        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None: they
+            are clean.
+        severity: of the corruption; may be left out where it has one alone.
         printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
     """
@@ -66,7 +67,7 @@ class Column:
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
     head: Head = "as trained"
-    degradation: str | None = None
+    corruption: str | None = None
     severity: float | None = None
     printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rgbt.evaluation.corrupted import choose, known_degradations, own_words
 
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import OfPixels, OfTime
-from rgbt.evaluation.corrupted import choose, known_degradations, own_words
 from tests.corruptions.recorded import NAMES, Recorded
 
 IMAGES = ("", "_rgb", "_thermal")

@@ -83,8 +83,8 @@ def test_points_without_frames_keep_the_keys_of_studies_from_before_there_were_a
         planner.plan(Point("p", ("seed=1",), evaluations=(asked,)))
         for asked in (
             Evaluation(),
-            Evaluation(degradation="noise", severity=8),
-            Evaluation(degradation="noise", severity=16),
+            Evaluation(corruption="noise", severity=8),
+            Evaluation(corruption="noise", severity=16),
         )
     ]
     assert len({plan.key for plan in failing}) == 3
