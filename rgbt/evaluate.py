@@ -50,13 +50,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.evaluation.segmentation import evaluate
     from rgbt.evaluation.segmentation_files import counts_path, overview
     from rgbt.tracking.terminal import show
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     if Path(arguments["out"] or "x").is_dir():
         raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
     network, request = _requests(arguments, overrides)
     opened = network.open()
-    announce_stored(opened)
+    announce_network(opened)
     result = evaluate(opened.session, opened.session.model, request)
     path = Path(arguments["out"] or counts_path(opened, network, request, result))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from rgbt.checks import InputError, check_choice
 from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
-    from rgbt.build.load_run import Stored
+    from rgbt.build.load_run import TrainedNetwork
     from rgbt.evaluation.pseudo_labels import Labelling
     from rgbt.evaluation.request import EvaluationRequest
 
@@ -58,13 +58,13 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     """
     from rgbt.evaluation.images import chosen_images, write_images
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     labelling = _labelling(arguments)
     network = NetworkRequest.from_options(arguments, overrides)
     request = EvaluationRequest.from_options(arguments, arguments["input"])
     opened = network.open(labelling.label_map)
-    announce_stored(opened)
+    announce_network(opened)
     if arguments["pseudo_labels"] == "true":
         _pseudo_labels(arguments, opened, request, labelling)
         return 0
@@ -93,7 +93,10 @@ def _labelling(arguments: dict[str, str]) -> Labelling:
 
 
 def _pseudo_labels(
-    arguments: dict[str, str], opened: Stored, request: EvaluationRequest, labelling: Labelling
+    arguments: dict[str, str],
+    opened: TrainedNetwork,
+    request: EvaluationRequest,
+    labelling: Labelling,
 ) -> None:
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rgbt.build.load_run import Stored
+from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
@@ -77,7 +77,11 @@ class PairFiles:
 
 
 def pair_files(
-    opened: Stored, network: NetworkRequest, request: EvaluationRequest, frames: Frames, out: str
+    opened: TrainedNetwork,
+    network: NetworkRequest,
+    request: EvaluationRequest,
+    frames: Frames,
+    out: str,
 ) -> PairFiles:
     """Where the counts of a measurement are written.
 
@@ -101,7 +105,7 @@ def pair_files(
     return files
 
 
-def _other_images(opened: Stored) -> tuple[str, ...]:
+def _other_images(opened: TrainedNetwork) -> tuple[str, ...]:
     """Part of a file's name where a run is measured on images that it was not trained with."""
     dataset = opened.session.dataset
     marker, now = read_marker(opened.folder.parent), dataset.fingerprint()

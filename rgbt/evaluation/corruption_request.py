@@ -19,9 +19,10 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.build.contracts import check_corruption, check_sample, is_own
 from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice, split_list
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build, check_node, constructor, setting_types
 from rgbt.config.stored_config import load_config
+from rgbt.config.targets import constructor, setting_types
 from rgbt.corruptions.corruption import Corruption, OfTime
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
 from rgbt.files.yaml_files import parse_yaml
@@ -160,7 +161,6 @@ def choose_corruption(
     for key, value in pairs:
         if key != SEED:
             OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
-    check_node(node, NODE)
     corruption = build(node)
     if is_own(corruption) and not isinstance(corruption, OfTime):
         check_corruption(corruption)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast, get_args
 
-from rgbt.build.load_run import Stored, open_trained
+from rgbt.build.load_run import TrainedNetwork, open_trained
 from rgbt.checks import InputError, check_choice
 from rgbt.config.stored_config import parse_trust
 from rgbt.data.domains import TestedHead
@@ -77,7 +77,7 @@ class NetworkRequest:
                 "with out=..."
             )
 
-    def open(self, label_map: LabelMap | None = None) -> Stored:
+    def open(self, label_map: LabelMap | None = None) -> TrainedNetwork:
         """The network with its weights, see `rgbt.build.load_run.open_trained`."""
         regions = [f"metric={self.regions}"] if self.regions else []
         overrides = [*self.overrides, *regions]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 from torch import nn
 
 from rgbt.build.session import Session
@@ -174,7 +173,7 @@ def _shared_identity(session: Session, split: str) -> dict[str, Any]:
         "split": split,
         "partition": session.regions.name,
         "weights": weights_digest(session.model),
-        "transform": OmegaConf.to_container(session.config.transform, resolve=True),
+        "transform": session.spec.transform.plain,
         "precision": session.trainer.precision,
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rgbt.build.load_run import Stored
+from rgbt.build.load_run import TrainedNetwork
 from rgbt.evaluation.request import NetworkRequest
 from rgbt.evaluation.robustness import CLEAN, Measured, read_json
 from rgbt.files.atomic import write_atomic
@@ -16,7 +16,7 @@ FOLDER = "robustness"
 """Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
 
 
-def counts_folder(opened: Stored, network: NetworkRequest, split: str) -> Path:
+def counts_folder(opened: TrainedNetwork, network: NetworkRequest, split: str) -> Path:
     """Folder of a split's counts: named plainly where the run is measured as it was trained."""
     session = opened.session
     regions = [session.regions.name] if network.regions else []
@@ -27,11 +27,11 @@ def counts_folder(opened: Stored, network: NetworkRequest, split: str) -> Path:
     return opened.folder / FOLDER / "_".join([split, *regions, *network.suffixes, *others])
 
 
-def robustness_title(opened: Stored, split: str) -> str:
+def robustness_title(opened: TrainedNetwork, split: str) -> str:
     """Title of the table."""
     session = opened.session
     is_run = opened.step > 0  # a file of weights tells neither step nor seed
-    seed = f" seed={session.config.seed}" if is_run else ""
+    seed = f" seed={session.spec.seed}" if is_run else ""
     return f"Robustness of {opened.label}{seed} ({session.dataset.name}, {split}): mIoU in percent"
 
 

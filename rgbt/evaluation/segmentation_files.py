@@ -6,14 +6,14 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from rgbt.build.load_run import Stored
+from rgbt.build.load_run import TrainedNetwork
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.evaluation.segmentation import EvaluationResult, result_tables
 from rgbt.tracking.terminal import result_view
 
 
 def counts_path(
-    opened: Stored,
+    opened: TrainedNetwork,
     network: NetworkRequest,
     request: EvaluationRequest,
     result: EvaluationResult,
@@ -26,7 +26,7 @@ def counts_path(
 
 
 def overview(
-    opened: Stored, request: EvaluationRequest, result: EvaluationResult, path: Path
+    opened: TrainedNetwork, request: EvaluationRequest, result: EvaluationResult, path: Path
 ) -> RenderableType:
     """The tables of an evaluation, and where its counts are."""
     session, head, corruption = opened.session, request.head, request.corruption

@@ -39,8 +39,8 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
 
     from rgbt.build.training_setup import prepare
     from rgbt.config.compose import compose
-    from rgbt.config.schema import check
     from rgbt.engine.trainer import Trainer
+    from rgbt.spec.specify import specify
 
     experiment, changes = CASES[case]
     config = compose(
@@ -50,7 +50,7 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
             *("data.num_workers=0", f"trainer.accelerator={device}", f"trainer.threads={threads}"),
         ]
     )
-    check(config)
+    specify(config)
     made = prepare(config)
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(

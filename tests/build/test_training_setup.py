@@ -12,11 +12,12 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from rgbt.training.train import pipeline as earlier
+from rgbt.training import pipeline as earlier
 from rgbt.build import training_setup as prepared_module
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check
+from rgbt.config.component import build
+from rgbt.spec.specify import specify
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
 from rgbt.evaluation.prediction import decode_ahead
@@ -50,7 +51,7 @@ def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
 def composed(words: Callable[..., list[str]]) -> Composed:
     def make(name: str, *more: str) -> DictConfig:
         config = compose(words(name, *more))
-        check(config)
+        specify(config)
         return config
 
     return make

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import OfPixels, OfTime
 from rgbt.corruptions.late import Delayed, Frozen
@@ -157,7 +158,9 @@ def test_settings_leave_out_the_ladder() -> None:
         (DELAYED, -1, "counts frames"),
     ],
 )
-def test_severity_out_of_range_is_refused(kind: OfPixels | OfTime, severity: float, sentence: str) -> None:
+def test_severity_out_of_range_is_refused(
+    kind: OfPixels | OfTime, severity: float, sentence: str
+) -> None:
     with pytest.raises(InputError, match=sentence):
         CorruptedDataset(Recorded(), kind, severity, split="test")
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
 
 from rgbt.config.command import plain_command
 from rgbt.corruptions.__main__ import OWN, main
 from rgbt.corruptions.late import Delayed
 from rgbt.corruptions.noise import Noise
 from rgbt.corruptions.removed import Removed
+from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
 from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample

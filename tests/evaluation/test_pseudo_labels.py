@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.data.cache.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
@@ -26,9 +25,16 @@ from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
 from rgbt.engine.confidence import probabilities
 from rgbt.evaluation import pseudo_labels as pseudo
+from rgbt.evaluation.pseudo_labels import (
+    Labelling,
+    Teacher,
+    summary,
+    teacher_of,
+    write_pseudo_labels,
+)
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.pseudo_labels import Labelling, Teacher, summary, teacher_of, write_pseudo_labels
 from rgbt.files.atomic import holding
+from rgbt.spec.specify import specify
 from rgbt.types import Output, View
 from tests.conftest import write_png
 
@@ -102,7 +108,7 @@ def session_of(root: Path, *overrides: str) -> Session:
             *overrides,
         ]
     )
-    check(config)
+    specify(config)
     return replace(open_session(config), model=Fixed())
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rgbt.evaluation.segmentation import result_tables
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.evaluation.segmentation import result_tables
 
 
 def test_result_tables_of_two_regions_and_two_classes() -> None:

@@ -20,7 +20,6 @@ from torch.nn import functional as F
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.data.next_frames import NextFrames
 from rgbt.evaluation import temporal_consistency
 from rgbt.evaluation.request import EvaluationRequest
@@ -28,6 +27,7 @@ from rgbt.evaluation.segmentation import evaluate
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, ca, tc
+from rgbt.spec.specify import specify
 from rgbt.transforms.view_sets import read_angles
 from rgbt.types import Output
 from tests.commands import SPLITS, words_of
@@ -71,7 +71,7 @@ class Oracle(nn.Module):
 
 def opened(*overrides: str) -> Session:
     config = compose(overrides)
-    check(config)
+    specify(config)
     return open_session(config)
 
 
@@ -424,7 +424,9 @@ def test_perfect_consistency_on_true_frames_is_100_whatever_is_right(cache: Path
 def test_pictures_show_what_was_followed(cache: Path) -> None:
     session = on_synth(cache)
     name = session.dataset.names("test")[1]
-    kept = count_pairs(session, Decoder(), EvaluationRequest(split="test", keep=[name]), "next").kept
+    kept = count_pairs(
+        session, Decoder(), EvaluationRequest(split="test", keep=[name]), "next"
+    ).kept
     (example,) = kept
     assert example.name == name
     assert np.array_equal(example.first_rgb, session.dataset.read(name).rgb)

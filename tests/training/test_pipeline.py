@@ -19,15 +19,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import check
 from rgbt.files.atomic import holding
 from rgbt.metrics.counts import Counts
 from rgbt.spec import run_key as identity
 from rgbt.spec.naming import TAGS
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from rgbt.tracking.folder import RunFolder
+from rgbt.training import pipeline as earlier
 from rgbt.training.pipeline import earlier_runs, finish_earlier, labels_folder, warn_of_other_code
-from rgbt.training.train import pipeline as earlier
 from tests.commands import Call, Trained, short
 from tests.composed import composed as configuration
 
@@ -48,12 +47,12 @@ def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def composed(experiment: str, *overrides: str) -> DictConfig:
     config = configuration([f"+experiment={experiment}", *overrides])
-    check(config)
+    specify(config)
     return config
 
 
 def alone(name: str, *overrides: str) -> str:
-    return run_key(composed(name, *overrides))
+    return specify(composed(name, *overrides)).key
 
 
 @dataclass
@@ -75,7 +74,7 @@ class Train:
 
 
 def folder_of(config: DictConfig) -> Path:
-    return Path(config.runs_dir) / run_key(config)
+    return Path(config.runs_dir) / specify(config).key
 
 
 def finish(config: DictConfig) -> None:
@@ -140,7 +139,7 @@ def test_an_earlier_run_is_the_run_of_its_experiment_alone(typed: list[str]) -> 
     for experiment in ("multi_head_modified_night_init_stage1", "heatnet_rgb_only"):
         for found in earlier_runs(composed(experiment, *typed)):
             assert found.config.name == found.experiment
-            assert run_key(found.config) == alone(found.experiment, *typed), found.experiment
+            assert specify(found.config).key == alone(found.experiment, *typed), found.experiment
 
 
 @pytest.mark.slow
@@ -151,13 +150,13 @@ def test_every_earlier_run_is_the_run_of_its_experiment_alone(experiment: str, s
     found = list(earlier_runs(composed(experiment, *typed)))
     assert found
     for each in found:
-        assert run_key(each.config) == alone(each.experiment, *typed)
+        assert specify(each.config).key == alone(each.experiment, *typed)
 
 
 def test_another_seed_stands_on_other_runs() -> None:
     def keys(*overrides: str) -> list[str]:
         config = composed("multi_head_night_stage1", *overrides)
-        return [run_key(config), *(run_key(each.config) for each in earlier_runs(config))]
+        return [specify(config).key, *(specify(each.config).key for each in earlier_runs(config))]
 
     first, second = keys("seed=0"), keys("seed=1")
     assert all(a != b for a, b in zip(first, second, strict=True))
@@ -252,13 +251,13 @@ def test_another_network_is_that_of_the_run_it_starts_from_too() -> None:
     (found,) = earlier_runs(config)
     assert found.config.model._target_ == config.model._target_
     assert found.config.model.weights is None
-    assert run_key(found.config) == alone("sh_source", "model=rtfnet_demo")
+    assert specify(found.config).key == alone("sh_source", "model=rtfnet_demo")
 
 
 def test_a_teacher_has_a_network_of_its_own() -> None:
     config = composed("multi_head_night_stage1", "model.base_width=7")
     (found,) = earlier_runs(config)
-    assert run_key(found.config) == alone("thermal_teacher")
+    assert specify(found.config).key == alone("thermal_teacher")
 
 
 def test_experiments_of_conf_form_no_ring() -> None:
@@ -508,7 +507,7 @@ def test_pretrained_weights_reach_the_first_stage(tmp_path: Path) -> None:
         (teacher,) = earlier_runs(stage.config)
         assert stage.config.model.weights == (None if file is None else str(file))
         assert teacher.config.model.weights is None
-        return [run_key(each) for each in (config, stage.config, teacher.config)]
+        return [specify(each).key for each in (config, stage.config, teacher.config)]
 
     files = [tmp_path / name for name in ("one.pth", "same.pth", "other.pth")]
     for file, content in zip(files, (b"abc", b"abc", b"abd"), strict=True):
@@ -541,7 +540,7 @@ def test_a_file_that_nothing_reads_is_told(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str
 ) -> None:
     from rgbt import run
-    from rgbt.training.train import train as training
+    from rgbt.training import train as training
 
     done: list[str] = []
     monkeypatch.setattr(training, "is_finished", lambda config: True)
