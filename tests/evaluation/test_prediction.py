@@ -64,7 +64,7 @@ def test_heads_of_listed_images() -> None:
 
 
 def test_heads_of_unlisted_images() -> None:
-    """Files of one's own: whether they are of the night is not known, and is not looked up in vain."""
+    """Own files: whether they are of the night is unknown, and not looked up in vain."""
     session = session_of({"head": "day", "view": "rgb"}, target_is="night")
     for requested, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", requested)(("mine", "night")) == (head, head)
