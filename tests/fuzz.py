@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from rgbt.build.training_setup import prepare
+from rgbt.build.training_setup import set_up_training
 from rgbt.checks import InputError
-from rgbt.config.component import Component, build
+from rgbt.config.component import Component
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
@@ -168,10 +168,10 @@ def used(folder: Path) -> Callable[[DictConfig, Case], None]:
 
     def use(config: DictConfig, case: Case) -> None:
         del case
-        specify(config)
-        specify(config).key
-        build(config.tracking)
-        prepared = prepare(config)
+        spec = specify(config)
+        assert spec.key
+        spec.tracking.build()
+        prepared = set_up_training(spec)
         session = prepared.session
         settings = replace(session.trainer, max_steps=1)
         Trainer(

@@ -108,8 +108,7 @@ def session_of(root: Path, *overrides: str) -> Session:
             *overrides,
         ]
     )
-    specify(config)
-    return replace(open_session(config), model=Fixed())
+    return replace(open_session(specify(config)), model=Fixed())
 
 
 @pytest.fixture

@@ -70,9 +70,7 @@ class Oracle(nn.Module):
 
 
 def opened(*overrides: str) -> Session:
-    config = compose(overrides)
-    specify(config)
-    return open_session(config)
+    return open_session(specify(compose(overrides)))
 
 
 def on_mfnet(data: Path, *overrides: str) -> Session:
