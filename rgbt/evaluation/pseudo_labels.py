@@ -159,20 +159,24 @@ def write_pseudo_labels(
     return PseudoLabels(out)
 
 
-def summary(found: PseudoLabels) -> Grid:
+def summary(labels: PseudoLabels) -> Grid:
     """Which share of the pixels got which class, and how sure the teacher was of them."""
-    said = found.manifest
-    by_class = [said["by_class"][name] for name in found.classes]
+    manifest = labels.manifest
+    by_class = [manifest["by_class"][name] for name in labels.classes]
     rows = [
         (name, percent(each["share"]), _percent(each["mean_confidence"]))
-        for name, each in zip(found.classes, by_class, strict=True)
+        for name, each in zip(labels.classes, by_class, strict=True)
     ]
-    least = said["threshold"]
+    least = manifest["threshold"]
     which = f"pixels with a confidence of at least {least:g}" if least else "every pixel"
-    title = f"{said['images']} images of {said['dataset']} {said['split']}, {which}"
+    title = f"{manifest['images']} images of {manifest['dataset']} {manifest['split']}, {which}"
     total = sum(each["share"] * (each["mean_confidence"] or 0.0) for each in by_class)
-    kept = ("kept", percent(said["kept"]), _percent(total / said["kept"] if said["kept"] else None))
-    whole = ("all pixels", percent(1.0), percent(said["mean_confidence"]))
+    kept = (
+        "kept",
+        percent(manifest["kept"]),
+        _percent(total / manifest["kept"] if manifest["kept"] else None),
+    )
+    whole = ("all pixels", percent(1.0), percent(manifest["mean_confidence"]))
     return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
 
 

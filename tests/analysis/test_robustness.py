@@ -13,8 +13,8 @@ from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
 from rgbt.config.command import plain_command
 from rgbt.evaluation.robustness import CLEAN, FORMAT
+from rgbt.evaluation.robustness_table import FOLDER
 from rgbt.metrics.named import value
-from rgbt.robustness import FOLDER
 from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
