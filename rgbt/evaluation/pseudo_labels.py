@@ -171,11 +171,8 @@ def summary(labels: PseudoLabels) -> Grid:
     which = f"pixels with a confidence of at least {least:g}" if least else "every pixel"
     title = f"{manifest['images']} images of {manifest['dataset']} {manifest['split']}, {which}"
     total = sum(each["share"] * (each["mean_confidence"] or 0.0) for each in by_class)
-    kept = (
-        "kept",
-        percent(manifest["kept"]),
-        _percent(total / manifest["kept"] if manifest["kept"] else None),
-    )
+    share = manifest["kept"]
+    kept = ("kept", percent(share), _percent(total / share if share else None))
     whole = ("all pixels", percent(1.0), percent(manifest["mean_confidence"]))
     return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
 
