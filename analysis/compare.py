@@ -54,14 +54,14 @@ class Options:
             "(virtual views), next (consecutive frames); default: of single frames"
         ),
     ] = ""
-    degradation: Annotated[
+    corruption: Annotated[
         str,
         Help(
-            "of runs, counts of corrupted images (rgbt robustness run=...): degradation=noise "
-            "severity=16"
+            "of runs, counts of corrupted images (rgbt robustness run=...): "
+            "corruption=noise:rgb severity=16"
         ),
     ] = ""
-    severity: Annotated[str, Help("of the degradation")] = ""
+    severity: Annotated[str, Help("of the corruption")] = ""
     missing: Annotated[
         Literal["refuse", "leave_out"],
         Help("refuse, or leave_out: compare the images that both hold"),
@@ -99,22 +99,22 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.tracking.terminal import rich_table, show
 
     del overrides  # none is heeded
-    frames, degradation, severity = options.frames, options.degradation, options.severity
-    _check_failing(degradation, severity, frames)
+    frames, corruption, severity = options.frames, options.corruption, options.severity
+    _check_corruption(corruption, severity, frames)
     check_out(options.out)
     _check_given(options)
     opened = [
         open_counts(side, options.runs_dir, options.split, frames)
         for side in (options.a, options.b)
     ]
-    if degradation:
-        opened = [under(each, degradation, severity) for each in opened]
+    if corruption:
+        opened = [under(each, corruption, severity) for each in opened]
     a, b = _counts(opened, options.missing)
     settings = settings_of(options)
     metrics = metrics_of(options.metrics, [*a, *b], settings)
     comparison = compare(a, b, metrics, settings)
-    failing = " ".join(word for word in (degradation, severity) if word)
-    labels = [f"{label} ({failing})" if failing else label for label in _labels(opened)]
+    shown = " ".join(word for word in (corruption, severity) if word)
+    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
     notes = absent_classes([*a, *b], settings.absent)
     grid = replace(comparison_grid(comparison, labels), notes=notes)
     said = sentence(comparison, *labels)
@@ -261,11 +261,11 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _check_failing(degradation: str, severity: str, frames: str) -> None:
-    if severity and not degradation:
-        raise InputError("'severity' has no effect without degradation=..., for example noise.")
-    if degradation and frames:
-        raise InputError(f"degradation={degradation} is of single frames; leave frames= out.")
+def _check_corruption(corruption: str, severity: str, frames: str) -> None:
+    if severity and not corruption:
+        raise InputError("'severity' has no effect without corruption=..., for example noise.")
+    if corruption and frames:
+        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
 
 
 def _check_given(options: Options) -> None:

@@ -1,4 +1,4 @@
-"""Counts of failing images, as ``python -m rgbt.robustness`` leaves them beside a run."""
+"""Counts of corrupted images, as ``python -m rgbt.robustness`` leaves them beside a run."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from analysis.results import RUNS, Stored, open_counts
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
+from rgbt.spec.corruption_names import row_name
 
 FOLDER = Path("evaluations") / "robustness"
 FORMAT = "rgbt robustness 1"
@@ -19,11 +20,11 @@ CLEAN = "clean"
 
 @dataclass(frozen=True)
 class Level:
-    """One severity of one degradation.
+    """One severity of one corruption.
 
     Attributes:
         mark: name of its file, e.g. "noise-16".
-        row: the degradation: "clean", "noise", "rgb_removed", "features-thermal", ...
+        row: the corruption: "clean", "noise", "rgb_removed", "features-thermal", ...
         title: what people call it.
         unit: of the severity; "" where there is one alone.
         severity: 0 is the clean image.
@@ -87,7 +88,7 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
 
 
 def folder_of(stored: Stored) -> Path:
-    """Where the counts of a run's failing images lie.
+    """Folder of the counts of a run's corrupted images.
 
     Raises:
         InputError: it is no run, or was not measured.
@@ -120,33 +121,33 @@ def _place(level: Level) -> tuple[bool, bool, str, str, float]:
     return (level.row != CLEAN, level.unit != "", level.title, level.row, level.severity)
 
 
-def under(stored: Sequence[Stored], degradation: str, severity: str) -> tuple[Stored, ...]:
-    """The same trainings on failing images.
+def under(stored: Sequence[Stored], corruption: str, severity: str) -> tuple[Stored, ...]:
+    """The same trainings on corrupted images.
 
     Args:
         stored: runs.
-        degradation: a row, e.g. "noise" or "features-thermal".
+        corruption: as it was measured, e.g. "noise:rgb", or a row such as "features-thermal".
         severity: as text; "" where the row has one alone.
 
     Raises:
         InputError: no runs, not measured, or measured at other severities.
     """
-    return tuple(_under(each, degradation, severity) for each in stored)
+    return tuple(_under(each, row_name(corruption), severity) for each in stored)
 
 
-def _under(stored: Stored, degradation: str, severity: str) -> Stored:
+def _under(stored: Stored, row: str, severity: str) -> Stored:
     folder = folder_of(stored)
     levels = levels_of(folder)
-    of_row = [level for level in levels if level.row == degradation]
+    of_row = [level for level in levels if level.row == row]
     if not of_row:
-        known = nearest(degradation, {level.row for level in levels})
-        raise InputError(f"degradation={degradation} was not measured in {folder}; {known}.")
+        known = nearest(row, {level.row for level in levels})
+        raise InputError(f"corruption={row} was not measured in {folder}; {known}.")
     chosen = [each for each in of_row if f"{each.severity:g}" == severity]
     chosen = of_row if not severity and len(of_row) == 1 else chosen
     if len(chosen) != 1:
         known = ", ".join(f"{each.severity:g}" for each in of_row)
         raise InputError(
-            f"severity={severity}: {folder} holds {degradation} at {known}; give one of these."
+            f"severity={severity}: {folder} holds {row} at {known}; give one of these."
         )
     (level,) = chosen
     path = folder / f"{level.mark}.npz"

@@ -5,14 +5,12 @@ Counts are written, and the tables that follow from them are shown.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import (
-    AS_TRAINED,
     Checkpoint,
     Head,
     Modality,
@@ -26,7 +24,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from rgbt.evaluation.corrupted import Failure
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 
 
 @dataclass(frozen=True)
@@ -39,14 +37,15 @@ class Options:
     modality: Modality = "default"
     regions: RegionsFile = "as trained"
     head: Head = "as trained"
-    degradation: Annotated[
+    corruption: Annotated[
         str,
         Help(
-            "of the images: a file of conf/degradation such as thermal_removed or noise, with a "
-            "severity: degradation=noise severity=16; rgbt robustness takes all of them"
+            "of the images: a file of conf/corruption such as noise, with a severity: "
+            "corruption=noise severity=16; of one image: corruption=noise:rgb, removed:thermal; "
+            "rgbt robustness measures all of them"
         ),
     ] = "none"
-    severity: Annotated[str, Help("of the degradation")] = ""
+    severity: Annotated[str, Help("of the corruption")] = ""
     checkpoint: Checkpoint = "best"
     trust: Trust = ""
     out: Annotated[
@@ -58,63 +57,35 @@ def main(options: Options, overrides: list[str]) -> int:
     """Evaluate a run, on its own data set or another one, or a network with weights from a file.
 
     Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
-    degradation: degradation.block=16 degradation.seed=1
+    corruption: corruption.block=16 corruption.seed=1
     """
-    from rgbt.build.load_run import open_trained
-    from rgbt.build.session import evaluate, result_tables, view_of
-    from rgbt.config.stored_config import parse_trust
-    from rgbt.evaluation.corrupted import own_words
-    from rgbt.tracking.terminal import result_view, show
+    from rgbt.evaluation.segmentation import evaluate
+    from rgbt.evaluation.segmentation_files import counts_path, overview
+    from rgbt.tracking.terminal import show
     from rgbt.training.overview import announce_network
 
     if options.out is not None and options.out.is_dir():
         raise InputError(f"out={options.out} is a folder; name the file of the counts, x.npz.")
-    words, overrides = own_words(overrides)
-    trust = parse_trust(options.trust)
-    failure = _failure(options, words, trust)
-    if options.regions != AS_TRAINED:
-        overrides = [*overrides, f"metric={options.regions}"]
-    run, runs_dir, checkpoint = options.run, options.runs_dir, options.checkpoint
-    stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
-    announce_network(stored)
-    session = stored.session
-    view = view_of(session, options.modality)
-    head = None if options.head == AS_TRAINED else options.head
-    if failure is not None:
-        session = failure.applied(session, options.split)
-    found = evaluate(session, session.model, options.split, view=view, head=head)
-    counts = found.counts
-    stem = "_".join(
-        [session.dataset.name, counts.split, view, counts.partition]
-        + ([] if head is None else [f"{head}-head"])
-        + ([] if failure is None else [failure.mark])
-        + ([] if checkpoint == "best" else [checkpoint])
-    )
-    path = options.out or stored.folder / f"{stem}.npz"
+    network, request = _requests(options, overrides)
+    opened = network.open()
+    announce_network(opened)
+    result = evaluate(opened.session, opened.session.model, request)
+    path = options.out or counts_path(opened, network, request, result)
     path.parent.mkdir(parents=True, exist_ok=True)
-    counts.save(path)
-    label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
-    label += f", {failure.told}" if failure else ""
-    tables = result_tables(counts, session.regions, label, stored.step)
-    heads = session.domains.heads_in_words(head or session.domains.tested_head)
-    places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
-    if found.skipped:
-        places.append(("left out", f"{len(found.skipped)} images that cannot be read"))
-    show(result_view(tables, path.parent, places))
+    result.counts.save(path)
+    show(overview(opened, request, result, path))
     return 0
 
 
-def _failure(options: Options, words: list[str], trust: Collection[str]) -> Failure | None:
-    """The degradation and its severity; None where none is asked for."""
-    from rgbt.evaluation.corrupted import choose
+def _requests(options: Options, overrides: list[str]) -> tuple[NetworkRequest, EvaluationRequest]:
+    from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 
-    if options.degradation != "none":
-        return choose(options.degradation, words, trust).at(options.severity)
-    idle = [*(["severity"] if options.severity else []), *words]
-    if idle:
-        key = idle[0].partition("=")[0]
-        raise InputError(f"'{key}' has no effect without degradation=..., for example noise.")
-    return None
+    words, others = split_overrides(overrides)
+    network = NetworkRequest.from_options(options, others, options.regions)
+    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
+    request = EvaluationRequest.from_options(options, options.split, options.head, corruption)
+    return network, request
 
 
 entry = PlainCommand(Options, main)

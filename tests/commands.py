@@ -39,7 +39,7 @@ Trained = Callable[..., Path]
 @contextmanager
 def without_pictures() -> Iterator[None]:
     """Pictures of runs are empty files: drawing takes as long as the steps of these tests."""
-    from rgbt.tracking import pair_pictures
+    from rgbt.evaluation import consistency_files
     from rgbt.training import train as training
 
     def draw(*things: Any) -> None:
@@ -49,7 +49,7 @@ def without_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("draw_panel", "draw_region_heat", "draw_pairs"):
             patch.setattr(training, name, draw)
-        patch.setattr(pair_pictures, "draw_pairs", draw)
+        patch.setattr(consistency_files, "draw_pairs", draw)
         yield
 
 

@@ -136,7 +136,7 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     code, _, err = call(sketch.main, *words_of(lab), f"out={lab / 'masks.png'}")
     assert code == 0, err
     assert (lab / "masks.png").is_file()
-    words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
+    words = (f"run={run}", f"corruption={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
     code, _, err = call(evaluate.entry, *words)
     assert code == 0, err
     words = (f"run={run}", "input=test", f"out={lab / 'out'}", "trust=my_lab")

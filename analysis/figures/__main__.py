@@ -103,9 +103,9 @@ class Options:
     size: Annotated[
         str | None, Help("of the picture of regions/heat (480x640), 16 to 4096 pixels a side")
     ] = None
-    degradations: Annotated[
+    corruptions: Annotated[
         str | None,
-        Help("to show, with commas (robustness): noise,frozen; default: all that were measured"),
+        Help("to show, with commas (robustness): noise:rgb,frozen; default: all that exist"),
     ] = None
 
     @property

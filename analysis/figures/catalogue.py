@@ -47,7 +47,7 @@ RUNS = "runs= (run, group or counts, with labels: label:run)"
 OF_RUNS = ("runs", "runs_dir", "split", "absent")
 FAILING = (
     "runs= (run, group or folder of python -m rgbt.robustness, with labels: label:run)",
-    (*OF_RUNS, "degradations"),
+    (*OF_RUNS, "corruptions"),
     (),
 )
 OF_INTERVALS = ("band", "resamples", "level", "blocks")
@@ -132,7 +132,7 @@ FIGURES: dict[str, Entry] = {
         make_papers.multihead_fig3,
     ),
     "robustness": Entry(
-        "mIoU as images fail, one panel per degradation, one line per method",
+        "mIoU under corruptions, one panel per corruption, one line per method",
         *FAILING,
         make_methods.robustness,
         numbers=make_methods.robustness_numbers,

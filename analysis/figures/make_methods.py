@@ -140,8 +140,8 @@ def _failing(given: Given) -> tuple[Panel, ...]:
         label, colon, place = word.partition(":")
         for each in trainings(place if colon else label, Path(runs_dir).expanduser(), split):
             found.setdefault(label if colon else each.label, []).append(each)
-    named = given.get("degradations", "")
-    rows = split_list(named, "degradations") if named else []
+    named = given.get("corruptions", "")
+    rows = split_list(named, "corruptions") if named else []
     levels = (level for each in found.values() for training in each for level in training.levels)
     return panels(found, given.absent(level.counts for level in levels), rows)
 

@@ -1,4 +1,4 @@
-"""What is left of each method as images fail: one panel per degradation, severity along x."""
+"""What is left of each method under corruptions: one panel per corruption, severity along x."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from analysis.robustness import CLEAN, Level, Training
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
+from rgbt.spec.corruption_names import row_name
 from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import Grid, number
 
@@ -38,8 +39,11 @@ HEIGHT = 1.55
 HEIGHT_BELOW = 1.35
 """Inches of a line of panels, and of the panel below them."""
 
+ROW = "degradation"
+"""What the tables beside the figure have called the column of corruptions from the start."""
+
 MISSING = "one image missing"
-"""Title of the panel of degradations without a severity."""
+"""Title of the panel of corruptions without a severity."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """One degradation, or those without a severity together.
+    """One corruption, or those without a severity together.
 
     Attributes:
         row: its name; "" of those together.
@@ -95,7 +99,7 @@ def panels(
     Args:
         methods: label -> its trainings.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-        rows: names of the degradations to show; (): all.
+        rows: names of the corruptions to show; (): all.
 
     Raises:
         InputError: methods on other images, or measured at different severities; a row that nobody
@@ -111,9 +115,10 @@ def panels(
     known = list(dict.fromkeys(level.row for level in levels if level.row != CLEAN))
     if not known:
         raise InputError("runs: clean images alone were measured; python -m rgbt.robustness does.")
+    rows = [row_name(row) for row in rows]
     for row in rows:
         if row not in known:
-            raise InputError(f"degradations: '{row}' was not measured; {nearest(row, known)}.")
+            raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
     shown = list(rows) or known
     first = {level.row: level for level in reversed(levels)}
     words = [row for row in shown if not first[row].unit]
@@ -171,7 +176,7 @@ def _mious(levels: Sequence[Level | None], absent: Absent) -> list[float]:
 
 @styled
 def draw(data: Sequence[Panel], *, relative: bool) -> Figure:
-    """One panel per degradation; mean over trainings, band of one standard deviation.
+    """One panel per corruption; mean over trainings, band of one standard deviation.
 
     The dashed line is the score on clean images. Missing images stand side by side below.
 
@@ -241,7 +246,7 @@ def _said(curve: Curve) -> str:
 
 def numbers(data: Sequence[Panel]) -> dict[str, str]:
     """Ending of a file -> its text: the figure's numbers as a table, and as CSV with all digits."""
-    header = ("degradation", "severity", "unit", "method", "seeds", "mIoU", "sd")
+    header = (ROW, "severity", "unit", "method", "seeds", "mIoU", "sd")
     lines: list[tuple[object, ...]] = [(*header, "relative", "relative_sd")]
     rows = []
     for panel, place, said in _places(data):
@@ -259,12 +264,12 @@ def numbers(data: Sequence[Panel]) -> dict[str, str]:
         rows.append((*said, *cells))
     title = "mIoU in percent, mean ± standard deviation over seeds (percent of the clean mIoU)"
     methods = [curve.method for curve in data[0].curves]
-    grid = Grid(title, ("degradation", "severity", *methods), tuple(rows))
+    grid = Grid(title, (ROW, "severity", *methods), tuple(rows))
     return {".md": grid.to_markdown(), ".csv": csv_text(lines)}
 
 
 def _places(data: Sequence[Panel]) -> list[tuple[Panel, int, tuple[str, str]]]:
-    """(panel, column of its curves, (degradation, severity)) of every line of a table."""
+    """(panel, column of its curves, (corruption, severity)) of every line of a table."""
     found = []
     for index, panel in enumerate(data):
         for place, severity in enumerate(panel.severities):

@@ -153,10 +153,10 @@ def check_regions(regions: Any, image_hw: tuple[int, int]) -> None:
         )
 
 
-def check_degradation(kind: Any) -> None:
-    """Refuse a degradation without the members of `rgbt.corruptions.corruption.Degradation`."""
+def check_corruption(kind: Any) -> None:
+    """Refuse a corruption without the members of `rgbt.corruptions.corruption.Corruption`."""
     calls = {"check": ("severity",), "__call__": ("sample", "severity", "rng_of")}
-    check_members("degradation", kind, ("title", "unit", "severities"), calls)
+    check_members("corruption", kind, ("title", "unit", "severities"), calls)
 
 
 def watch_model(model: nn.Module, num_classes: int) -> None:

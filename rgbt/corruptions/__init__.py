@@ -1,4 +1,5 @@
-"""Images that are missing or partly wrong: a kind of failure with a severity.
+"""Images that are missing or partly wrong, each kind of corruption with a severity.
 
-A failure is chosen by its file in ``conf/degradation/``; `dataset.Degraded` is a data set under it.
+A corruption is chosen by its file in ``conf/corruption/``; `rgbt.evaluation.corrupted_dataset` is a
+data set seen under it.
 """

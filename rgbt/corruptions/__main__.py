@@ -1,4 +1,4 @@
-"""Draw degradations of one pair: ``python -m rgbt.corruptions dataset=synth out=sheet.png``."""
+"""Draw corruptions of one pair: ``rgbt corruptions dataset=synth out=sheet.png``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,8 @@ if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
 
 SUFFIXES = (".png", ".jpg")
-PLACE = 11
+POSITION = 11
 """Of the sample in its split: late enough for a delay of ten frames."""
-
-BOTH = ("occluded", "noise", "blur")
-"""Kinds that have files of RGB alone and of thermal alone beside them."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +24,11 @@ class Options:
     """What is drawn."""
 
     out: Annotated[str, Help("picture to write, .png or .jpg")] = ""
-    degradations: Annotated[
+    corruptions: Annotated[
         str,
         Help(
-            "files of conf/degradation with commas, or all; default: those of one image alone are "
-            "left out where both can fail"
+            "files of conf/corruption with commas, such as frozen,noise:rgb, or all; default: "
+            "those of one image alone are left out where both can be corrupted"
         ),
     ] = ""
     split: Annotated[
@@ -41,28 +38,30 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Draw a pair under every severity of the degradations: RGB left, thermal right.
+    """Draw a pair under every severity of the corruptions: RGB left, thermal right.
 
     Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet (default: the embedded
-    data), and what is drawn at random, degradation.seed=1
+    data), and what is drawn at random, corruption.seed=1
     """
-    from rgbt.corruptions.sheet import draw, sheet
-    from rgbt.evaluation.corrupted import known_degradations, own_words
-    from rgbt.robustness import chosen_of
+    from rgbt.evaluation.corruption_request import (
+        choose_corruptions,
+        split_overrides,
+        standard_corruptions,
+    )
+    from rgbt.evaluation.corruption_sheet import draw, sheet
 
     path = _path(options.out)
-    words, overrides = own_words(overrides)
-    names = options.degradations or ",".join(
-        name for name in known_degradations() if not name.startswith(tuple(f"{b}_" for b in BOTH))
-    )
-    chosen = chosen_of(names, words)
+    words, overrides = split_overrides(overrides)
+    known = standard_corruptions()
+    usual = [name for name in known if name.partition(":")[0] not in known or ":" not in name]
+    chosen = choose_corruptions(options.corruptions or ",".join(usual), words)
     dataset: LabelledDataset = built("dataset", overrides)
     listed = dataset.names(options.split)
-    name = options.name or listed[min(PLACE, len(listed) - 1)]
+    name = options.name or listed[min(POSITION, len(listed) - 1)]
     if name not in listed:
         near = nearest(name, listed[:20])
         raise InputError(f"name={name}: split '{options.split}' has no such sample; {near}.")
-    kinds = [each.degradation for each in chosen]
+    kinds = [each.corruption for each in chosen]
     lines = sheet(dataset, kinds, name, options.split, chosen[0].seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     draw(lines).savefig(path, dpi=95)

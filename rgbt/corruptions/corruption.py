@@ -1,8 +1,9 @@
-"""What a degradation is: a failure of a camera with a severity, in one of two forms.
+"""What a corruption is: a missing or partly wrong image with a severity, in one of two forms.
 
-Severity 0 is no failure and never reaches a degradation: `dataset.Degraded` hands such samples on
-as they are. Lengths are given in pixels of an image of `REFERENCE_HEIGHT` rows and scaled to the
-height of the file, so that one ladder serves MFNet (480), PST900 (720) and the embedded data (120).
+Severity 0 is the clean image and never reaches a corruption: `rgbt.evaluation.corrupted_dataset`
+returns such samples as they are. Lengths are given in pixels of an image of `REFERENCE_HEIGHT` rows
+and scaled to the height of the file, so that one ladder serves MFNet (480), PST900 (720) and the
+embedded data (120).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ REFERENCE_HEIGHT = 480
 
 Image = Literal["rgb", "thermal"]
 Images = Literal["rgb", "thermal", "both"]
-"""Which image of a pair fails."""
+"""Which image of a pair is corrupted."""
 
 IMAGES: dict[Images, tuple[Image, ...]] = {
     "rgb": ("rgb",),
@@ -42,7 +43,7 @@ Severities = Annotated[tuple[Annotated[float, Interval(gt=0, le=1000)], ...], Le
 
 
 class Kind(Protocol):
-    """What every degradation says of itself.
+    """What every corruption declares.
 
     Attributes:
         title: what tables and figures call it, e.g. "noise, RGB".
@@ -61,10 +62,10 @@ class Kind(Protocol):
 
 @runtime_checkable
 class OfPixels(Kind, Protocol):
-    """A failure that changes the pixels of one pair."""
+    """A corruption that changes the pixels of one pair."""
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
-        """`sample` under the failure, uint8 as before; the label and the name stay.
+        """The corrupted `sample`, uint8 as before; the label and the name stay.
 
         Raises:
             InputError: the severity changes nothing of an image of this size.
@@ -74,14 +75,14 @@ class OfPixels(Kind, Protocol):
 
 @runtime_checkable
 class OfTime(Kind, Protocol):
-    """A failure that shows the thermal image of another frame."""
+    """A corruption that shows the thermal image of another frame."""
 
-    def shown(self, place: int, severity: float) -> int:
-        """Place of the frame whose thermal image is shown at `place`; 0 is the first frame."""
+    def shown(self, index: int, severity: float) -> int:
+        """Index of the frame whose thermal image is shown at `index`; 0 is the first frame."""
         ...
 
 
-Degradation = OfPixels | OfTime
+Corruption = OfPixels | OfTime
 
 
 def check_ladder(kind: Kind) -> None:
@@ -93,7 +94,7 @@ def check_ladder(kind: Kind) -> None:
     ladder = kind.severities
     if not ladder or any(low >= high for low, high in zip((0.0, *ladder), ladder, strict=False)):
         raise InputError(
-            "degradation.severities must rise from above 0 (0 is the clean image and always "
+            "corruption.severities must rise from above 0 (0 is the clean image and always "
             f"measured), got {list(ladder)}."
         )
     for severity in ladder:

@@ -37,12 +37,12 @@ class Frozen:
         if severity < 2:
             raise InputError(
                 "severity of frozen counts the frames from one thermal image to the next: 1 is "
-                "no failure; give 2 or more."
+                "no corruption; give 2 or more."
             )
 
-    def shown(self, place: int, severity: float) -> int:
+    def shown(self, index: int, severity: float) -> int:
         """See `OfTime`."""
-        return place - place % int(severity)
+        return index - index % int(severity)
 
 
 class Delayed:
@@ -68,6 +68,6 @@ class Delayed:
         """Whole frames, at least 1."""
         check_whole(severity)
 
-    def shown(self, place: int, severity: float) -> int:
+    def shown(self, index: int, severity: float) -> int:
         """See `OfTime`."""
-        return max(0, place - int(severity))
+        return max(0, index - int(severity))

@@ -25,8 +25,8 @@ DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 class Misregistered:
     """Thermal is moved by n pixels up, down, left or right, as drawn for each image.
 
-    Whole pixels, so that nothing is interpolated and the effect is that of the place alone. What
-    comes in from outside repeats the edge: a black stripe would be a failure of its own. The
+    Whole pixels, so that nothing is interpolated and the effect is that of the position alone. What
+    comes in from outside repeats the edge: a black stripe would be a corruption of its own. The
     colour image and the label stay.
 
     Args:

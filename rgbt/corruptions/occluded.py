@@ -85,7 +85,7 @@ class Occluded:
         if number == 0:
             raise InputError(
                 f"a share of {share:g} of {rows} x {columns} blocks is none; give a severity of at "
-                f"least {0.5 / (rows * columns):.2g}, or a smaller degradation.block."
+                f"least {0.5 / (rows * columns):.2g}, or a smaller corruption.block."
             )
         blocks = np.zeros(rows * columns, bool)
         blocks[rng.permutation(rows * columns)[:number]] = True

@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,12 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from rgbt.build.session import Session, decode_ahead, heads_of
+from rgbt.build.session import Session
 from rgbt.checks import InputError, RunError, check_range
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.batches import Dataset
-from rgbt.data.domains import TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import eval_batches
 from rgbt.data.pseudo_labels import (
@@ -41,12 +40,14 @@ from rgbt.data.pseudo_labels import (
 )
 from rgbt.engine.confidence import probabilities
 from rgbt.engine.progress import progress
+from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.tables import Grid, percent
 from rgbt.tracking.terminal import tell
-from rgbt.types import IGNORE, Sample, View
+from rgbt.types import IGNORE, Sample
 
 BEGUN = "pseudo_labels.begun.json"
 """What a folder that is not finished was begun with."""
@@ -68,14 +69,23 @@ class Teacher:
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What is predicted and what is kept of it; see `write_pseudo_labels`."""
+class Labelling:
+    """How a prediction becomes labels.
 
-    split: str
-    view: View
-    threshold: float
-    label_map: LabelMap | None
-    head: TestedHead | None
+    Attributes:
+        threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
+        label_map: from the classes of the network to those of the data set; None: they are the
+            same.
+
+    Raises:
+        InputError: a threshold out of range.
+    """
+
+    threshold: float = 0.0
+    label_map: LabelMap | None = None
+
+    def __post_init__(self) -> None:
+        check_range("threshold", self.threshold, 0, 1)
 
 
 def teacher_of(name: str, model: nn.Module) -> Teacher:
@@ -102,15 +112,8 @@ def label_map_of(name: str) -> LabelMap | None:
     return made
 
 
-def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where to, and what is kept
-    session: Session,
-    teacher: Teacher,
-    split: str,
-    view: View,
-    out: Path,
-    threshold: float,
-    label_map: LabelMap | None,
-    head: TestedHead | None,
+def write_pseudo_labels(
+    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling, out: Path
 ) -> PseudoLabels:
     """Predict a split with the network of `session` and write its sure pixels as labels.
 
@@ -125,26 +128,22 @@ def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where 
     Args:
         session: see `rgbt.build.session.open_session`; its network is the teacher.
         teacher: who that is.
-        split: of the session's data set.
-        view: what is predicted from.
+        request: split, view and head; a head of None: as the teacher's configuration says.
+        labelling: how predictions become labels.
         out: folder, made where it is missing.
-        threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
-        label_map: from the classes of the network to those of the data set; None: they are the
-            same.
-        head: which of two heads predicts an image; None: as the teacher's configuration says.
 
     Raises:
         InputError: settings that do not fit each other, a folder that holds something else or was
             begun with other settings, an image that cannot be read (data.on_error=raise).
         RunError: the network's predictions are not finite.
     """
-    check_range("threshold", threshold, 0, 1)
-    if label_map is not None:
+    assert request.corruption is None, "labels are predicted from clean images"
+    if (label_map := labelling.label_map) is not None:
         num_classes = session.spec.model.values.get("num_classes", label_map.num_source)
         label_map.check(num_classes, tuple(session.dataset.classes), session.dataset.name)
-    asked = _Asked(split, view, threshold, label_map, head)
-    settings = _settings(session, teacher, asked)
-    names = tuple(dict.fromkeys(session.dataset.names(split)))
+    request = replace(request, view=view_of(session, request.view))
+    settings = _settings(session, teacher, request, labelling)
+    names = tuple(dict.fromkeys(session.dataset.names(request.split)))
     _refuse_other_content(out)
     out.mkdir(parents=True, exist_ok=True)
     with _alone(out):
@@ -154,25 +153,27 @@ def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where 
             # First the one, then the other: a killed process leaves a folder that is known.
             write_atomic(out / BEGUN, _text(settings))
             (out / MANIFEST).unlink(missing_ok=True)
-            skipped = _predict(session, asked, out, missing, len(names))
+            written = _Writer(out, labelling)
+            skipped = _predict(session, request, written, missing, len(names))
             _finish(out, settings, [name for name in names if name not in skipped], skipped)
     return PseudoLabels(out)
 
 
-def summary(found: PseudoLabels) -> Grid:
+def summary(labels: PseudoLabels) -> Grid:
     """Which share of the pixels got which class, and how sure the teacher was of them."""
-    said = found.manifest
-    by_class = [said["by_class"][name] for name in found.classes]
+    manifest = labels.manifest
+    by_class = [manifest["by_class"][name] for name in labels.classes]
     rows = [
         (name, percent(each["share"]), _percent(each["mean_confidence"]))
-        for name, each in zip(found.classes, by_class, strict=True)
+        for name, each in zip(labels.classes, by_class, strict=True)
     ]
-    least = said["threshold"]
+    least = manifest["threshold"]
     which = f"pixels with a confidence of at least {least:g}" if least else "every pixel"
-    title = f"{said['images']} images of {said['dataset']} {said['split']}, {which}"
+    title = f"{manifest['images']} images of {manifest['dataset']} {manifest['split']}, {which}"
     total = sum(each["share"] * (each["mean_confidence"] or 0.0) for each in by_class)
-    kept = ("kept", percent(said["kept"]), _percent(total / said["kept"] if said["kept"] else None))
-    whole = ("all pixels", percent(1.0), percent(said["mean_confidence"]))
+    share = manifest["kept"]
+    kept = ("kept", percent(share), _percent(total / share if share else None))
+    whole = ("all pixels", percent(1.0), percent(manifest["mean_confidence"]))
     return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
 
 
@@ -181,7 +182,7 @@ def _percent(fraction: float | None) -> str:
 
 
 @dataclass
-class _Chosen:
+class _Subset:
     """A data set of which only some names are read."""
 
     name: str
@@ -196,20 +197,22 @@ class _Chosen:
         return self.dataset.read(name)
 
 
-def _settings(session: Session, teacher: Teacher, asked: _Asked) -> dict[str, Any]:
+def _settings(
+    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling
+) -> dict[str, Any]:
     """The first part of the manifest: all that the files follow from."""
     settings = {
         "format": FORMAT,
         "teacher": teacher.name,
         "weights": teacher.weights,
         "network": _network(session.spec),
-        "view": asked.view,
-        "head": asked.head or session.domains.tested_head,
-        "label_map": None if asked.label_map is None else asdict(asked.label_map),
-        "threshold": float(asked.threshold),
+        "view": request.view,
+        "head": request.head or session.domains.tested_head,
+        "label_map": None if labelling.label_map is None else asdict(labelling.label_map),
+        "threshold": float(labelling.threshold),
         "dataset": session.dataset.name,
         "fingerprint": session.dataset.fingerprint(),
-        "split": asked.split,
+        "split": request.split,
         "classes": session.dataset.classes,
     }
     plain: dict[str, Any] = json.loads(json.dumps(settings))
@@ -220,10 +223,10 @@ def _network(spec: RunSpec) -> str:
     """SHA-256 over the settings of a prediction, without the weights and without paths."""
     plain = spec.plain
     model = {key: value for key, value in plain["model"].items() if key not in ("weights", "fresh")}
-    places = ("root", "cache_dir", "palette", "layout")
-    read = {key: value for key, value in plain["dataset"].items() if key not in places}
-    asked = [model, read, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
-    text = json.dumps(asked, sort_keys=True)
+    unimportant = ("root", "cache_dir", "palette", "layout")
+    read = {key: value for key, value in plain["dataset"].items() if key not in unimportant}
+    decisive = [model, read, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
+    text = json.dumps(decisive, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -270,10 +273,10 @@ def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     return finished
 
 
-def _refuse_others(out: Path, stored: dict[str, Any], settings: dict[str, Any]) -> None:
+def _refuse_others(out: Path, begun: dict[str, Any], settings: dict[str, Any]) -> None:
     for key, value in settings.items():
-        if key != "teacher" and stored.get(key) != value:
-            before, now = (str(each)[:60] for each in (stored.get(key), value))
+        if key != "teacher" and begun.get(key) != value:
+            before, now = (str(each)[:60] for each in (begun.get(key), value))
             raise InputError(
                 f"{out} was begun with pseudo-labels of another {key} ({before}, now {now}); name "
                 "another folder, or remove this one."
@@ -285,43 +288,50 @@ def _is_written(out: Path, name: str) -> bool:
 
 
 def _predict(
-    session: Session, asked: _Asked, out: Path, missing: tuple[str, ...], total: int
+    session: Session,
+    request: EvaluationRequest,
+    writer: _Writer,
+    missing: tuple[str, ...],
+    total: int,
 ) -> dict[str, str]:
     """Predict and write the missing images; why others could not be read, by name."""
     if not missing:
         return {}
-    decode_ahead(session, asked.split)
-    chosen = _Chosen(session.dataset.name, session.dataset, missing)
-    batches = eval_batches(chosen, asked.split, session.transform, session.loading)
+    decode_ahead(session, request.split)
+    subset = _Subset(session.dataset.name, session.dataset, missing)
+    batches = eval_batches(subset, request.split, session.transform, session.loading)
     model, fabric = session.model.eval(), session.fabric
-    heads_by = heads_of(session, asked.view, asked.head)
+    view = view_of(session, request.view)
+    heads_by = heads_of(session, view, request.head)
     with progress() as display:
         done = total - len(missing)
         task = display.add_task("predicting", total=total, completed=done, note="images")
         for batch in batches:
             heads = heads_by(batch.name)
-            found = probabilities(model, batch.to(fabric.device), fabric, asked.view, heads)
+            found = probabilities(model, batch.to(fabric.device), fabric, view, heads)
             confidence, classes = (each.cpu().numpy() for each in found.max(1))
             for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
-                _write(out, name, sure, ids.astype(np.uint8), asked)
+                writer.write(name, sure, ids.astype(np.uint8))
             display.advance(task, len(batch.name))
     return batches.skipped
 
 
-def _write(
-    out: Path,
-    name: str,
-    confidence: NDArray[np.float32],
-    classes: NDArray[np.uint8],
-    asked: _Asked,
-) -> None:
-    if not np.isfinite(confidence).all():
-        raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
-    mapped = classes if asked.label_map is None else asked.label_map(classes)
-    label = np.where(confidence < asked.threshold, np.uint8(IGNORE), mapped)
-    stored = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
-    _write_png(confidence_path(out, name), stored)
-    _write_png(label_path(out, name), label)
+@dataclass(frozen=True)
+class _Writer:
+    """Writes labels and confidences of images to the folder `out`."""
+
+    out: Path
+    labelling: Labelling
+
+    def write(self, name: str, confidence: NDArray[np.float32], classes: NDArray[np.uint8]) -> None:
+        if not np.isfinite(confidence).all():
+            raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
+        label_map, threshold = self.labelling.label_map, self.labelling.threshold
+        mapped = classes if label_map is None else label_map(classes)
+        label = np.where(confidence < threshold, np.uint8(IGNORE), mapped)
+        scaled = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+        _write_png(confidence_path(self.out, name), scaled)
+        _write_png(label_path(self.out, name), label)
 
 
 def _write_png(path: Path, image: NDArray[Any]) -> None:

@@ -1,4 +1,4 @@
-"""Counts of a network under every failure: what is evaluated, what is kept, what is made again."""
+"""Counts of a network under every corruption: what is evaluated, kept and evaluated again."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+from torch import nn
+
+from rgbt.build.session import Session
 from rgbt.checks import InputError
-from rgbt.evaluation.corrupted import Chosen, Failure
+from rgbt.engine.progress import progress
+from rgbt.evaluation.corruption_request import CorruptionRequest
+from rgbt.evaluation.prediction import network_views, view_of
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.segmentation import evaluate
 from rgbt.files import budgets
-from rgbt.types import VIEWS, View
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from rgbt.build.session import Session
-    from rgbt.metrics.counts import Counts
+from rgbt.files.atomic import write_atomic
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.scores import miou
+from rgbt.types import View
 
 FORMAT = "rgbt robustness 1"
 CLEAN = "clean"
@@ -31,107 +36,111 @@ features of one branch alone are decoded."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One evaluation.
+class Condition:
+    """What the network sees in one evaluation: clean images, one branch, or a corruption.
 
     Attributes:
-        mark: name of its file.
-        row: of the table: a degradation or a view, whose severities share it.
+        file_stem: name of its files without extension.
+        row: of the table: a corruption or a view, whose severities share it.
         title: what people call the row.
         unit: of the severity; "" where it has none.
         severity: 0: clean.
         view: what is predicted from.
-        failure: of the images; None: they are clean.
+        corruption: of the images; None: they are clean.
     """
 
-    mark: str
+    file_stem: str
     row: str
     title: str
     unit: str
     severity: float
     view: View
-    failure: Failure | None = None
+    corruption: CorruptionRequest | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """What of the condition decides the counts, as values of JSON."""
+        return {
+            "severity": self.severity,
+            "view": self.view,
+            # The key that counts on disk are found by.
+            "failure": None if self.corruption is None else self.corruption.identity(),
+        }
 
 
 @dataclass(frozen=True)
 class Measured:
-    """An evaluation with its counts, and the mIoU of each part of them as a fraction."""
+    """A condition with its counts, and the mIoU of each part of them as a fraction."""
 
-    asked: Asked
+    condition: Condition
     counts: Counts
     mious: dict[str, float]
 
 
-def asked_of(session: Session, chosen: Sequence[Chosen]) -> tuple[Asked, ...]:
-    """Clean images, single branches as far as the network decodes them, every failure."""
-    from rgbt.build.session import view_of
-
-    view = view_of(session)
-    known = getattr(session.model, "views", VIEWS)
+def conditions(session: Session, corruptions: Sequence[CorruptionRequest]) -> tuple[Condition, ...]:
+    """Clean images, single branches as far as the network decodes them, every severity."""
+    view, known = view_of(session), network_views(session)
     branches = {each: title for each, title in FEATURES.items() if view == "rgbt" and each in known}
-    found = [Asked(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
+    found = [Condition(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
     for branch, title in branches.items():
-        found.append(Asked(f"features-{branch}", f"features-{branch}", title, "", 1.0, branch))
-    for each in chosen:
-        kind = each.degradation
-        for severity in kind.severities:
-            failure = Failure(each, severity)
-            said = (each.row, kind.title, kind.unit, severity)
-            found.append(Asked(failure.mark, *said, view, failure))
+        name = f"features-{branch}"
+        found.append(Condition(name, name, title, "", 1.0, branch))
+    for each in (level for corruption in corruptions for level in corruption.ladder()):
+        kind = each.corruption
+        found.append(
+            Condition(each.file_stem, each.row, kind.title, kind.unit, each.severity, view, each)
+        )
     return tuple(found)
 
 
 def measure(
-    session: Session, split: str, chosen: Sequence[Chosen], folder: Path
+    session: Session, split: str, corruptions: Sequence[CorruptionRequest], folder: Path
 ) -> tuple[Measured, ...]:
-    """Evaluate what is missing of a run's robustness; the clean images come first.
+    """Evaluate what is missing of a run's robustness; the clean images are first.
 
     Args:
         session: with the trained network.
         split: of its data set.
-        chosen: degradations, each with all severities of its ladder.
+        corruptions: each is evaluated at all severities of its ladder.
         folder: of the counts; NAME.npz has a NAME.json, written after it, that says what made it.
 
     Raises:
         InputError: a severity that does not fit the images, or a file that cannot be read.
     """
-    from rgbt.engine.progress import progress
-    from rgbt.metrics.scores import miou
-
     folder.mkdir(parents=True, exist_ok=True)
-    every = asked_of(session, chosen)
+    every = conditions(session, corruptions)
     shared = _shared_identity(session, split)
     found = []
     with progress() as display:
         task = display.add_task("robustness", total=len(every), note="")
-        for asked in every:
-            display.update(task, note=asked.mark)
-            counts = _counts(session, split, asked, shared, folder)
+        for condition in every:
+            display.update(task, note=condition.file_stem)
+            counts = _counts(session, split, condition, shared, folder)
             parts = {"": counts, **{f"{part}/": sub for part, sub in counts.parts().items()}}
             mious = {
                 f"{part}mIoU": float(miou(sub.whole(), session.regions.absent, sub.scored))
                 for part, sub in parts.items()
             }
-            found.append(Measured(asked, counts, mious))
+            found.append(Measured(condition, counts, mious))
             display.advance(task)
     return tuple(found)
 
 
 def _counts(
-    session: Session, split: str, asked: Asked, shared: dict[str, Any], folder: Path
+    session: Session, split: str, condition: Condition, shared: dict[str, Any], folder: Path
 ) -> Counts:
-    """Those that are there if they were made of the same, else new ones."""
-    from rgbt.build.session import evaluate
-    from rgbt.files.atomic import write_atomic
-
-    counts_file, made_file = folder / f"{asked.mark}.npz", folder / f"{asked.mark}.json"
-    identity = _identity(asked, shared)
-    made = {**identity, "row": asked.row, "title": asked.title, "unit": asked.unit}
+    """Those in the folder if the same made them, else new ones."""
+    counts_file = folder / f"{condition.file_stem}.npz"
+    made_file = folder / f"{condition.file_stem}.json"
+    identity = dict(json.loads(json.dumps({**shared, **condition.identity()})))
+    texts = {"row": condition.row, "title": condition.title, "unit": condition.unit}
+    made = {**identity, **texts}
     known = read_json(made_file)
     counts = _kept(counts_file, known, identity)
     if counts is None:
-        failing = session if asked.failure is None else asked.failure.applied(session, split)
-        counts = evaluate(failing, session.model, split, view=asked.view).counts
+        request = EvaluationRequest(
+            split=split, view=condition.view, corruption=condition.corruption
+        )
+        counts = evaluate(session, session.model, request).counts
         # What says that the counts are of these weights must not outlive those of others.
         made_file.unlink(missing_ok=True)
         counts.save(counts_file)
@@ -141,15 +150,13 @@ def _counts(
 
 
 def _kept(file: Path, known: Any, identity: dict[str, Any]) -> Counts | None:
-    """The counts in `file` if they were made of the same; None where they are missing or damaged.
+    """The counts in `file` if the same made them; None where they are missing or damaged.
 
     Args:
         file: of counts.
         known: what is written beside it.
-        identity: see `_identity`.
+        identity: what decides the counts.
     """
-    from rgbt.metrics.counts import Counts
-
     is_same = isinstance(known, dict) and {key: known.get(key) for key in identity} == identity
     if not (file.is_file() and is_same):
         return None
@@ -157,17 +164,6 @@ def _kept(file: Path, known: Any, identity: dict[str, Any]) -> Counts | None:
         return Counts.load(file)
     except InputError:
         return None
-
-
-def _identity(asked: Asked, shared: dict[str, Any]) -> dict[str, Any]:
-    """What decides the counts of an evaluation, as read back from JSON."""
-    plain = {
-        **shared,
-        "severity": asked.severity,
-        "view": asked.view,
-        "failure": None if asked.failure is None else asked.failure.identity(),
-    }
-    return dict(json.loads(json.dumps(plain)))
 
 
 def _shared_identity(session: Session, split: str) -> dict[str, Any]:
@@ -184,8 +180,6 @@ def _shared_identity(session: Session, split: str) -> dict[str, Any]:
 
 def weights_digest(model: nn.Module) -> str:
     """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
-    import torch
-
     digest = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
@@ -194,7 +188,7 @@ def weights_digest(model: nn.Module) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The mapping in a file of JSON; None where it is not there or damaged."""
+    """The mapping in a file of JSON; None where it is missing or damaged."""
     try:
         return budgets.read_json(path, dict[str, Any], "")
     except InputError:

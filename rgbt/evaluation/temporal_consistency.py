@@ -5,7 +5,7 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Literal, NamedTuple
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.build.session import Session, decode_ahead, heads_of, view_of
+from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
 from rgbt.engine.evaluate import class_maps
 from rgbt.engine.progress import progress
+from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import OF_PAIRS
@@ -30,7 +32,7 @@ from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
 from rgbt.metrics.scores import class_mean
 from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
-from rgbt.types import IGNORE, Batch, View
+from rgbt.types import IGNORE, Batch
 
 Predict = Callable[[Batch], Tensor]
 """A batch on the device -> its class maps (B, H', W') uint8."""
@@ -103,14 +105,8 @@ class Pairs:
     kept: tuple[PairExample, ...]
 
 
-def count_pairs(  # noqa: PLR0913 - as `rgbt.build.session.evaluate`, and what the second frames are
-    session: Session,
-    model: nn.Module,
-    split: str,
-    frames: Frames,
-    *,
-    view: View | None = None,
-    keep: Collection[str] = (),
+def count_pairs(
+    session: Session, model: nn.Module, request: EvaluationRequest, frames: Frames
 ) -> Pairs:
     """Predict both frames of every scene of a split and count, with a progress bar.
 
@@ -120,21 +116,21 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.build.session.evaluate`, and what t
     Args:
         session: see `rgbt.build.session.open_session`; its `consistency` says which virtual views.
         model: the network to evaluate; left in evaluation mode.
-        split: name of the split.
+        request: split, view, head, and the scenes to return for pictures.
         frames: what the second frames are.
-        view: what is predicted from; None: see `rgbt.build.session.view_of`.
-        keep: names of scenes to return for pictures.
 
     Raises:
         InputError: no sets of views, no second frames, or no image that can be read.
     """
+    assert request.corruption is None, "pairs are counted of clean images"
+    split = request.split
     _check_second_frames(session, frames)
     decode_ahead(session, split)
     model.eval()
     found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
-    view = view or view_of(session)
-    heads = heads_of(session, view)
+    view = view_of(session, request.view)
+    heads = heads_of(session, view, request.head)
 
     def predict(batch: Batch) -> Tensor:
         return class_maps(model, batch, session.fabric, view, heads(batch.name))
@@ -147,7 +143,7 @@ def count_pairs(  # noqa: PLR0913 - as `rgbt.build.session.evaluate`, and what t
         for scenes in scenes_of(session, predict, split):
             for protocol, maps in scenes.compared.items():
                 found[protocol].add(scenes, maps, num_classes)
-            wanted = [name for name in scenes.names if name in keep and name not in kept]
+            wanted = [name for name in scenes.names if name in request.keep and name not in kept]
             kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
             display.update(task, completed=len(next(iter(found.values())).by_name))
     counts = {protocol: _counts(session, split, protocol, each) for protocol, each in found.items()}
@@ -169,12 +165,12 @@ def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]
     """Every batch with each set of views in turn."""
     sets = session.consistency
     names = session.dataset.names(split)
-    # A name that the list holds twice has the views of its first place.
-    place = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
+    # A name that the list holds twice has the views of its first position.
+    position = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
         first = predict(moved)
-        indices = [place[name] for name in batch.name]
+        indices = [position[name] for name in batch.name]
         for number in range(len(sets.sets)):
             yield _turned(session, predict, moved, first, (number, indices))
 
@@ -292,7 +288,7 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
         names=names,
         night=dataset.nights(names),
         classes=dataset.classes,
-        partition=partition_name(protocol, sets, views_of(session, protocol)),
+        partition=partition_name(protocol, sets, frames_mark(session, protocol)),
         dataset=dataset.fingerprint(),
         split=split,
         unscored=dataset.unscored,
@@ -300,7 +296,7 @@ def _counts(session: Session, split: str, protocol: Protocol, collected: Collect
     )
 
 
-def views_of(session: Session, protocol: Protocol) -> str:
+def frames_mark(session: Session, protocol: Protocol) -> str:
     """Which second frames counts are of: "" for the published views, else six digits of others.
 
     True frames are told apart by their lists and files, so that those of another motion differ.
@@ -343,3 +339,11 @@ def consistency_values(table: ConsistencyTable) -> dict[str, float]:
         for protocol in table.tc
         for score, by_protocol in means.items()
     }
+
+
+def consistency_title(pairs: Pairs, label: str, dataset: str) -> str:
+    """Title of the table: what was measured, on which second frames."""
+    protocol, counts = next(iter(pairs.counts.items()))
+    frames = next(frames for frames, protocols in PROTOCOLS.items() if protocol in protocols)
+    views = counts.partition.partition("-")[2] or "published"
+    return f"Consistency of {label} ({dataset}, {counts.split}; {frames}: {views})"

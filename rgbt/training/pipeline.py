@@ -14,12 +14,12 @@ from contextlib import contextmanager
 from omegaconf import OmegaConf
 
 from rgbt.build.load_run import open_run
-from rgbt.build.session import view_of
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
 from rgbt.config.component import target_names
 from rgbt.data.pseudo_labels import MANIFEST
-from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
+from rgbt.evaluation.pseudo_labels import Labelling, teacher_of, write_pseudo_labels
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
 from rgbt.tracking.other_code import other_code
@@ -146,10 +146,7 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     write_pseudo_labels(
         session,
         teacher_of(teacher.run.folder.name, session.model),
-        domain.split,
-        view_of(session, domain.teacher_view or "default"),
+        EvaluationRequest(split=domain.split, view=domain.teacher_view),
+        Labelling(domain.threshold),
         folder,
-        domain.threshold,
-        label_map=None,
-        head=None,
     )

@@ -12,16 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.build.session import (
-    Session,
-    decode_ahead,
-    evaluate,
-    legend_of,
-    names_key,
-    panel_names,
-    result_tables,
-    view_of,
-)
+from rgbt.build.session import Session, names_key
 from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
 from rgbt.data.domains import Domains
@@ -30,6 +21,9 @@ from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, restore_weights
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
+from rgbt.evaluation.prediction import decode_ahead, view_of
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
@@ -283,7 +277,7 @@ class Run:
         per_epoch = self.setup.steps_per_epoch()
 
         def validate(step: int) -> float:
-            found = evaluate(session, self.setup.model, split)
+            found = evaluate(session, self.setup.model, EvaluationRequest(split=split))
             place = trainer.checkpoints.begin_evaluation(step)
             found.counts.save(place / self.folder.counts_path(split).name)
             values = scores.summary(found.counts, session.regions.absent)
@@ -315,7 +309,8 @@ class Run:
             split = session.trainer.selection_split if kind == "val" else kind
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
-                found = count_pairs(session, session.model, split, "virtual", keep=keep)
+                request = EvaluationRequest(split=split, keep=keep)
+                found = count_pairs(session, session.model, request, "virtual")
             except InputError as error:
                 # The training is done, and is not lost for what is measured beside.
                 tell(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
@@ -331,7 +326,8 @@ class Run:
 
     def _test(self, session: Session, state: State, pairs: ConsistencyTable | None) -> None:
         """Counts, tables and figures of the best checkpoint on the test split."""
-        found = evaluate(session, session.model, "test", keep=panel_names(session.dataset, "test"))
+        keep = panel_names(session.dataset, "test")
+        found = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
         state.skip(found.skipped)
         found.counts.save(self.folder.counts_path("test"))
         values = scores.summary(found.counts, session.regions.absent)
@@ -359,7 +355,8 @@ class Run:
         target = session.domains.target
         if target is None or target.view in (None, view_of(session)):
             return {}
-        counts = evaluate(session, model, split, view=target.view).counts
+        request = EvaluationRequest(split=split, view=target.view)
+        counts = evaluate(session, model, request).counts
         counts.save(place / self.folder.counts_path(f"{split}_{target.view}").name)
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))

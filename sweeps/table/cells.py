@@ -98,7 +98,7 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
         column.modality,
         table.regions,
         head=column.head,
-        degradation=column.degradation,
+        corruption=column.corruption,
         severity=column.severity,
     )
     return None if needed == ExtraEvaluation() else needed

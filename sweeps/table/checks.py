@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -63,7 +64,7 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
         check_choice(f"{where}, {given[0]}", other, [each.name for each in table.columns])
     _check_frames(column, where)
     _check_head(column, where)
-    _check_degradation(column, where)
+    _check_corruption(column, where)
     _check_sources(column, table, before, f"{where}, {given[0]}")
 
 
@@ -92,31 +93,39 @@ def _check_head(column: Column, where: str) -> None:
         )
 
 
-def _check_degradation(column: Column, where: str) -> None:
-    """Refuse a degradation of what is not predicted, an unknown one, or a severity it has not."""
-    if column.degradation is None:
+def _check_corruption(column: Column, where: str) -> None:
+    """Refuse a corruption of what is not predicted, an unknown one, or a severity it has not."""
+    if column.corruption is None:
         if column.severity is not None:
             raise InputError(
-                f"{where}: 'severity' is of a degradation; add degradation: NAME, or remove it."
+                f"{where}: 'severity' is of a corruption; add corruption: NAME, or remove it."
             )
         return
     if column.metric is None or column.frames is not None:
         raise InputError(
-            f"{where}: 'degradation' is for scores of single frames alone; remove degradation: "
-            f"{column.degradation}."
+            f"{where}: 'corruption' is for scores of single frames alone; remove corruption: "
+            f"{column.corruption}."
         )
-    check_choice(f"{where}, degradation", column.degradation, available("degradation"))
-    # Below its key, as in a configuration: sentences about it name degradation.severities.
-    file = conf_dir() / "degradation" / f"{column.degradation}.yaml"
-    kind = build(OmegaConf.create({"degradation": OmegaConf.load(file)}).degradation)
+    name, _, image = column.corruption.partition(":")
+    check_choice(f"{where}, corruption", name, available("corruption"))
+    try:
+        kind = _corruption(name, image)
+        if column.severity is not None:
+            kind.check(column.severity)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     if column.severity is None and len(kind.severities) > 1:
         known = ", ".join(f"{each:g}" for each in kind.severities)
         raise InputError(f"{where}: {kind.title} needs a severity ({kind.unit}); one of {known}.")
-    if column.severity is not None:
-        try:
-            kind.check(column.severity)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
+
+
+def _corruption(name: str, image: str) -> Any:
+    # Below its key, as in a configuration: sentences about it name corruption.severities.
+    file = conf_dir() / "corruption" / f"{name}.yaml"
+    node = OmegaConf.create({"corruption": OmegaConf.load(file)}).corruption
+    if image:
+        node.image = image
+    return build(node)
 
 
 def _check_frames(column: Column, where: str) -> None:

@@ -39,10 +39,10 @@ HEAD = """\
 COLUMNS = """\
 columns: # or: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
   # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB,
-  # head: source with one head of a network of two; degradation: noise and severity: 16 of failing
-  # images (docs/robustness.md); {name: both, mean: [day, night]} and {name: gain, minus: [day,
-  # night]} of other columns; {name: TC, metric: TC, frames: aligned} and CA, of two frames
-  # (docs/consistency.md); {name: size, parameters: true} counts the network
+  # head: source with one head of a network of two; corruption: noise and severity: 16 of
+  # corrupted images (docs/robustness.md); {name: both, mean: [day, night]} and {name: gain,
+  # minus: [day, night]} of other columns; {name: TC, metric: TC, frames: aligned} and CA, of two
+  # frames (docs/consistency.md); {name: size, parameters: true} counts the network
 """
 
 ROWS = """\

@@ -40,8 +40,9 @@ class Column:
             `rgbt.metrics.pairs`.
         head: of a network with a head per domain, the one that predicts; see
             `sweeps.evaluation.Head`.
-        degradation: what fails of the images, a file of ``conf/degradation``; None: they are clean.
-        severity: of the degradation; may be left out where it has one alone.
+        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None: they
+            are clean.
+        severity: of the corruption; may be omitted if the corruption has a single one.
         printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
     """
@@ -57,7 +58,7 @@ class Column:
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
     head: Head = "as trained"
-    degradation: str | None = None
+    corruption: str | None = None
     severity: float | None = None
     printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"

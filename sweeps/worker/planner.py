@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rgbt.config.compose import with_pixels
+from rgbt.spec.corruption_names import row_name
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.run_specs import PlannedRun, plan_run
@@ -66,12 +67,16 @@ class Planner:
 def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:
     """The attributes of an evaluation that keys of points hold.
 
-    Attributes that came after the first studies are left out at their defaults, so that the keys
-    of older studies stay the same.
+    Attributes that came after the first studies are left out at their defaults, and a corruption
+    has the name that it had then, so that the keys of older studies stay the same.
     """
     defaults = vars(ExtraEvaluation())
-    return {
+    identity = {
         name: value
         for name, value in vars(evaluation).items()
         if name in ("modality", "regions") or value != defaults[name]
     }
+    if evaluation.corruption is None:
+        return identity
+    named = {"corruption": ("degradation", row_name(evaluation.corruption))}
+    return dict(named.get(name, (name, value)) for name, value in identity.items())

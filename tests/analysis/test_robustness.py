@@ -12,8 +12,8 @@ from analysis.results import open_counts
 from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
 from rgbt.evaluation.robustness import CLEAN, FORMAT
+from rgbt.evaluation.robustness_table import FOLDER
 from rgbt.metrics.named import value
-from rgbt.robustness import FOLDER
 from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
@@ -70,7 +70,7 @@ def test_the_same_trainings_on_failing_images(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("degradation", "severity", "sentence"),
+    ("corruption", "severity", "sentence"),
     [
         ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
         ("noise", "12", r"severity=12: .* holds noise at 8, 16; give one of these"),
@@ -78,10 +78,10 @@ def test_the_same_trainings_on_failing_images(runs: Path) -> None:
     ],
 )
 def test_what_was_not_measured_is_told(
-    runs: Path, degradation: str, severity: str, sentence: str
+    runs: Path, corruption: str, severity: str, sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
-        under(open_counts("k0", runs), degradation, severity)
+        under(open_counts("k0", runs), corruption, severity)
 
 
 def test_what_is_no_measured_run_is_told(runs: Path) -> None:
@@ -111,13 +111,13 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
 
 def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
     where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
-    code, out, err = call(entry, "a=k2", "b=k0", "degradation=noise", "severity=16", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "corruption=noise", "severity=16", *where)
     assert code == 0, err
     # 40 against 35 on noisy images (80 against 75 on clean ones).
     assert "crm (noise 16) less none (noise 16)" in out
     assert "35.00" in out
     assert "40.00" in out
-    code, out, err = call(entry, "a=k2", "b=k0", "degradation=rgb_removed", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "corruption=rgb_removed", *where)
     assert code == 0, err
     assert "15.00" in out
 
@@ -125,9 +125,9 @@ def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["severity=3"], "'severity' has no effect without degradation=..."),
-        (["degradation=noise", "frames=next"], "is of single frames; leave frames= out"),
-        (["degradation=noise", "severity=3"], "holds noise at 8, 16; give one of these"),
+        (["severity=3"], "'severity' has no effect without corruption=..."),
+        (["corruption=noise", "frames=next"], "is of single frames; omit frames="),
+        (["corruption=noise", "severity=3"], "holds noise at 8, 16; give one of these"),
     ],
 )
 def test_compare_refuses(call: Call, runs: Path, words: list[str], sentence: str) -> None:

@@ -281,7 +281,7 @@ def test_a_right_scheme_passes() -> None:
     )
 
 
-def test_transforms_partitions_and_degradations() -> None:
+def test_transforms_partitions_and_corruptions() -> None:
     rng = np.random.default_rng(0)
     wrong = SimpleNamespace(train=lambda sample, rng: sample, test=lambda sample: sample)
     assert "transform: SimpleNamespace.train returned Sample without `centre_yx`" in refused(
@@ -297,8 +297,8 @@ def test_transforms_partitions_and_degradations() -> None:
         lambda: contracts.check_regions(halves, HW)
     )
     haze = SimpleNamespace(title="haze", unit="", severities=(1.0,), check=lambda severity: None)
-    assert "degradation: SimpleNamespace has no method __call__(sample, severity, rng_of)" in (
-        refused(lambda: contracts.check_degradation(haze))
+    assert "corruption: SimpleNamespace has no method __call__(sample, severity, rng_of)" in (
+        refused(lambda: contracts.check_corruption(haze))
     )
 
 

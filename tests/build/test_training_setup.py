@@ -20,8 +20,10 @@ from rgbt.config.component import build
 from rgbt.spec.specify import specify
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
-from rgbt.evaluation.pseudo_labels import BEGUN, Teacher, write_pseudo_labels
-from rgbt.build.session import decode_ahead, open_session
+from rgbt.evaluation.prediction import decode_ahead
+from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, Teacher, write_pseudo_labels
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.build.session import open_session
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
 from tests.composed import composed as composed_once
@@ -220,8 +222,9 @@ def test_another_range_of_thermal_counts_is_another_input(
 
     def written(*typed: str) -> Any:
         session = open_session(composed("thermal_teacher", *typed))
+        request = EvaluationRequest(split="val", view="thermal")
         return write_pseudo_labels(
-            *(session, Teacher("a", "w"), "val", "thermal", tmp_path / "out", 0.0, None, None)
+            session, Teacher("a", "w"), request, Labelling(), tmp_path / "out"
         )
 
     first = written()

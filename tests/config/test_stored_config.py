@@ -186,7 +186,7 @@ def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path
             predict.entry,
             (f"run={run}", "input=test", f"out={tmp_path / 'out'}"),
         ),
-        (robustness.entry, (f"run={run}", "degradations=noise")),
+        (robustness.entry, (f"run={run}", "corruptions=noise")),
         (consistency.entry, (f"run={run}",)),
     ]
     for name in ("transform", "model", "scheme"):
@@ -206,16 +206,16 @@ def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path
     assert not marker.exists()
 
 
-def test_a_degradation_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> None:
-    from rgbt.evaluation.corrupted import choose
+def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> None:
+    from rgbt.evaluation.corruption_request import choose_corruption
 
     path = tmp_path / "fog.yaml"
     path.write_text(f"_target_: os.system\ncommand: touch {tmp_path / 'marker'}\n")
     with pytest.raises(InputError, match=r"fog.yaml: '_target_' names os.system"):
-        choose(str(path))
+        choose_corruption(str(path))
     path.write_text("_target_: my_lab.Plain\nwidth: 2\n")
     with pytest.raises(InputError, match="add trust=my_lab"):
-        choose(str(path))
+        choose_corruption(str(path))
     with pytest.raises(InputError, match="Plain has no attribute"):  # it was built
-        choose(str(path), trust=("my_lab",))
+        choose_corruption(str(path), trust=("my_lab",))
     assert not (tmp_path / "marker").exists()

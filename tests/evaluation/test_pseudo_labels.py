@@ -25,7 +25,14 @@ from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
 from rgbt.engine.confidence import probabilities
 from rgbt.evaluation import pseudo_labels as pseudo
-from rgbt.evaluation.pseudo_labels import Teacher, summary, teacher_of, write_pseudo_labels
+from rgbt.evaluation.pseudo_labels import (
+    Labelling,
+    Teacher,
+    summary,
+    teacher_of,
+    write_pseudo_labels,
+)
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding
 from rgbt.spec.specify import specify
 from rgbt.types import Output, View
@@ -110,9 +117,10 @@ def session(root: Path) -> Session:
 
 
 def written(session: Session, out: Path, threshold: float = 0.9, **others: Any) -> PseudoLabels:
-    settings = {"split": "train", "view": "thermal", "label_map": None, "head": None, **others}
-    teacher = settings.pop("teacher", Teacher("abc", "w"))
-    return write_pseudo_labels(session, teacher, out=out, threshold=threshold, **settings)
+    teacher = others.pop("teacher", Teacher("abc", "w"))
+    labelling = Labelling(threshold, others.pop("label_map", None))
+    request = EvaluationRequest(**{"split": "train", "view": "thermal", **others})
+    return write_pseudo_labels(session, teacher, request, labelling, out)
 
 
 def image(path: Path) -> np.ndarray:

@@ -17,11 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.build.session import Session, evaluate, open_session
+from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.next_frames import NextFrames
-from rgbt.evaluation import temporal_consistency as two_frames
+from rgbt.evaluation import temporal_consistency
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.segmentation import evaluate
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, ca, tc
@@ -32,6 +34,7 @@ from tests.commands import SPLITS, words_of
 from tests.conftest import write_png
 
 HW = (48, 64)
+VAL, TEST = EvaluationRequest(split="val"), EvaluationRequest(split="test")
 
 
 class Decoder(nn.Module):
@@ -92,14 +95,14 @@ def test_the_split_is_decoded_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     def begin(session: object, *splits: str) -> None:
         raise Begun(splits)
 
-    monkeypatch.setattr(two_frames, "decode_ahead", begin)
+    monkeypatch.setattr(temporal_consistency, "decode_ahead", begin)
     sets = SimpleNamespace(sets=())
     session: Any = SimpleNamespace(consistency=sets)
     with pytest.raises(InputError, match=r"consistency\.sets is empty"):
-        count_pairs(session, Decoder(), "val", "virtual")
+        count_pairs(session, Decoder(), VAL, "virtual")
     sets.sets = ("released_1",)
     with pytest.raises(Begun, match="'val'"):
-        count_pairs(session, Decoder(), "val", "virtual")
+        count_pairs(session, Decoder(), VAL, "virtual")
 
 
 # ---- virtual views --------------------------------------------------------------------------
@@ -145,7 +148,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
     maps = [cv2.resize(each, HW[::-1], interpolation=cv2.INTER_NEAREST) for each in coarse]
     draw(data, maps)
     session = on_mfnet(data)
-    found = count_pairs(session, Decoder(), "test", "virtual").counts
+    found = count_pairs(session, Decoder(), TEST, "virtual").counts
     sets = session.consistency
     for protocol in ("aligned", "released"):
         counts = found[protocol].counts.reshape(3, 3, 10, 9, 9)
@@ -185,7 +188,7 @@ def test_perfect_consistency_scores_100_aligned_and_little_as_released(data: Pat
     scores = {}
     for view in ("paper", "released"):
         session = on_mfnet(data, f"view@consistency.view={view}")
-        found = count_pairs(session, Bands(), "test", "virtual")
+        found = count_pairs(session, Bands(), TEST, "virtual")
         scores[view] = consistency_table(found.counts, "exclude")
     shown = {"unlabeled": 0, "bump": 8}
     for index in shown.values():
@@ -203,7 +206,7 @@ def test_pixels_without_a_label_do_not_count_where_frames_are_aligned(data: Path
     draw(data, [stripes()] * 3)
     for name in SPLITS["test"]:
         write_png(data / "labels" / f"{name}.png", np.full(HW, 255, np.uint8))
-    found = count_pairs(on_mfnet(data), Bands(), "test", "virtual").counts
+    found = count_pairs(on_mfnet(data), Bands(), TEST, "virtual").counts
     assert not found["aligned"].counts.any()
     released = found["released"].counts.reshape(3, 3, 10, 9, 9)
     # What the release's border rule fills in is background, the rest has no label.
@@ -217,7 +220,7 @@ def test_pixels_without_a_label_do_not_count_where_frames_are_aligned(data: Path
 def test_images_may_be_evaluated_at_another_size_than_their_labels(data: Path) -> None:
     draw(data, [stripes()] * 3)
     session = on_mfnet(data, "scale.test_short_edge=96", "view@consistency.view=paper")
-    found = count_pairs(session, Bands(), "test", "virtual").counts["aligned"]
+    found = count_pairs(session, Bands(), TEST, "virtual").counts["aligned"]
     assert found.counts.sum() > 0.97 * 9 * 48 * 64
     by_class = tc(found.by_region(), "exclude")
     assert by_class[0] > 0.9
@@ -226,7 +229,7 @@ def test_images_may_be_evaluated_at_another_size_than_their_labels(data: Path) -
 
 def test_the_size_of_a_batch_does_not_change_the_counts(data: Path) -> None:
     found = [
-        count_pairs(on_mfnet(data, f"scale.eval_batch_size={size}"), Decoder(), "test", "virtual")
+        count_pairs(on_mfnet(data, f"scale.eval_batch_size={size}"), Decoder(), TEST, "virtual")
         for size in (1, 2, 3)
     ]
     for protocol in ("aligned", "released"):
@@ -236,11 +239,11 @@ def test_the_size_of_a_batch_does_not_change_the_counts(data: Path) -> None:
 
 
 def test_an_unreadable_image_is_left_out(data: Path) -> None:
-    whole = count_pairs(on_mfnet(data), Decoder(), "test", "virtual").counts["aligned"]
+    whole = count_pairs(on_mfnet(data), Decoder(), TEST, "virtual").counts["aligned"]
     path = data / "images" / f"{SPLITS['test'][0]}.png"
     path.write_bytes(path.read_bytes()[:100])
     session = on_mfnet(data, "data.on_error=skip")
-    found = count_pairs(session, Decoder(), "test", "virtual").counts["aligned"]
+    found = count_pairs(session, Decoder(), TEST, "virtual").counts["aligned"]
     assert found.names == tuple(SPLITS["test"][1:])
     # The others keep the angles of their own places in the list.
     assert np.array_equal(found.counts, whole.counts[1:])
@@ -251,7 +254,7 @@ def test_a_name_that_a_list_holds_twice_counts_once(data: Path, size: int) -> No
     first, *others = SPLITS["test"]
     (data / "test.txt").write_text("\n".join([first, *others, first]))
     session = on_mfnet(data, f"scale.eval_batch_size={size}")
-    for counts in count_pairs(session, Decoder(), "test", "virtual").counts.values():
+    for counts in count_pairs(session, Decoder(), TEST, "virtual").counts.values():
         assert counts.names == tuple(SPLITS["test"])
         by_set = counts.counts.reshape(3, 3, 10, 9, 9).sum((2, 3, 4))
         assert (by_set <= 48 * 64).all()
@@ -299,9 +302,9 @@ def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
 def test_counts_say_which_classes_the_data_set_leaves_out_of_means(data: Path) -> None:
     session = on_mfnet(data)
     session.dataset.unscored = ("bump", "unlabeled")
-    for counts in count_pairs(session, Decoder(), "test", "virtual").counts.values():
+    for counts in count_pairs(session, Decoder(), TEST, "virtual").counts.values():
         assert counts.unscored == ("bump", "unlabeled")
-    assert evaluate(session, Decoder(), "test").counts.unscored == ("bump", "unlabeled")
+    assert evaluate(session, Decoder(), TEST).counts.unscored == ("bump", "unlabeled")
 
 
 # ---- true frames ----------------------------------------------------------------------------
@@ -349,7 +352,7 @@ def test_an_oracle_scores_on_true_frames_what_its_labels_do(cache: Path) -> None
             agree[cls] += (one & two).sum()
             union[cls] += (one | two).sum()
             triple[cls] += (one & two).sum()
-    found = count_pairs(session, oracle, "test", "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, "next").counts["next"]
     assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
@@ -374,25 +377,25 @@ def test_pixels_of_true_frames_without_a_label_do_not_count(tmp_path: Path) -> N
         _, seen = followed(session, name, label)
         expected.append(int((seen & (label != 255)).sum()))
         assert (seen & (label == 255)).any()
-    found = count_pairs(session, Decoder(), "test", "next").counts["next"]
+    found = count_pairs(session, Decoder(), TEST, "next").counts["next"]
     assert not found.counts[:, 9].any()
     assert found.counts.sum((1, 2, 3)).tolist() == expected
 
 
 def test_true_frames_listed_twice_count_once(tmp_path: Path) -> None:
-    once = count_pairs(on_synth(tmp_path), Decoder(), "test", "next").counts["next"]
+    once = count_pairs(on_synth(tmp_path), Decoder(), TEST, "next").counts["next"]
     root = on_synth(tmp_path).dataset.root
     for place in (root, root / "next"):
         listed = (place / "test.txt").read_text().split()
         (place / "test.txt").write_text("\n".join([*listed, listed[0]]))
-    found = count_pairs(on_synth(tmp_path), Decoder(), "test", "next").counts["next"]
+    found = count_pairs(on_synth(tmp_path), Decoder(), TEST, "next").counts["next"]
     assert found.names == once.names
     assert np.array_equal(found.counts, once.counts)
 
 
 def test_second_frames_of_another_motion_are_another_partition(cache: Path) -> None:
     partitions = [
-        count_pairs(on_synth(cache, *more), Decoder(), "test", "next").counts["next"].partition
+        count_pairs(on_synth(cache, *more), Decoder(), TEST, "next").counts["next"].partition
         for more in ((), ("seed=1",), ("dataset.ego_forward_m=0.6",))
     ]
     assert partitions[0] == partitions[1] != partitions[2]
@@ -406,20 +409,22 @@ def test_perfect_consistency_on_true_frames_is_100_whatever_is_right(cache: Path
         brought, seen = followed(session, name, noise)
         oracle.learn(session.dataset.read(name).rgb, noise)
         oracle.learn(after.dataset.read(name).rgb, np.where(seen, brought, 0))
-    found = count_pairs(session, oracle, "test", "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, "next").counts["next"]
     assert tc(found.by_region(), "exclude").tolist() == [1.0] * 9
     assert ca(found.by_region(), "exclude").max() < 0.9
     # Noise that does not move with the scene agrees by chance alone.
     for name in session.dataset.names("test"):
         oracle.learn(after.dataset.read(name).rgb, rng.integers(0, 9, HW))
-    found = count_pairs(session, oracle, "test", "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, "next").counts["next"]
     assert tc(found.by_region(), "exclude").max() < 0.12
 
 
 def test_pictures_show_what_was_followed(cache: Path) -> None:
     session = on_synth(cache)
     name = session.dataset.names("test")[1]
-    kept = count_pairs(session, Decoder(), "test", "next", keep=[name]).kept
+    kept = count_pairs(
+        session, Decoder(), EvaluationRequest(split="test", keep=[name]), "next"
+    ).kept
     (example,) = kept
     assert example.name == name
     assert np.array_equal(example.first_rgb, session.dataset.read(name).rgb)
@@ -472,11 +477,11 @@ def test_second_frames_that_do_not_fit_are_named(
     session = on_synth(tmp_path, f"scale.eval_batch_size={batch_size}")
     sentence = spoil(session.dataset.root, session.dataset.names("test")[0])
     with pytest.raises(InputError, match=sentence):
-        count_pairs(session, Decoder(), "test", "next")
+        count_pairs(session, Decoder(), TEST, "next")
 
 
 def test_no_second_frames_and_no_views_are_refused(data: Path) -> None:
     with pytest.raises(InputError, match="has no second frames"):
-        count_pairs(on_mfnet(data), Decoder(), "test", "next")
+        count_pairs(on_mfnet(data), Decoder(), TEST, "next")
     with pytest.raises(InputError, match="give consistency=views"):
-        count_pairs(on_mfnet(data, "consistency=none"), Decoder(), "test", "virtual")
+        count_pairs(on_mfnet(data, "consistency=none"), Decoder(), TEST, "virtual")

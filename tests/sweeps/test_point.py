@@ -27,17 +27,17 @@ def test_evaluation_with_head_has_own_path() -> None:
 
 
 def test_failing_images_have_a_file_of_their_own() -> None:
-    noisy = ExtraEvaluation("rgbt", "ring9", degradation="noise", severity=16.0)
-    words = ("modality=rgbt", "regions=ring9", "degradation=noise", "severity=16")
+    noisy = ExtraEvaluation("rgbt", "ring9", corruption="noise", severity=16.0)
+    words = ("modality=rgbt", "regions=ring9", "corruption=noise", "severity=16")
     assert noisy.command == ("rgbt.evaluate", *words)
     assert noisy.path == "evaluations/table_rgbt_ring9_noise-16.npz"
     assert noisy.label == "rgbt, ring9, noise-16"
     assert {word.partition("=")[0] for word in words} <= set(types_of(OfEvaluate))
-    removed = ExtraEvaluation(head="own", degradation="rgb_removed")
-    assert removed.command[-2:] == ("head=own", "degradation=rgb_removed")
+    removed = ExtraEvaluation(head="own", corruption="removed:rgb")
+    assert removed.command[-2:] == ("head=own", "corruption=removed:rgb")
     assert removed.path == "evaluations/table_default_as-trained_own-head_rgb_removed.npz"
     assert removed.label == "default, as trained, own head, rgb_removed"
-    share = ExtraEvaluation(degradation="occluded", severity=0.25)
+    share = ExtraEvaluation(corruption="occluded", severity=0.25)
     assert share.path.endswith("as-trained_occluded-0.25.npz")
     assert share.command[-1] == "severity=0.25"
 

@@ -66,7 +66,7 @@ def test_mean_deviation_and_what_is_left_of_clean() -> None:
     assert np.isnan(Curve("x", np.array([[80.0, 40.0]])).summary(relative=False)[1]).all()
 
 
-def test_degradations_that_are_named_in_their_order(methods) -> None:
+def test_corruptions_that_are_named_in_their_order(methods) -> None:
     assert [panel.row for panel in panels(methods, "released", ["noise"])] == ["noise"]
     (missing,) = panels(methods, "released", ["features-thermal", "rgb_removed"])
     assert missing.ticks == ("clean", "thermal alone (features)", "RGB removed (zeroed)")
@@ -160,7 +160,7 @@ def test_the_command_draws_groups_and_writes_the_numbers(call: Call, tmp_path: P
     write_run(runs, "k0", "crm masker=none", 0, SCORES)
     write_run(runs, "k1", "crm masker=none", 1, less(10))
     out = tmp_path / "drawn" / "robustness.svg"
-    words = (f"runs_dir={runs}", f"out={out}", "degradations=noise, rgb_removed")
+    words = (f"runs_dir={runs}", f"out={out}", "corruptions=noise, rgb_removed")
     code, said, err = call(
         entry, "figure=robustness", "runs=crm masker=none,mine:k0", *words, "absent=exclude"
     )
@@ -177,7 +177,7 @@ def test_the_command_draws_groups_and_writes_the_numbers(call: Call, tmp_path: P
         (["figure=robustness"], "needs runs=..., runs or groups"),
         (["figure=robustness/relative", "runs=nowhere"], "'nowhere' is no run folder"),
         (["figure=robustness", "runs=a", "frames=next"], "'frames' has no effect on figure="),
-        (["figure=regions/heat", "runs=a", "degradations=noise"], "'degradations' has no effect"),
+        (["figure=regions/heat", "runs=a", "corruptions=noise"], "'corruptions' has no effect"),
     ],
 )
 def test_bad_input(call: Call, tmp_path: Path, words: list[str], sentence: str) -> None:

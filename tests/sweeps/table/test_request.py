@@ -113,16 +113,16 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
 def test_failing_images_are_evaluated_apart() -> None:
     columns = (
         Column(name="mIoU", metric="mIoU"),
-        Column(name="no thermal", metric="mIoU", degradation="thermal_removed"),
-        Column(name="noisy", metric="mIoU", degradation="noise", severity=16),
-        Column(name="noisier", metric="Var", degradation="noise", severity=32),
+        Column(name="no thermal", metric="mIoU", corruption="removed:thermal"),
+        Column(name="noisy", metric="mIoU", corruption="noise", severity=16),
+        Column(name="noisier", metric="Var", corruption="noise", severity=32),
         Column(name="loss", minus=("noisier", "noisy")),
     )
     asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
     assert asked.points()[0].evaluations == (
-        ExtraEvaluation(degradation="thermal_removed"),
-        ExtraEvaluation(degradation="noise", severity=16),
-        ExtraEvaluation(degradation="noise", severity=32),
+        ExtraEvaluation(corruption="removed:thermal"),
+        ExtraEvaluation(corruption="noise", severity=16),
+        ExtraEvaluation(corruption="noise", severity=32),
     )
 
 

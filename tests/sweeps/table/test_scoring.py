@@ -131,8 +131,8 @@ def test_each_head_has_its_counts() -> None:
 
 
 def test_failing_images_have_counts_of_their_own() -> None:
-    noisy = Column(name="noisy", metric="pixel_accuracy", degradation="noise", severity=16)
-    made = {None: right(50), ExtraEvaluation(degradation="noise", severity=16.0): right(30)}
+    noisy = Column(name="noisy", metric="pixel_accuracy", corruption="noise", severity=16)
+    made = {None: right(50), ExtraEvaluation(corruption="noise", severity=16.0): right(30)}
     runs = {("a", 0): outcome("k", made)}
     scored = score("t", table((Row(label="a"),), (ACC, noisy)), runs, scale="demo")
     assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]

@@ -129,18 +129,18 @@ def test_names_list_published_tables_and_ones_own(tmp_path: Path) -> None:
         (column(mean=["mIoU", "b"], head="source"), "'head' is for scores of single frames alone"),
         (column(parameters=True, head="source"), "single frames alone; remove head: source"),
         (column(metric="TC", frames="aligned", head="target"), "remove head: target"),
-        (column(metric="Var", degradation="nois"), "degradation: 'nois' is not a choice; did you"),
-        (column(metric="Var", degradation="noise"), "needs a severity (grey levels (std)); one of"),
+        (column(metric="Var", corruption="nois"), "corruption: 'nois' is not a choice; did you"),
+        (column(metric="Var", corruption="noise"), "needs a severity (grey levels (std)); one of"),
         (
-            column(metric="Var", degradation="noise", severity=300),
+            column(metric="Var", corruption="noise", severity=300),
             "column 'b': severity (standard deviation in grey levels) must lie in [0, 255], got",
         ),
-        (column(metric="Var", degradation="noise", severity="8"), "'severity': input should be a"),
-        (column(metric="Var", severity=8), "'severity' is of a degradation; add degradation"),
-        (column(needs="x", degradation="rgb_removed"), "for scores of single frames alone; remove"),
+        (column(metric="Var", corruption="noise", severity="8"), "'severity': input should be a"),
+        (column(metric="Var", severity=8), "'severity' is of a corruption; add corruption"),
+        (column(needs="x", corruption="removed:rgb"), "for scores of single frames alone; remove"),
         (
-            column(metric="TC", frames="aligned", degradation="rgb_removed"),
-            "single frames alone; remove degradation: rgb_removed",
+            column(metric="TC", frames="aligned", corruption="removed:rgb"),
+            "single frames alone; remove corruption: removed:rgb",
         ),
         ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
         (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
@@ -350,14 +350,14 @@ def test_columns_are_scores_that_can_be_computed(name: str) -> None:
 def test_crm_table1_drops_images_and_own_features() -> None:
     found = TABLES["crm/table1"]
     dropped = {
-        column.name: (column.degradation, column.modality)
+        column.name: (column.corruption, column.modality)
         for column in found.columns
         if column.metric is not None
     }
     assert dropped == {
         "rgbt_mIoU": (None, "default"),
-        "rgb_drop_mIoU": ("rgb_removed", "default"),
-        "thr_drop_mIoU": ("thermal_removed", "default"),
+        "rgb_drop_mIoU": ("removed:rgb", "default"),
+        "thr_drop_mIoU": ("removed:thermal", "default"),
         "rgb_drop_features_mIoU": (None, "thermal"),
         "thr_drop_features_mIoU": (None, "rgb"),
     }

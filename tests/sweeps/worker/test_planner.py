@@ -82,8 +82,8 @@ def test_plan_keys_of_older_studies_are_unchanged(
         planner.plan(Point("p", ("seed=1",), evaluations=(asked,)))
         for asked in (
             ExtraEvaluation(),
-            ExtraEvaluation(degradation="noise", severity=8),
-            ExtraEvaluation(degradation="noise", severity=16),
+            ExtraEvaluation(corruption="noise", severity=8),
+            ExtraEvaluation(corruption="noise", severity=16),
         )
     ]
     assert len({plan.key for plan in failing}) == 3

@@ -1,4 +1,4 @@
-"""A picture of degradations: one line each, the clean pair and every severity of the ladder."""
+"""A picture of corruptions: one line each, the clean pair and every severity of the ladder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rgbt.corruptions.corruption import Degradation
-from rgbt.corruptions.dataset import Degraded
+from rgbt.corruptions.corruption import Corruption
 from rgbt.dataset import LabelledDataset
+from rgbt.evaluation.corrupted_dataset import CorruptedDataset
 from rgbt.types import Sample
 
 CELL = 2.4
@@ -20,7 +20,7 @@ CELL = 2.4
 
 @dataclass(frozen=True)
 class Line:
-    """One degradation.
+    """One corruption.
 
     Attributes:
         title: its title.
@@ -34,13 +34,13 @@ class Line:
 
 
 def sheet(
-    source: LabelledDataset, kinds: Iterable[Degradation], name: str, split: str, seed: int = 0
+    source: LabelledDataset, kinds: Iterable[Corruption], name: str, split: str, seed: int = 0
 ) -> tuple[Line, ...]:
-    """One sample under every severity of every degradation.
+    """One sample under every severity of every corruption.
 
     Args:
         source: the data set.
-        kinds: degradations.
+        kinds: corruptions.
         name: of the sample.
         split: that it is of.
         seed: of what is drawn.
@@ -49,7 +49,7 @@ def sheet(
     for kind in kinds:
         pairs = []
         for severity in (0.0, *kind.severities):
-            seen = Degraded(source, kind, severity, split=split, seed=seed)
+            seen = CorruptedDataset(source, kind, severity, split=split, seed=seed)
             pairs.append((severity, seen.read(name)))
         lines.append(Line(kind.title, kind.unit, tuple(pairs)))
     return tuple(lines)
@@ -73,11 +73,11 @@ def draw(lines: tuple[Line, ...]) -> Figure:
     for row, line in zip(grid, lines, strict=True):
         for axes, (severity, sample) in zip(row, line.pairs, strict=False):
             axes.imshow(side_by_side(sample))
-            axes.set_title(_said(line, severity), fontsize=7, loc="left", pad=2)
+            axes.set_title(_caption(line, severity), fontsize=7, loc="left", pad=2)
     return figure
 
 
-def _said(line: Line, severity: float) -> str:
+def _caption(line: Line, severity: float) -> str:
     if severity == 0:
         return line.title
     return f"{severity:g} {line.unit}" if line.unit else ""

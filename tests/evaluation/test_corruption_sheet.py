@@ -1,4 +1,4 @@
-"""The picture of degradations: its data, that it is drawn, and the command."""
+"""The picture of corruptions: its data, that it is drawn, and the command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rgbt.corruptions.__main__ import entry
 from rgbt.corruptions.late import Delayed
 from rgbt.corruptions.noise import Noise
 from rgbt.corruptions.removed import Removed
-from rgbt.corruptions.sheet import draw, sheet, side_by_side
+from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
 from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample
@@ -24,7 +24,7 @@ KINDS = (
 )
 
 
-def test_a_line_per_degradation_with_the_clean_pair_first() -> None:
+def test_a_line_per_corruption_with_the_clean_pair_first() -> None:
     lines = sheet(Recorded(), KINDS, "00004D", "test")
     assert [[severity for severity, _ in line.pairs] for line in lines] == [
         *([0.0, 8.0, 16.0], [0.0, 1.0], [0.0, 1.0])
@@ -51,7 +51,7 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
     root = write_mfnet({"test": ["00001D", "00002D"]})
     out = tmp_path / "a" / "sheet.png"
     where = (f"dataset.root={root}", "dataset=mfnet", f"out={out}")
-    code, said, err = call(entry, "degradations=noise,rgb_removed", *where)
+    code, said, err = call(entry, "corruptions=noise,removed:rgb", *where)
     assert (code, said.strip()) == (0, str(out)), err
     assert cv2.imread(str(out)).shape[1] > 500
     code, _, err = call(entry, "name=00003D", *where)
@@ -63,7 +63,7 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
     ("words", "sentence"),
     [
         (["out=x.pdf"], "out must name the picture to write, .png or .jpg, got 'x.pdf'"),
-        (["out=x.png", "degradations=nois"], "did you mean 'noise"),
+        (["out=x.png", "corruptions=nois"], "did you mean 'noise"),
     ],
 )
 def test_bad_input(call: Call, words: list[str], sentence: str) -> None:

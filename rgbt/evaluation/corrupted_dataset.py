@@ -1,4 +1,4 @@
-"""A data set seen under a degradation, so that everything which reads one runs unchanged."""
+"""A data set seen under a corruption, so that everything which reads one runs unchanged."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 
 from rgbt.checks import InputError
-from rgbt.corruptions.corruption import Degradation, OfTime
+from rgbt.corruptions.corruption import Corruption, OfTime
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
 
 
-class Degraded(DatasetWrapper):
-    """`source` under a degradation; a `rgbt.dataset.LabelledDataset`.
+class CorruptedDataset(DatasetWrapper):
+    """`source` under a corruption; a `rgbt.dataset.LabelledDataset`.
 
     Names, labels and the fingerprint are those of the source: scores are of the same images. What
     is drawn for an image follows from (seed, its name) alone, whatever is read before it.
 
     Args:
         source: the data set.
-        degradation: what fails.
+        corruption: what fails.
         severity: how much; 0: nothing, samples are those of the source.
         split: that is read; its order is the order of time.
         seed: of what is drawn.
@@ -36,16 +36,16 @@ class Degraded(DatasetWrapper):
     def __init__(
         self,
         source: LabelledDataset,
-        degradation: Degradation,
+        corruption: Corruption,
         severity: float,
         *,
         split: str,
         seed: int = 0,
     ) -> None:
         if severity:
-            degradation.check(severity)
+            corruption.check(severity)
         super().__init__(source)
-        self.degradation = degradation
+        self.corruption = corruption
         self.severity = severity
         self.split = split
         self.seed = seed
@@ -53,7 +53,7 @@ class Degraded(DatasetWrapper):
         self._shown = self._other_frames()
 
     def read(self, name: str) -> Sample:
-        """The sample called `name` under the degradation.
+        """The sample called `name` under the corruption.
 
         Raises:
             InputError: as the source; images of two sizes where one frame is shown for another; a
@@ -62,24 +62,25 @@ class Degraded(DatasetWrapper):
         sample = self.source.read(name)
         if not self.severity:
             return sample
-        if isinstance(self.degradation, OfTime):
+        if isinstance(self.corruption, OfTime):
             return self._with_thermal_of(self.shown(name), sample)
 
         def rng_of(purpose: str) -> np.random.Generator:
+            # The word is part of the seed: another one draws other blocks.
             return numpy_generator(self.seed, f"degradation {purpose} of {name}")
 
-        return self.degradation(sample, self.severity, rng_of)
+        return self.corruption(sample, self.severity, rng_of)
 
     def shown(self, name: str) -> str:
         """Name of the frame whose thermal image `name` shows: itself, or an earlier one.
 
         Raises:
-            InputError: the degradation is one of time, and `name` is not of its split.
+            InputError: the corruption is one of time, and `name` is not of its split.
         """
         if self._shown and name not in self._shown:
             raise InputError(
                 f"'{name}' is not of split '{self.split}', whose order says which thermal image is "
-                "shown; read the split that was degraded."
+                "shown; read the split that was corrupted."
             )
         return self._shown.get(name, name)
 
@@ -89,12 +90,12 @@ class Degraded(DatasetWrapper):
         return tuple(path for each in names for path in self.source.files(each))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides what `read` makes of files: as the source's, and the degradation."""
+        """What decides what `read` makes of files: as the source's, and the corruption."""
         listed = hashlib.sha256("\n".join(self._names).encode()).hexdigest()
         return {
             **self.source.decoding(),
-            "degradation": type(self.degradation).__name__,
-            "settings": settings_of(self.degradation),
+            "corruption": type(self.corruption).__name__,
+            "settings": settings_of(self.corruption),
             "severity": self.severity,
             "seed": self.seed,
             "listed": listed,
@@ -102,14 +103,14 @@ class Degraded(DatasetWrapper):
 
     def _other_frames(self) -> dict[str, str]:
         """Name -> name of the frame whose thermal image it shows; {} where time does not matter."""
-        if not self.severity or not isinstance(self.degradation, OfTime):
+        if not self.severity or not isinstance(self.corruption, OfTime):
             return {}
         nights = self.source.nights(self._names) or (False,) * len(self._names)
         found: dict[str, str] = {}
         for dark in (False, True):
             frames = [n for n, night in zip(self._names, nights, strict=True) if night == dark]
-            for place, name in enumerate(frames):
-                found[name] = frames[self.degradation.shown(place, self.severity)]
+            for index, name in enumerate(frames):
+                found[name] = frames[self.corruption.shown(index, self.severity)]
         return found
 
     def _with_thermal_of(self, other: str, sample: Sample) -> Sample:
@@ -126,7 +127,7 @@ class Degraded(DatasetWrapper):
         return replace(sample, thermal=thermal)
 
 
-def settings_of(degradation: Degradation) -> dict[str, Any]:
-    """What a degradation was built with, as values of JSON; the ladder is no part of it."""
+def settings_of(corruption: Corruption) -> dict[str, Any]:
+    """What a corruption was built with, as values of JSON; the ladder is no part of it."""
     known = ("title", "unit", "severities")
-    return {key: value for key, value in vars(degradation).items() if key not in known}
+    return {key: value for key, value in vars(corruption).items() if key not in known}

@@ -1,4 +1,4 @@
-"""A data set under a degradation: which frames are shown, and what stays as it is."""
+"""A data set under a corruption: which frames are shown, and what stays as it is."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import OfPixels, OfTime
-from rgbt.corruptions.dataset import Degraded, settings_of
 from rgbt.corruptions.late import Delayed, Frozen
 from rgbt.corruptions.noise import Noise
 from rgbt.corruptions.occluded import Occluded
 from rgbt.corruptions.removed import Removed
 from rgbt.dataset import LabelledDataset
+from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
 from tests.corruptions.recorded import NAMES, Recorded, sample
 
 FROZEN, DELAYED = Frozen(severities=(2.0,)), Delayed(severities=(1.0,))
 NOISE = Noise(image="both", severities=(8.0,))
 
 
-def shown(data: Degraded, names: Sequence[str]) -> list[str]:
-    """Whose thermal image each name shows, told by the pixels."""
+def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
+    """Whose thermal image each name shows, known by the pixels."""
     known = {sample(name).thermal.tobytes(): name for name in names}
     return [known[data.read(name).thermal.tobytes()] for name in names]
 
@@ -31,29 +31,29 @@ def shown(data: Degraded, names: Sequence[str]) -> list[str]:
 def test_frozen_is_renewed_every_n_frames() -> None:
     names = tuple(f"{number:02d}" for number in range(7))
     source = Recorded(names, by_night=False)
-    assert shown(Degraded(source, FROZEN, 3, split="test"), names) == [
+    assert shown(CorruptedDataset(source, FROZEN, 3, split="test"), names) == [
         *("00", "00", "00", "03", "03", "03", "06")
     ]
-    assert shown(Degraded(source, FROZEN, 2, split="test"), names) == [
+    assert shown(CorruptedDataset(source, FROZEN, 2, split="test"), names) == [
         *("00", "00", "02", "02", "04", "04", "06")
     ]
-    assert shown(Degraded(source, FROZEN, 20, split="test"), names) == ["00"] * 7
+    assert shown(CorruptedDataset(source, FROZEN, 20, split="test"), names) == ["00"] * 7
 
 
-def test_delayed_is_n_frames_earlier_and_the_first_at_the_beginning() -> None:
+def test_delayed_starts_with_the_first_frame() -> None:
     names = tuple(f"{number:02d}" for number in range(6))
     source = Recorded(names, by_night=False)
     for n, expected in {
         1: ["00", "00", "01", "02", "03", "04"],
         4: ["00", "00", "00", "00", "00", "01"],
     }.items():
-        data = Degraded(source, DELAYED, n, split="test")
+        data = CorruptedDataset(source, DELAYED, n, split="test")
         assert shown(data, names) == expected
         assert [data.shown(name) for name in names] == expected
 
 
-def test_frames_by_day_and_by_night_follow_their_own_kind() -> None:
-    data = Degraded(Recorded(), DELAYED, 1, split="test")
+def test_frames_of_day_and_night_are_separate() -> None:
+    data = CorruptedDataset(Recorded(), DELAYED, 1, split="test")
     assert dict(zip(NAMES, shown(data, NAMES), strict=True)) == {
         **{"00001D": "00001D", "00003D": "00001D", "00004D": "00003D", "00006D": "00004D"},
         **{"00002N": "00002N", "00005N": "00002N"},
@@ -61,7 +61,7 @@ def test_frames_by_day_and_by_night_follow_their_own_kind() -> None:
 
 
 def test_only_thermal_is_of_another_frame() -> None:
-    found = Degraded(Recorded(), DELAYED, 1, split="test").read("00006D")
+    found = CorruptedDataset(Recorded(), DELAYED, 1, split="test").read("00006D")
     own = sample("00006D")
     assert found.name == "00006D"
     np.testing.assert_array_equal(found.rgb, own.rgb)
@@ -70,8 +70,8 @@ def test_only_thermal_is_of_another_frame() -> None:
 
 def test_the_order_of_reading_does_not_matter() -> None:
     for kind, severity in ((NOISE, 8), (DELAYED, 2), (FROZEN, 3)):
-        forward = Degraded(Recorded(), kind, severity, split="test")
-        backward = Degraded(Recorded(), kind, severity, split="test")
+        forward = CorruptedDataset(Recorded(), kind, severity, split="test")
+        backward = CorruptedDataset(Recorded(), kind, severity, split="test")
         first = {name: forward.read(name) for name in NAMES}
         second = {name: backward.read(name) for name in reversed(NAMES)}
         for name in NAMES:
@@ -81,7 +81,7 @@ def test_the_order_of_reading_does_not_matter() -> None:
 
 def test_draws_differ_by_name_and_seed() -> None:
     blocks = Occluded(image="thermal", block=32, severities=(0.5,))
-    data, other = (Degraded(Recorded(), blocks, 0.5, split="test", seed=s) for s in (0, 1))
+    data, other = (CorruptedDataset(Recorded(), blocks, 0.5, split="test", seed=s) for s in (0, 1))
     hidden = [data.read(name).thermal == 0 for name in NAMES[:2]] + [
         other.read(NAMES[0]).thermal == 0
     ]
@@ -93,7 +93,7 @@ def test_draws_differ_by_name_and_seed() -> None:
 @pytest.mark.parametrize("kind", [NOISE, FROZEN, DELAYED, Removed(image="rgb")])
 def test_severity_0_is_the_sample_of_the_source(kind: OfPixels | OfTime) -> None:
     source = Recorded()
-    data = Degraded(source, kind, 0, split="test")
+    data = CorruptedDataset(source, kind, 0, split="test")
     found = data.read("00003D")
     np.testing.assert_array_equal(found.rgb, sample("00003D").rgb)
     np.testing.assert_array_equal(found.thermal, sample("00003D").thermal)
@@ -103,7 +103,7 @@ def test_severity_0_is_the_sample_of_the_source(kind: OfPixels | OfTime) -> None
 
 def test_is_a_data_set_like_its_source() -> None:
     source = Recorded()
-    data: LabelledDataset = Degraded(source, NOISE, 8, split="test")
+    data: LabelledDataset = CorruptedDataset(source, NOISE, 8, split="test")
     for name in ("root", "name", "num_classes", "classes", "palette", "unscored", "splits"):
         assert getattr(data, name) == getattr(source, name)
     assert data.names("val") == ("00009D",)
@@ -115,7 +115,7 @@ def test_is_a_data_set_like_its_source() -> None:
 
 
 def test_files_are_those_that_are_read() -> None:
-    late = Degraded(Recorded(), DELAYED, 1, split="test")
+    late = CorruptedDataset(Recorded(), DELAYED, 1, split="test")
     assert late.files("00004D") == (
         *(Path("00004D.png"), Path("00004D_label.png")),
         *(Path("00003D.png"), Path("00003D_label.png")),
@@ -123,22 +123,22 @@ def test_files_are_those_that_are_read() -> None:
     assert late.files("00001D") == (Path("00001D.png"), Path("00001D_label.png"))
 
 
-def test_decoding_tells_failures_apart() -> None:
+def test_decoding_of_different_corruptions_differs() -> None:
     made = [
-        Degraded(Recorded(), NOISE, 8, split="test"),
-        Degraded(Recorded(), NOISE, 9, split="test"),
-        Degraded(Recorded(), NOISE, 8, split="test", seed=1),
-        Degraded(Recorded(), Noise(image="rgb", severities=(8.0,)), 8, split="test"),
-        Degraded(Recorded(), FROZEN, 8, split="test"),
-        Degraded(Recorded(NAMES[:-1]), FROZEN, 8, split="test"),
+        CorruptedDataset(Recorded(), NOISE, 8, split="test"),
+        CorruptedDataset(Recorded(), NOISE, 9, split="test"),
+        CorruptedDataset(Recorded(), NOISE, 8, split="test", seed=1),
+        CorruptedDataset(Recorded(), Noise(image="rgb", severities=(8.0,)), 8, split="test"),
+        CorruptedDataset(Recorded(), FROZEN, 8, split="test"),
+        CorruptedDataset(Recorded(NAMES[:-1]), FROZEN, 8, split="test"),
     ]
-    told = [each.decoding() for each in made]
-    assert all(each["layout"] == "recorded" for each in told)
-    assert all(a != b for index, a in enumerate(told) for b in told[:index])
-    assert told[0] == Degraded(Recorded(), NOISE, 8, split="test").decoding()
+    decodings = [each.decoding() for each in made]
+    assert all(each["layout"] == "recorded" for each in decodings)
+    assert all(a != b for index, a in enumerate(decodings) for b in decodings[:index])
+    assert decodings[0] == CorruptedDataset(Recorded(), NOISE, 8, split="test").decoding()
 
 
-def test_settings_are_what_the_file_says_but_for_the_ladder() -> None:
+def test_settings_leave_out_the_ladder() -> None:
     assert settings_of(Occluded(image="rgb", block=8, severities=(0.5,))) == {
         "image": "rgb",
         "block": 8,
@@ -151,25 +151,27 @@ def test_settings_are_what_the_file_says_but_for_the_ladder() -> None:
     [
         (NOISE, 256, "must lie in"),
         (NOISE, -1, "must lie in"),
-        (FROZEN, 1, "1 is no failure; give 2 or more"),
+        (FROZEN, 1, "1 is no corruption; give 2 or more"),
         (FROZEN, 2.5, "counts frames: expected 1, 2, 3"),
         (DELAYED, float("inf"), "counts frames"),
         (DELAYED, float("nan"), "counts frames"),
         (DELAYED, -1, "counts frames"),
     ],
 )
-def test_severities_out_of_range(kind: OfPixels | OfTime, severity: float, sentence: str) -> None:
+def test_severity_out_of_range_is_refused(
+    kind: OfPixels | OfTime, severity: float, sentence: str
+) -> None:
     with pytest.raises(InputError, match=sentence):
-        Degraded(Recorded(), kind, severity, split="test")
+        CorruptedDataset(Recorded(), kind, severity, split="test")
 
 
-def test_frames_of_two_sizes_and_names_of_other_splits() -> None:
-    data = Degraded(Recorded(sizes={"00003D": (60, 80)}), DELAYED, 1, split="test")
+def test_frames_of_two_sizes_are_refused() -> None:
+    data = CorruptedDataset(Recorded(sizes={"00003D": (60, 80)}), DELAYED, 1, split="test")
     with pytest.raises(InputError, match=r"'00004D' \(120x160 pixels\) .* '00003D' \(60x80 pixels"):
         data.read("00004D")
     with pytest.raises(InputError, match="'00009D' is not of split 'test', whose order says"):
         data.read("00009D")
-    # Failures of pixels ask for no order.
-    assert Degraded(Recorded(), NOISE, 8, split="test").read("00009D").name == "00009D"
+    # Corruptions of pixels need no order.
+    assert CorruptedDataset(Recorded(), NOISE, 8, split="test").read("00009D").name == "00009D"
     with pytest.raises(InputError, match="no split 'tset'"):
-        Degraded(Recorded(), DELAYED, 1, split="tset")
+        CorruptedDataset(Recorded(), DELAYED, 1, split="tset")

@@ -1,0 +1,107 @@
+"""Predictions of single images as pictures: a colour overlay and a PNG of class indices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.build.session import Session
+from rgbt.checks import InputError
+from rgbt.data.batches import collate
+from rgbt.data.label_map import LabelMap
+from rgbt.data.to_predict import ToPredict, of_files, of_path, of_split
+from rgbt.engine.evaluate import predictions
+from rgbt.engine.progress import progress
+from rgbt.evaluation.prediction import heads_of, view_of
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.files.atomic import write_atomic
+from rgbt.tracking.pictures import overlay
+from rgbt.tracking.terminal import tell
+from rgbt.types import Sample
+
+
+def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
+    """The images of the options ``input``, or ``rgb`` and ``thermal``.
+
+    Raises:
+        InputError: neither or both are given, or there are no such images.
+    """
+    if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
+        given = {"input": source, "rgb": rgb, "thermal": thermal}
+        raise InputError(
+            "expected either input=FOLDER (or a split, or a file of four channels) or rgb=FILE "
+            "thermal=FILE, got "
+            + (" and ".join(key for key, value in given.items() if value) or "none")
+            + " of input, rgb and thermal."
+        )
+    dataset = session.dataset
+    if rgb:
+        return of_files(dataset, Path(rgb), Path(thermal))
+    if source in dataset.splits:
+        return of_split(dataset, source)
+    return of_path(dataset, source, session.loading.on_error)
+
+
+def write_images(
+    session: Session,
+    images: ToPredict,
+    request: EvaluationRequest,
+    out: Path,
+    label_map: LabelMap | None,
+) -> str:
+    """Write NAME_overlay.png and NAME.png of every image, with a progress bar.
+
+    Args:
+        session: see `rgbt.build.session.open_session`.
+        images: see `chosen_images`.
+        request: view and head.
+        out: folder, made where it is missing.
+        label_map: from the classes of the network to those of the data set; None: they are the
+            same.
+
+    Returns:
+        how many images were written, and where.
+
+    Raises:
+        InputError: an input image would be overwritten, or cannot be read.
+    """
+    images.check_out(out)
+    out.mkdir(parents=True, exist_ok=True)
+    palette = np.array(session.dataset.palette, np.uint8)
+    written = 0
+    with progress() as display:
+        task = display.add_task("predicting", total=len(images.names), note="images")
+        for sample, predicted in _predicted(session, images, request):
+            classes = predicted if label_map is None else label_map(predicted)
+            painted = overlay(sample.rgb, classes, palette)
+            _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
+            _write(out / f"{sample.name}.png", classes)
+            written += 1
+            display.advance(task)
+    for reason in list(images.skipped.values())[:1]:
+        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
+    for path in images.others[:1]:
+        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
+    return f"{written} images in {out.resolve()}"
+
+
+def _predicted(
+    session: Session, images: ToPredict, request: EvaluationRequest
+) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
+    view = view_of(session, request.view)
+    heads = heads_of(session, view, request.head)
+    for sample in images.samples(session.loading.on_error):
+        # One image at a time: a folder may hold images of any size.
+        batch = collate([session.transform.test(sample)], "")
+        for found in predictions(session.model, [batch], session.fabric, view, heads):
+            yield sample, found.classes[0].numpy()
+
+
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    encoded, content = cv2.imencode(".png", image)
+    assert encoded, "8 bit images can be encoded"
+    write_atomic(path, content.tobytes())
