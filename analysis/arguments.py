@@ -14,7 +14,7 @@ from rgbt.config.command import built
 from rgbt.config.options import Help
 
 if TYPE_CHECKING:
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
 
 MOST = 1_000_000
 """What a count may be, where nothing else limits it."""

@@ -96,7 +96,7 @@ def main(options: Options, overrides: list[str]) -> int:
     label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
     label += f", {failure.told}" if failure else ""
     tables = result_tables(counts, session.regions, label, stored.step)
-    heads = session.domains.told(head or session.domains.tested_head)
+    heads = session.domains.heads_in_words(head or session.domains.tested_head)
     places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
     if found.skipped:
         places.append(("left out", f"{len(found.skipped)} images that cannot be read"))

@@ -22,7 +22,7 @@ from rgbt.checkpoints.read import Contents
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.component import build
-from rgbt.config.compose import compose, conf_dir
+from rgbt.config.compose import available, compose
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
@@ -92,7 +92,7 @@ def _network(
 
 def _is_there(overrides: tuple[str, ...]) -> bool:
     model = overrides[0].removeprefix("model=")
-    return (conf_dir() / "model" / f"{model}.yaml").is_file()
+    return model in available("model")
 
 
 def _built(node: DictConfig) -> Any:

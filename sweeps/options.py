@@ -166,14 +166,13 @@ def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequ
     Raises:
         InputError: no such table, scale or metric; no seeds.
     """
-    from rgbt.config.compose import conf_dir
+    from rgbt.config.compose import available
     from sweeps.table.request import TableRequest, seeds_of
     from sweeps.table.scoring import check_metrics
     from sweeps.table.table import load_table
     from sweeps.worker.storage import NAME
 
-    scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
-    check_choice("scale", options.scale, scales)
+    check_choice("scale", options.scale, available("scale"))
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"

@@ -298,7 +298,7 @@ def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
     words = (f"run={broken}", f"input={tmp_path / 'mine'}", f"out={out}")
     code, _, err = call(entry, *words)
     assert code == 2
-    assert_one_sentence(err, "so that no head can be chosen; say head=source or head=target")
+    assert_one_sentence(err, "so no head can be chosen; set head=source or head=target")
 
     found = {}
     for head in ("source", "target"):
@@ -502,11 +502,11 @@ BAD: dict[str, tuple[list[str], str]] = {
         "domains.source.head=left, but DeepLabV2 has the heads source, target",
     ),
     "heads of a network with one": (
-        ["multi_head_thermal_stage1", "model=deeplab_demo"],
+        ["multi_head_thermal_stage1", "model.heads=[main]"],
         "domains.source.head=source, but DeepLabV2 has the heads main; choose one of them",
     ),
     "a head that nothing trains": (
-        ["sh_source", "model=multi_head_demo"],
+        ["sh_source", "model.heads=[source,target]"],
         "DeepLabV2 has the heads source, target, of which these domains train only the first",
     ),
     "network without scores": (

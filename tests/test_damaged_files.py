@@ -365,40 +365,39 @@ def read_names(path: Path) -> Any:
     return plain(read(path, "dataset.splits"))
 
 
-STORE_ABOUT = {"class": "MFNet", "fingerprint": "0123", "root": "/data"}
+CACHE_ABOUT = {"class": "MFNet", "fingerprint": "0123", "root": "/data"}
 
 
-def store(folder: Path) -> Path:
-    from rgbt.data.cache.file import crc_of
-    from rgbt.data.cache.stamps import Stamp
-    from rgbt.data.cache.store import Fresh, Store
+def cache(folder: Path) -> Path:
+    from rgbt.data.cache.folder import CacheFolder, NewSample
+    from rgbt.data.cache.sample_file import crc_of
     from rgbt.types import Sample
 
     rgb = picture((10, 12), 3)
     samples = [Sample(rgb // n, rgb[..., 0] // n, None, name=f"{n}") for n in (1, 2, 3)]
-    made = Store(folder / "store", STORE_ABOUT, 1)
+    made = CacheFolder(folder / "cache", CACHE_ABOUT, 1)
     with made.building():
-        made.add(iter([Fresh(sample, crc_of(sample), ()) for sample in samples]))
-    assert Stamp
-    (path,) = (folder / "store").glob("*.frames")
+        made.add(iter([NewSample(sample, crc_of(sample), ()) for sample in samples]))
+
+    (path,) = (folder / "cache").glob("*.frames")
     return path
 
 
-def read_store(path: Path) -> Any:
-    """Every frame that is whole; damaged ones are decoded anew, and count as refused here."""
-    from rgbt.data.cache.store import Store
+def read_cache(path: Path) -> Any:
+    """Every intact sample; damaged ones are decoded again, and count as refused here."""
+    from rgbt.data.cache.folder import CacheFolder
 
-    opened = Store(path.parent, STORE_ABOUT, 1)
+    opened = CacheFolder(path.parent, CACHE_ABOUT, 1)
     opened.load(lambda *_: None)
-    frames = {name: plain(at.file.read(at.frame)) for name, at in sorted(opened.frames.items())}
-    whole = store_frames()
-    assert frames.items() <= whole.items(), "a frame with other pixels"
-    if len(frames) < len(whole):
-        raise InputError("frames are left out.")
-    return plain(frames)
+    samples = {name: plain(at.file.read(at.record)) for name, at in sorted(opened.samples.items())}
+    intact = cached_samples()
+    assert samples.items() <= intact.items(), "a sample with other pixels"
+    if len(samples) < len(intact):
+        raise InputError("samples are left out.")
+    return plain(samples)
 
 
-def store_frames() -> dict[str, Any]:
+def cached_samples() -> dict[str, Any]:
     from rgbt.types import Sample
 
     rgb = picture((10, 12), 3)
@@ -406,9 +405,9 @@ def store_frames() -> dict[str, Any]:
     return {sample.name: plain(sample) for sample in samples}
 
 
-def in_store(name: str) -> Callable[[Path], Path]:
+def in_cache(name: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        return store(folder).with_name(name)
+        return cache(folder).with_name(name)
 
     return make
 
@@ -518,9 +517,9 @@ KINDS = {
         Kind("pseudo-label", lambda f: pseudo(f).parent / "labels" / "a.png", read_pseudo),
         Kind("confidence", lambda f: pseudo(f).parent / "confidence" / "a.png", read_pseudo),
         Kind("split list", split_list, read_names, anything),
-        Kind("decoded frames", store, read_store),
-        Kind("about.json of decoded frames", in_store("about.json"), read_store),
-        Kind("verified.json of decoded frames", in_store("verified.json"), read_store),
+        Kind("image cache", cache, read_cache),
+        Kind("about.json of image cache", in_cache("about.json"), read_cache),
+        Kind("verified.json of image cache", in_cache("verified.json"), read_cache),
         Kind("journal of studies", journal, read_journal, anything),
         Kind("robustness.json", robustness, read_robustness),
         Kind("angles of views", angles, read_angles, anything),

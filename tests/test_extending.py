@@ -144,7 +144,9 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     assert code == 0, err
     code, _, err = call(predict.entry, *words, f"input={lab}")
     assert code == 2
-    assert_one_sentence(err, "Arrays does not say how new images are read; name one of its splits")
+    assert_one_sentence(
+        err, "Arrays does not declare how new images are read; name one of its splits"
+    )
 
 
 FOCAL = '{"focal": ((1 - (-each).exp()) ** self.gamma * each).mean()[None]}'

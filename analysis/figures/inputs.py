@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from analysis.predictions.maps import PixelMaps
     from analysis.results import Frames
     from analysis.statistics.data import SpatialStatistics
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent, Regions
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
     from rgbt.types import Sample
 
 Labels = NDArray[np.uint8]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.dataset import LabelledDataset
+from rgbt.dataset import LabelledDataset
 
 Missing = Literal["refuse", "leave_out"]
 

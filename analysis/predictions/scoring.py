@@ -18,7 +18,7 @@ from analysis.predictions.folder import Found, Missing, find
 from analysis.predictions.images import Array, Format, Reader, check_one_kind
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
-from rgbt.data.dataset import LabelledDataset
+from rgbt.dataset import LabelledDataset
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent, Regions

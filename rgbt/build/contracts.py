@@ -1,7 +1,7 @@
 """What a user's own parts must be: checked where they enter the lab, one sentence each.
 
 Classes of this package are tested, and pass unchecked; others are compared with `rgbt.types` and
-with `rgbt.data.dataset` before a training starts, and what they return the first time they are
+with `rgbt.dataset` before a training starts, and what they return the first time they are
 used. docs/extending.md has an example of each.
 """
 
@@ -38,7 +38,7 @@ def is_own(part: object) -> bool:
 
 
 def check_dataset(dataset: Any) -> None:
-    """Refuse a data set without the members of `rgbt.data.dataset.LabelledDataset`.
+    """Refuse a data set without the members of `rgbt.dataset.LabelledDataset`.
 
     Raises:
         InputError: naming the member, or the property that is of another type.
@@ -108,7 +108,7 @@ def _check_label(returned: str, label: np.ndarray, num_classes: int) -> None:
 
 
 def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) -> None:
-    """Refuse a transform whose examples are not those of `rgbt.data.batches.Example`.
+    """Refuse a transform whose examples are not those of `rgbt.data.batches.TransformedSample`.
 
     Raises:
         InputError: naming the method and what it returned.

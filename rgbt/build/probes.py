@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rgbt.checks import InputError
 from rgbt.build.contracts import check_first_sample, check_regions, check_transform, is_own
-from rgbt.data.cache.dataset import Decoded
+from rgbt.dataset import reader_of
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
 from rgbt.build.session import Session
@@ -39,8 +39,7 @@ def check_own_parts(session: Session) -> None:
     Raises:
         InputError: in the words of `rgbt.build.contracts`.
     """
-    dataset, transform = session.dataset, session.transform
-    dataset = dataset.source if isinstance(dataset, Decoded) else dataset
+    dataset, transform = reader_of(session.dataset), session.transform
     splits = [domain.split for domain in session.domains.named.values()]
     if is_own(dataset):
         for split in dict.fromkeys((*splits, session.trainer.selection_split, "test")):

@@ -19,8 +19,8 @@ from torch import nn
 
 from rgbt.checks import InputError, check_choice
 from rgbt.build.contracts import check_dataset, is_own, watch_model
-from rgbt.data.dataset import LabelledDataset
-from rgbt.data.cache.dataset import Decoded, decoded_dataset
+from rgbt.dataset import LabelledDataset
+from rgbt.data.cache.dataset import cached_dataset, cached_layer
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
@@ -103,7 +103,7 @@ def open_session(
     files: LabelledDataset = spec.dataset.build()
     if is_own(files):
         check_dataset(files)
-    dataset = decoded_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
+    dataset = cached_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
     num_classes = spec.model.values.get("num_classes", dataset.num_classes)
     _check_classes(num_classes, dataset, label_map)
     if is_own(model):
@@ -148,17 +148,15 @@ def _fabric(trainer: TrainerSettings) -> Fabric:
 
 
 def decode_ahead(session: Session, *splits: str) -> None:
-    """Fill the cache of decoded images with these splits, where one is asked for.
+    """Fill the image cache with these splits, if the session has one.
 
     In the main process, before others read from it.
 
     Raises:
         InputError: the cache cannot be written.
     """
-    # A degradation may stand before it.
-    dataset = getattr(session.dataset, "source", None)
-    dataset = session.dataset if isinstance(session.dataset, Decoded) else dataset
-    if isinstance(dataset, Decoded):
+    dataset = cached_layer(session.dataset)
+    if dataset is not None:
         names = tuple(name for split in splits for name in dataset.names(split))
         with ExitStack() as shown:
             tasks: dict[str, TaskID] = {}

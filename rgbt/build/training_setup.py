@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from rgbt.checks import InputError
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import available
 from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
@@ -177,7 +177,7 @@ def _tell_what_is_not_as_published(session: Session) -> None:
         )
     meant = spec.recipe.dataset
     if spec.scale.name == "paper" and meant != data.name:
-        known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
+        known = data.name in available("recipe")
         tell(
             f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
             + (f"choose recipe={data.name}, or " if known else "")
@@ -357,7 +357,7 @@ def _check_domains(scheme: object, session: Session) -> None:
             raise InputError(
                 f"domains.{name}.head={domain.head}, but {type(model).__name__} has "
                 + (f"the heads {', '.join(heads)}" if heads else "no heads to choose from")
-                + "; choose one of them, or model=multi_head_demo (or _paper)."
+                + "; choose one of them, or a DeepLab v2 with model.heads=[source,target]."
             )
         views = getattr(model, "views", VIEWS)
         if domain.view is not None and domain.view not in views:

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import compose, conf_dir, register_resolvers
+from rgbt.config.compose import compose, conf_dir, register_resolvers, searching
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.keys import check_keys
 from rgbt.config.reporting import exit_code
@@ -61,7 +61,7 @@ def command(
             def job(config: DictConfig) -> None:
                 codes.append(exit_code(lambda: _checked(main, config), catch_interrupt=False))
 
-            with answered():
+            with answered(), searching(words):
                 code = max([exit_code(lambda: _compose(config_name, job, words)), *codes])
             sys.exit(code)
 

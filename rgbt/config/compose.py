@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
 from omegaconf import DictConfig, OmegaConf
+
+SEARCH_PATH = "hydra.searchpath"
+"""Override that adds folders of a user's own files, as RGBT_CONF does (conf/config.yaml)."""
+
+_of_the_command: list[str] = []
+"""That override as the running command was given it; one at most."""
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -22,16 +31,75 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
+@contextmanager
+def searching(words: Sequence[str]) -> Iterator[None]:
+    """Compose with the search path of a command line, for as long as the command runs.
+
+    Upstream runs, defaults and groups of a run that is opened again are composed without the words
+    of the command, and need the folders of its ``hydra.searchpath=...`` too.
+
+    Args:
+        words: of the command line, after the name of the command.
+    """
+    before = list(_of_the_command)
+    _of_the_command[:] = [word for word in words if word.startswith(f"{SEARCH_PATH}=")][:1]
+    try:
+        yield
+    finally:
+        _of_the_command[:] = before
+
+
+def search_path(overrides: Sequence[str] = ()) -> list[str]:
+    """The override ``hydra.searchpath=...`` that applies: of `overrides`, else of the command.
+
+    Returns:
+        a list of this one word; empty where none was given.
+    """
+    given = [word for word in overrides if word.startswith(f"{SEARCH_PATH}=")]
+    return given or list(_of_the_command)
+
+
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that `rgbt.run` would get from these overrides, not checked."""
-    register_resolvers()
+    """The configuration that `rgbt.run` would get from these overrides, not checked.
+
+    Files are looked up in ``conf/`` and in the folders of `search_path`.
+    """
+    others = [word for word in overrides if not word.startswith(f"{SEARCH_PATH}=")]
     with _own_hydra():
-        return hydra.compose("config", list(overrides))
+        return hydra.compose("config", [*others, *search_path(overrides)])
+
+
+def available(group: str, overrides: Sequence[str] = ()) -> list[str]:
+    """Names of the files of a group, those of `search_path` included.
+
+    Args:
+        group: such as "experiment" or "model/inputs".
+        overrides: of which ``hydra.searchpath=...`` counts.
+    """
+    return list(_listed(group, ObjectType.CONFIG, *_searched(overrides)))
+
+
+def groups(overrides: Sequence[str] = ()) -> list[str]:
+    """Names of the groups, those of `search_path` included."""
+    return list(_listed("", ObjectType.GROUP, *_searched(overrides)))
+
+
+def _searched(overrides: Sequence[str]) -> tuple[str | None, *tuple[str, ...]]:
+    return os.environ.get("RGBT_CONF"), *search_path(overrides)
+
+
+@cache
+def _listed(group: str, kind: ObjectType, _own: str | None, *words: str) -> tuple[str, ...]:
+    """Names in a group; cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
+    with _own_hydra():
+        loader = GlobalHydra.instance().config_loader()
+        return tuple(loader.get_group_options(group, kind, "config", list(words)))
 
 
 @contextmanager
 def _own_hydra() -> Iterator[None]:
     """Hydra with our configuration, also inside a command that Hydra runs."""
+    register_resolvers()
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
@@ -46,12 +114,18 @@ def _own_hydra() -> Iterator[None]:
 def register_resolvers() -> None:
     """What configuration files may say beside values, by the chosen scale.
 
+    ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
-    for name, resolve in (("px", _scaled_pixels), ("scenes", _num_scenes)):
+    for name, resolve in (("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)):
         if not OmegaConf.has_resolver(name):
             OmegaConf.register_new_resolver(name, resolve)
+
+
+def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
+    scale = _root_.scale  # in a defaults list the name of the file, elsewhere the node
+    return choices[scale if isinstance(scale, str) else scale.name]
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:

@@ -5,6 +5,7 @@ Hydra's own messages name neither the key that was meant nor what to type.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest, split_list
-from rgbt.config.compose import compose, conf_dir, flatten
+from rgbt.config.compose import (
+    SEARCH_PATH,
+    available,
+    compose,
+    conf_dir,
+    flatten,
+    groups,
+    search_path,
+)
 from rgbt.config.keys import top_level
 
 ADDED = ("experiment", "search", "debug")
@@ -48,7 +57,7 @@ def check_words(words: Sequence[str]) -> None:
         if key == "seed" and value.startswith("["):
             seeds = ",".join(split_list(value, "seeds"))
             raise InputError(f"'{word}': a run has one seed; several are a grid: -m seed={seeds}.")
-        if key == "hydra.searchpath":
+        if key == SEARCH_PATH:
             _check_folders(word, value)
 
 
@@ -75,13 +84,14 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     """
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
-        return f"there is no {group or 'configuration'} '{name}'; {nearest(name, error.options)}."
+        what = f"there is no {group or 'configuration'} '{name}'"
+        return f"{what}; {nearest(name, error.options)}.{forgotten(overrides)}"
     if isinstance(error, MissingConfigException):
         match = re.search(r"'([^']+?)(?:/[^'/]*)?'", str(error))
         group = match.group(1) if match else "?"
-        return f"there is no group '{group}'; {nearest(group, _groups())}."
+        return f"there is no group '{group}'; {nearest(group, groups(overrides))}."
     if isinstance(error, OverrideParseException):
-        return _no_override(str(error.override))
+        return _no_override(str(error.override), overrides)
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:
@@ -89,16 +99,22 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     return _of_the_defaults(str(error).splitlines()[0].rstrip("."), overrides)
 
 
-def _groups() -> list[str]:
-    return sorted(path.name for path in conf_dir().iterdir() if path.is_dir())
+def forgotten(overrides: Sequence[str] = ()) -> str:
+    """How a file of the user's own is found, where the command names no folder of such files."""
+    if search_path(overrides) or os.environ.get("RGBT_CONF"):
+        return ""
+    return (
+        f" For a file of your own add '{SEARCH_PATH}=[file:///my/conf]', or set RGBT_CONF=/my/conf."
+    )
 
 
-def _no_override(word: str) -> str:
+def _no_override(word: str, overrides: Sequence[str]) -> str:
     name = word.lstrip("+~").partition("=")[0]
-    files = [group for group in _groups() if (conf_dir() / group / f"{name}.yaml").is_file()]
+    known = groups(overrides)
+    files = [group for group in known if name in available(group, overrides)]
     expected = "key=value, with quotes around a value that holds commas, brackets or spaces: "
     expected += "'key=\"a, b\"'"
-    if name in _groups():
+    if name in known:
         expected = _typed(name, "NAME")
     elif files:
         expected = " or ".join(_typed(group, name) for group in files)
@@ -112,6 +128,12 @@ def _of_the_defaults(first: str, overrides: Sequence[str]) -> str:
         return (
             f"'{several[1]}' names several values, which is a grid: add -m; quotes make one value "
             "of it: 'key=\"a, b\"'."
+        )
+    sizes = re.search(r"'\$\{by_scale:(.*)\}'", first)
+    if sizes:
+        return (
+            f"the experiment names files for these scales alone: {sizes[1]}; choose one yourself "
+            "with group=NAME."
         )
     absent = re.search(r"Could not override '([^']+)'", first)
     if absent and absent[1] in ADDED:

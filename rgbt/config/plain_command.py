@@ -54,7 +54,9 @@ class PlainCommand(Generic[T]):
 
     def code(self, words: Sequence[str]) -> int:
         """The exit code of the command with these words; a mistake is one sentence on stderr."""
-        with answered():
+        from rgbt.config.compose import searching
+
+        with answered(), searching(words):
             return exit_code(lambda: self.run(words))
 
     def run(self, words: Sequence[str]) -> int | None:

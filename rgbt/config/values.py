@@ -92,7 +92,9 @@ def _refusal(path: str, value: Any, annotation: Any, place: Place) -> str:
             break
         annotation, value = inner, value[step]
         path += f"[{step}]" if isinstance(step, int) else f".{step}"
-    return f"'{path}' must be {expected(annotation)}, got {_shown(value)}{_meant(annotation, value)}"
+    return (
+        f"'{path}' must be {expected(annotation)}, got {_shown(value)}{_meant(annotation, value)}"
+    )
 
 
 def _meant(annotation: Any, value: Any) -> str:

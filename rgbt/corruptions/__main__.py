@@ -12,7 +12,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from rgbt.data.dataset import LabelledDataset
+    from rgbt.dataset import LabelledDataset
 
 SUFFIXES = (".png", ".jpg")
 PLACE = 11

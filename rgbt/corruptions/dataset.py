@@ -3,70 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import Degradation, OfTime
+from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
 
 
-class Source(Protocol):
-    """The data set that is degraded (see `rgbt.data.dataset.LabelledDataset`)."""
-
-    root: Path
-    name: str
-    num_classes: int
-    classes: tuple[str, ...]
-    palette: tuple[tuple[int, int, int], ...]
-    unscored: tuple[str, ...]
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        """Split -> what it is made of."""
-        ...
-
-    def has(self, split: str) -> bool:
-        """Whether anything of `split` is there."""
-        ...
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        ...
-
-    def read(self, name: str) -> Sample:
-        """One sample."""
-        ...
-
-    def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label alone."""
-        ...
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens."""
-        ...
-
-    def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
-        ...
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Hash of names and files."""
-        ...
-
-
-class Degraded:
-    """`source` under a degradation; it is a `rgbt.data.dataset.LabelledDataset` itself.
+class Degraded(DatasetWrapper):
+    """`source` under a degradation; a `rgbt.dataset.LabelledDataset`.
 
     Names, labels and the fingerprint are those of the source: scores are of the same images. What
     is drawn for an image follows from (seed, its name) alone, whatever is read before it.
@@ -84,7 +35,7 @@ class Degraded:
 
     def __init__(
         self,
-        source: Source,
+        source: LabelledDataset,
         degradation: Degradation,
         severity: float,
         *,
@@ -93,32 +44,13 @@ class Degraded:
     ) -> None:
         if severity:
             degradation.check(severity)
-        self.source = source
+        super().__init__(source)
         self.degradation = degradation
         self.severity = severity
         self.split = split
         self.seed = seed
-        self.root = source.root
-        self.name = source.name
-        self.num_classes = source.num_classes
-        self.classes = source.classes
-        self.palette = source.palette
-        self.unscored = source.unscored
         self._names = source.names(split)
         self._shown = self._other_frames()
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        """Those of the source."""
-        return self.source.splits
-
-    def has(self, split: str) -> bool:
-        """Whether the source has anything of `split`."""
-        return self.source.has(split)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split of the source."""
-        return self.source.names(split)
 
     def read(self, name: str) -> Sample:
         """The sample called `name` under the degradation.
@@ -151,10 +83,6 @@ class Degraded:
             )
         return self._shown.get(name, name)
 
-    def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of the source."""
-        return self.source.label(name)
-
     def files(self, name: str) -> tuple[Path, ...]:
         """Files of the source for `name`, and for the frame that is shown where it is another."""
         names = dict.fromkeys((name, self.shown(name)))
@@ -171,14 +99,6 @@ class Degraded:
             "seed": self.seed,
             "listed": listed,
         }
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night, as the source says."""
-        return self.source.nights(names)
-
-    def fingerprint(self) -> str:
-        """That of the source."""
-        return self.source.fingerprint()
 
     def _other_frames(self) -> dict[str, str]:
         """Name -> name of the frame whose thermal image it shows; {} where time does not matter."""

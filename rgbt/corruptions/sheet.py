@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rgbt.corruptions.corruption import Degradation
-from rgbt.corruptions.dataset import Degraded, Source
+from rgbt.corruptions.dataset import Degraded
+from rgbt.dataset import LabelledDataset
 from rgbt.types import Sample
 
 CELL = 2.4
@@ -33,7 +34,7 @@ class Line:
 
 
 def sheet(
-    source: Source, kinds: Iterable[Degradation], name: str, split: str, seed: int = 0
+    source: LabelledDataset, kinds: Iterable[Degradation], name: str, split: str, seed: int = 0
 ) -> tuple[Line, ...]:
     """One sample under every severity of every degradation.
 

@@ -1,4 +1,4 @@
-"""What the loader asks of a data set and a transform, and how examples become a batch."""
+"""Members of data sets and transforms that the loader uses, and stacking of examples to a batch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.types import Batch, Loadable, Sample
 
 
 class Dataset(Protocol):
-    """Where samples come from (see `rgbt.data.mfnet.MFNet`)."""
+    """The members of a data set that the loader uses (see `rgbt.data.mfnet.MFNet`)."""
 
     name: str
 
@@ -23,11 +23,11 @@ class Dataset(Protocol):
         ...
 
     def read(self, name: str) -> Sample:
-        """One sample; InputError where it cannot be read."""
+        """One sample; InputError if it cannot be read."""
         ...
 
 
-class Example(Protocol):
+class TransformedSample(Protocol):
     """A sample after the transform (see `rgbt.transforms.example.Example`)."""
 
     @property
@@ -67,24 +67,24 @@ class Example(Protocol):
 
     @property
     def confidence(self) -> NDArray[np.float32] | None:
-        """(H', W') how sure the labels are, or None."""
+        """(H', W') confidence of the labels, or None."""
         ...
 
 
 class Transform(Protocol):
     """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
 
-    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+    def train(self, sample: Sample, rng: np.random.Generator) -> TransformedSample:
         """Augmented example; every draw comes from `rng`."""
         ...
 
-    def test(self, sample: Sample) -> Example:
+    def test(self, sample: Sample) -> TransformedSample:
         """Example for evaluation, the same every time."""
         ...
 
 
 class BatchTransform(Protocol):
-    """A transform that can leave the work to the device (see `rgbt.transforms.crm.CrmTransform`).
+    """A transform that can augment whole batches on the device.
 
     ``stack([drawn(sample, rng), ...]).to(device)`` is the batch of ``train(sample, rng)``.
     """
@@ -92,20 +92,20 @@ class BatchTransform(Protocol):
     works_on_batches: bool
 
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Any:
-        """What `train` would read and do; every draw comes from `rng`."""
+        """The sample and the draws of `train`, not yet applied; every draw comes from `rng`."""
         ...
 
     def stack(self, drawn: Sequence[Any]) -> Loadable:
-        """Examples of one size; InputError where they differ."""
+        """Examples of one size; InputError if they differ."""
         ...
 
 
-def collate(examples: Sequence[Example], advice: str = "") -> Batch:
+def collate(examples: Sequence[TransformedSample], advice: str = "") -> Batch:
     """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
 
     Args:
         examples: at least one, images all (H, W, 3) and labels all (H', W').
-        advice: ends the message where sizes differ; says which key to change.
+        advice: end of the message if sizes differ; names the key to change.
 
     Raises:
         InputError: images or labels differ in size, naming the first two that do; labels of some
@@ -129,7 +129,7 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     )
 
 
-def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
+def _confidences(examples: Sequence[TransformedSample]) -> list[NDArray[np.float32]]:
     """Those of all examples, or none."""
     found = [each.confidence for each in examples if each.confidence is not None]
     if 0 < len(found) < len(examples):
@@ -145,7 +145,7 @@ def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
     return found
 
 
-def _check_sizes(examples: Sequence[Example], advice: str) -> None:
+def _check_sizes(examples: Sequence[TransformedSample], advice: str) -> None:
     first = examples[0]
     for example in examples[1:]:
         for what in ("rgb", "label"):

@@ -1,4 +1,4 @@
-"""Command that reads a whole data set and reports what it holds and what is wrong.
+"""Command that reads a whole data set and reports its content and its problems.
 
     python -m rgbt.data.check dataset=mfnet dataset.root=...
     python -m rgbt.data.check dataset=kp dataset.root=...
@@ -17,17 +17,21 @@ from rich.table import Table
 
 from rgbt.config.command import command
 from rgbt.config.component import build
-from rgbt.data.dataset import LabelledDataset
-from rgbt.data.report.dataset import check_dataset, layout_of, num_listed
-from rgbt.data.report.values import Report, SplitReport
+from rgbt.data.report.dataset import check_dataset, checks_of, num_listed
+from rgbt.data.report.values import DatasetReport, SplitReport
+from rgbt.dataset import LabelledDataset
 
 WIDTH_WITHOUT_TERMINAL = 120
 
 
 @command()
 def main(config: DictConfig) -> int:
-    """Check ``config.dataset``; 1 where there are problems."""
-    dataset: LabelledDataset = build(config.dataset)
+    """Check ``config.dataset``; returns 1 if there are problems."""
+    return check_and_print(build(config.dataset))
+
+
+def check_and_print(dataset: LabelledDataset) -> int:
+    """Read a data set and print the report; returns 1 if there are problems."""
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("reading", total=num_listed(dataset))
         report = check_dataset(
@@ -39,18 +43,18 @@ def main(config: DictConfig) -> int:
     return 1 if report.problems else 0
 
 
-def print_report(dataset: LabelledDataset, report: Report) -> None:
+def print_report(dataset: LabelledDataset, report: DatasetReport) -> None:
     """Write the report to stdout: two tables, then one line per note and per problem."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
-    layout = layout_of(dataset)
-    title = f"{dataset.name} ({layout.title}): {dataset.root}"
+    checks = checks_of(dataset)
+    title = f"{dataset.name} ({checks.title}): {dataset.root}"
     console.print(title, soft_wrap=True, markup=False)
     if report.splits:
         console.print(split_table(report.splits))
         labelled = (split for split in report.splits if split.pixels.any())
-        own = tuple(split for split in labelled if not layout.repeats(split.split))
+        own = tuple(split for split in labelled if not checks.repeats(split.split))
         console.print(class_table(own, (*dataset.classes, "ignored")))
     for kind, lines in (("note", report.notes), ("problem", report.problems)):
         for line in lines:

@@ -1,4 +1,4 @@
-"""Which images a run is trained on: one domain, or a labelled source and a target to adapt to."""
+"""Training domains of a run: one, or a labelled source and a target to adapt to."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rgbt.types import View
 GIVEN, NONE = "given", "none"
 
 TestedHead = Literal["own", "source", "target"]
-"""Which head predicts an image: that of its domain, or one domain's for all."""
+"""The head that predicts an image: that of its domain, or that of one domain for all images."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Domain:
-    """One domain: its training images, how they are seen, whose labels they have.
+    """One domain: its training images, their view and their labels.
 
     Attributes:
         split: of the data set.
@@ -31,11 +31,11 @@ class Domain:
             is left to that network.
         threshold: least confidence of a pixel that keeps its label of "experiment:..."; 0 for all
             else.
-        confidence: whether pixels count in the loss as much as their label is sure; needs
+        confidence: whether the loss of a pixel is weighted by the confidence of its label; needs
             pseudo-labels.
 
     Raises:
-        InputError: a setting that has no effect with these labels.
+        InputError: a setting has no effect with these labels.
     """
 
     split: Text
@@ -77,7 +77,7 @@ class Domains:
             with the head for the day ("source").
 
     Raises:
-        InputError: heads that cannot be told apart, or settings without effect.
+        InputError: heads that cannot be distinguished, or settings without effect.
     """
 
     source: Domain
@@ -99,14 +99,14 @@ class Domains:
             )
         if self.target_is == "view" and self.named["target"].view in (None, self.source.view):
             raise InputError(
-                "domains.target_is=view tells the heads' images apart by what the network sees of "
-                f"them, but both domains are seen as {self.source.view or 'null'}; give "
+                "domains.target_is=view distinguishes the images of the heads by their view, but "
+                f"both domains have the view {self.source.view or 'null'}; give "
                 "domains.target.view another value, or set domains.target_is=night."
             )
         if self.tested_head == "source" and len(heads) < 2:
             raise InputError(
                 "domains.tested_head=source chooses between two heads, but there are "
-                f"{len(heads)}; leave it at own."
+                f"{len(heads)}; set it to own."
             )
 
     @property
@@ -117,46 +117,46 @@ class Domains:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Names of the heads, the source's first; () where the network has one for all."""
+        """Names of the heads, the source's first; () if the network has one for all."""
         return tuple(dict.fromkeys(head for head in self._own_heads() if head is not None))
 
-    def told(self, asked: TestedHead) -> str:
-        """Which head predicts which images, in words; "" where there is one for all."""
+    def heads_in_words(self, choice: TestedHead) -> str:
+        """Which head predicts which images, for messages; "" if there is one for all."""
         if len(self.heads) < 2:
             return ""
         source, target = self.heads
-        if asked != "own":
-            return f"{self.named[asked].head} for all images"
+        if choice != "own":
+            return f"{self.named[choice].head} for all images"
         if self.target_is == "night":
             return f"{source} by day, {target} at night"
         return f"{target} for {self.named['target'].view}, {source} otherwise"
 
-    def head_of(self, view: View, night: bool | None, asked: TestedHead) -> str | None:
+    def head_of(self, view: View, night: bool | None, choice: TestedHead) -> str | None:
         """The head that predicts an image.
 
         Args:
-            view: what the network sees of it.
-            night: whether it was taken at night; None where the data set does not say.
-            asked: "own", or the domain whose head shall predict all images.
+            view: the images that the network gets.
+            night: whether it was taken at night; None if the data set does not state it.
+            choice: "own", or the domain of the head that predicts all images.
 
         Returns:
-            its name; None where the network has one head for all.
+            its name; None if the network has one head for all.
 
         Raises:
-            InputError: a choice between heads that there are not; no head can be chosen because
-                the data set does not tell night from day.
+            InputError: the network has one head only; or no head can be chosen because
+                the data set does not state the time of day.
         """
         heads = self.heads
         if len(heads) < 2:
-            if asked != "own":
+            if choice != "own":
                 raise InputError(
-                    f"head={asked} chooses between the heads of two domains, but this run has one "
+                    f"head={choice} chooses between the heads of two domains, but this run has one "
                     "for all images; omit it."
                 )
             return heads[0] if heads else None
-        if asked == "own":
-            asked = self._domain_of(view, night)
-        return self.named[asked].head
+        if choice == "own":
+            choice = self._domain_of(view, night)
+        return self.named[choice].head
 
     def _domain_of(self, view: View, night: bool | None) -> TestedHead:
         if self.target_is == "view":
@@ -164,7 +164,7 @@ class Domains:
         if night is None:
             raise InputError(
                 "domains.target_is=night: the data set does not say which images were taken at "
-                "night, so that no head can be chosen; say head=source or head=target."
+                "night, so no head can be chosen; set head=source or head=target."
             )
         return "target" if night else "source"
 

@@ -1,7 +1,7 @@
-"""Decoding of files into RGB, thermal and label arrays, refusing what would be misread.
+"""Decodes files into RGB, thermal and label arrays, and refuses files it could misread.
 
-OpenCV only decodes here. It drops a fourth channel unless told otherwise and returns B, G, R; the
-thermal image lies in the alpha slot, so that nothing may treat the four channels as one image.
+OpenCV only decodes here. By default it drops a fourth channel, and it returns B, G, R. The thermal
+image is in the alpha channel, so the four channels must not be processed as one image.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from rgbt.files.budgets import check_array
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
-Counts = NDArray[np.uint16]
+CountImage = NDArray[np.uint16]
 
 
 def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
     """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal.
 
-    `advice` says what to do with a file of other channels.
+    `advice` ends the message about a file of other channels.
 
     Raises:
         InputError: missing, not decodable, not 8 bit, or not four channels.
@@ -44,7 +44,7 @@ def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:
-    """RGB (H, W, 3) uint8 of a file of three channels; `advice` says what to do with another one.
+    """RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message about others.
 
     Raises:
         InputError: missing, not decodable, not 8 bit, or other channels.
@@ -66,7 +66,7 @@ def read_thermal(path: Path) -> Array:
     return one_channel(_decode(path), path)
 
 
-def read_counts(path: Path) -> Counts:
+def read_counts(path: Path) -> CountImage:
     """Counts of a thermal camera, (H, W) uint16, at their full depth.
 
     Raises:
@@ -117,13 +117,13 @@ def read_label_array(path: Path, num_classes: int) -> Array:
 
 
 def read_indices(path: Path) -> NDArray[Any]:
-    """Whole numbers (H, W) of an image of one channel, at its own depth, as they were written.
+    """Whole numbers (H, W) of an image of one channel, at its own depth, unchanged.
 
-    A PNG with a palette holds indices, which are returned; its colours are not looked at.
+    Of a PNG with a palette the indices are returned, not the colours.
 
     Raises:
-        InputError: missing, not decodable, several channels, or a kind of file that does not keep
-            numbers as they are: JPEG, and grey PNG of less than 8 bits, which decoders stretch.
+        InputError: missing, not decodable, several channels, or a format that changes values:
+            JPEG, and grey PNG of less than 8 bits, which decoders scale.
     """
     data = read_image(path)
     depth, colours = data[24:26] if data.startswith(PNG) and len(data) > 25 else (8, 0)
@@ -143,9 +143,9 @@ def read_indices(path: Path) -> NDArray[Any]:
 
 
 def read_colours(path: Path) -> Array:
-    """Colours of a label (H, W, 3) uint8, in the order R, G, B, as they were written.
+    """Colours of a label (H, W, 3) uint8, in the order R, G, B, unchanged.
 
-    A PNG with a palette is read as its colours; a fourth channel that hides nothing is dropped.
+    Of a PNG with a palette the colours are returned; an opaque fourth channel is dropped.
 
     Raises:
         InputError: missing, not decodable, not 8 bit, other channels, or a JPEG.
@@ -168,7 +168,7 @@ def read_colours(path: Path) -> Array:
 
 
 def read_array(path: Path, what: str) -> NDArray[Any]:
-    """The array of a `.npy` file; `what` it should hold, for the message.
+    """The array of a `.npy` file; `what` is the expected content, for the message.
 
     Raises:
         InputError: missing, damaged, or something else.
@@ -205,7 +205,7 @@ def one_channel(thermal: NDArray[Any], path: Path) -> NDArray[Any]:
 
 
 def decode(path: Path) -> NDArray[Any]:
-    """An image as it lies, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
+    """An image as written, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
 
     Raises:
         InputError: missing, cut short, not decodable.
@@ -239,7 +239,7 @@ def _decode(path: Path) -> Array:
 def _decoded(data: bytes, path: Path) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:  # a header that announces more pixels than there can be
+    except cv2.error as error:  # a header with more pixels than possible
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError(f"{path} cannot be decoded, its pixels do not fit") from error
         image = None
@@ -249,7 +249,7 @@ def _decoded(data: bytes, path: Path) -> NDArray[Any]:
 
 
 def _palette_indices(data: bytes, path: Path) -> Array:
-    # OpenCV returns the colours of the palette, from which the indices cannot be told.
+    # OpenCV returns the colours of the palette, which do not determine the indices.
     try:
         with Image.open(io.BytesIO(data)) as image:
             return np.array(image, np.uint8)

@@ -1,7 +1,7 @@
 """Freiburg Thermal: labelled days and unlabelled nights for training, both labelled for testing.
 
-A reader only: it cuts the frame, maps counts of the thermal camera to grey and brings labels to the
-size of the frame, each as the configuration says, and refuses what it cannot read exactly.
+A reader only: it crops frames, converts thermal counts to grey levels and resizes labels to the
+frame, as configured, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_counts, read_label, read_label_array, within
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
-from rgbt.data.freiburg_layout import Frame, find_frames, inside
-from rgbt.data.integrity import is_there
+from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
+from rgbt.data.named_files import check_lengths, check_split, existing_file, existing_root, size_of
+from rgbt.data.prepare.freiburg import PREPARATION
+from rgbt.data.report.freiburg import FreiburgChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
@@ -47,18 +48,18 @@ SPLITS = {
 CROP = (5, 645, 360, 1640)
 THERMAL_RANGE = (21800, 23700)
 Count = Annotated[int, Interval(ge=0, lt=2**16)]
-Counts = tuple[Count, Count]
+CountRange = tuple[Count, Count]
 Edge = Annotated[int, Interval(ge=0, le=8192)]
 Crop = tuple[Edge, Edge, Edge, Edge]
 
 MOST_STRETCH = 0.02
-"""How far the aspect of a label may be from that of its frame: what rounding a size leaves."""
+"""Largest relative difference of the aspect ratios of label and frame, due to rounding."""
 
 Array = NDArray[np.uint8]
 
 
 class Freiburg:
-    """RGB-thermal street scenes of Freiburg as their archives lay them out.
+    """RGB-thermal street scenes of Freiburg, in the layout of their archives.
 
     Layout (XX and YY are digits; sec and nsec are seconds and nanoseconds):
         train/seq_XX_{day|night}/YY/fl_rgb/fl_rgb_<sec>_<nsec>.png               8 bit, RGB
@@ -66,8 +67,8 @@ class Freiburg:
                                     fl_rgb_labels/fl_rgb_labels_<sec>_<nsec>.png   8 bit, by day
         test/{day|night}/ImagesRGB/*_rgb.png   ImagesIR/*_ir.png   SegmentationClass/*.npy
 
-    Splits: "train_day", "train_night", and "train", which is "train_day": what is trained on where
-    no domains are named; "val", day sequences that are taken out of "train_day"; "test_day",
+    Splits: "train_day", "train_night", and "train", which equals "train_day" and is used without
+    domains; "val", day sequences that are not in "train_day"; "test_day",
     "test_night", and "test", the day followed by the night. Training frames at night have no
     labels. Those by day, and so those of "val", carry predictions of an RGB network that was
     trained on Mapillary Vistas; only the test part is labelled by hand.
@@ -83,24 +84,26 @@ class Freiburg:
 
     Args:
         root: folder that holds `train`, `test` or both.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
         unscored: classes that are counted but left out of every mean over classes.
-        crop: first row, row after the last, first column, column after the last of what is cut out
-            of every frame and label; None keeps whole frames.
+        crop: first row, row after the last, first column, column after the last of the part of
+            every frame and label that is used; None: whole frames.
         thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
             [21800, 25000] in the HeatNet release.
-        ignored_test: classes whose pixels do not count in "val" and "test" (they become 255):
+        ignored_test: classes that are ignored in "val" and "test" (they become 255):
             "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
         val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
             "val".
 
     Raises:
-        InputError: no such root, neither part in it, a crop, range or class that cannot be, or
-            numbers of classes, names and colours that differ.
+        InputError: no such root, neither part in it, an invalid crop, range or class, or numbers of
+            classes, names and colours that differ.
     """
+
+    preparation = PREPARATION
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -112,11 +115,11 @@ class Freiburg:
         palette: tuple[Colour, ...] = PALETTE,
         unscored: Names = ("background", "ignore"),
         crop: Crop | None = CROP,
-        thermal_range: Counts = THERMAL_RANGE,
+        thermal_range: CountRange = THERMAL_RANGE,
         ignored_test: Names = ("ignore",),
         val_sequences: Names = ("seq_04_day",),
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds train and test")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
@@ -127,8 +130,8 @@ class Freiburg:
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences
         self.splits = SPLITS
-        self._split_frames: dict[str, tuple[Frame, ...]] = {}
-        _check_root(self.root, root)
+        self._split_frames: dict[str, tuple[FreiburgFrame, ...]] = {}
+        _check_root(self.root)
         check_lengths(num_classes, classes, palette)
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
@@ -137,14 +140,14 @@ class Freiburg:
         self.images = FreiburgImages(crop, thermal_range)
 
     def has(self, split: str) -> bool:
-        """Whether there are frames of `split`; InputError where the split is unknown."""
+        """Whether `split` has frames; InputError if the split is unknown."""
         return bool(self._of(split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted by folder and file, the day before the night.
 
         Raises:
-            InputError: unknown split, no frame of it, a sequence for "val" that is not there.
+            InputError: unknown split, no frame of it, a missing sequence of "val".
         """
         frames = self._of(split)
         if split in ("train", "train_day", "val"):
@@ -167,7 +170,7 @@ class Freiburg:
         """
         frame = self.frame(name)
         pixels, counts = whole_frame(name, *self._image_paths(frame))
-        # A label is brought to the size of the whole frame, and cut with it.
+        # A label is resized to the whole frame, and cropped with it.
         label = None if frame.label is None else self._label(frame, counts.shape)
         sample = self.images.sample(name, pixels, counts)
         if label is None:
@@ -193,7 +196,7 @@ class Freiburg:
         return tuple(path for path in paths if path is not None)
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {
             "crop": self.crop,
             "thermal_range": self.thermal_range,
@@ -203,59 +206,59 @@ class Freiburg:
         }
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
-        """Whether each frame lies in a folder that says night; InputError where there is none."""
+        """Whether each frame is in a night folder; InputError if there is no such frame."""
         return tuple(self.frame(name).night for name in names)
 
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
-        What labels look like belongs to it (crop, `ignored_test`). Nothing is decoded and the root
-        is left out, so that equal copies have equal fingerprints; files that are missing count as
-        such.
+        It includes the settings of labels (crop, `ignored_test`), but not the root, so that equal
+        copies have equal fingerprints. Nothing is decoded; missing files have size -1.
         """
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(self.splits):
             names = [frame.name for frame in self._of(split)]
             digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
         for name in self._frames:
-            sizes = [_size(path) for path in self.files(name)]
+            sizes = [size_of(path) for path in self.files(name)]
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError where there is no such frame."""
+    def checks(self) -> FreiburgChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return FreiburgChecks(self)
+
+    def frame(self, name: str) -> FreiburgFrame:
+        """The files of `name`; InputError if there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self._frames[name]
 
     @cached_property
-    def frames(self) -> tuple[Frame, ...]:
-        """Every frame, listed once: later changes of the folder are not seen."""
+    def frames(self) -> tuple[FreiburgFrame, ...]:
+        """Every frame; listed once, so later changes of the folder have no effect."""
         return find_frames(self.root)
 
     @cached_property
-    def _frames(self) -> dict[str, Frame]:
+    def _frames(self) -> dict[str, FreiburgFrame]:
         return {frame.name: frame for frame in self.frames}
 
-    def _of(self, split: str) -> tuple[Frame, ...]:
+    def _of(self, split: str) -> tuple[FreiburgFrame, ...]:
         if split not in self._split_frames:
             self._split_frames[split] = self._select(split)
         return self._split_frames[split]
 
-    def _select(self, split: str) -> tuple[Frame, ...]:
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
-        place, _, time = split.partition("_")
-        time = time or ("day" if place in ("train", "val") else "")
+    def _select(self, split: str) -> tuple[FreiburgFrame, ...]:
+        check_split(split, self.splits)
+        part, _, time = split.partition("_")
+        time = time or ("day" if part in ("train", "val") else "")
         return tuple(
             frame
             for frame in self.frames
-            if self._place(frame) == place and time in ("", "night" if frame.night else "day")
+            if self._part(frame) == part and time in ("", "night" if frame.night else "day")
         )
 
-    def _place(self, frame: Frame) -> str:
+    def _part(self, frame: FreiburgFrame) -> str:
         if frame.is_test:
             return "test"
         held_out = not frame.night and not set(frame.sequences).isdisjoint(self.val_sequences)
@@ -274,63 +277,43 @@ class Freiburg:
     def _why_empty(self, split: str) -> str:
         hint = f"unpack the archive '{split.partition('_')[0]}' there"
         if split == "val":
-            hint = f"it is {list(self.val_sequences)}, name day sequences that are there"
+            hint = f"it is {list(self.val_sequences)}, name existing day sequences"
         elif split in ("train", "train_day") and self.has("val"):
-            hint = "every day sequence is in dataset.val_sequences, leave one out of it"
+            hint = "every day sequence is in dataset.val_sequences, remove one of them"
         return (
             f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
             f"{self.root}; {hint}."
         )
 
-    def _image_paths(self, frame: Frame) -> tuple[Path, Path]:
-        if not is_there(frame.thermal):
-            raise InputError(
-                f"'{frame.name}': its thermal image {frame.thermal} is missing; restore it, or use "
-                "data.on_error=skip to leave the frame out."
-            )
-        return within(frame.rgb, self.root), within(frame.thermal, self.root)
+    def _image_paths(self, frame: FreiburgFrame) -> tuple[Path, Path]:
+        thermal = existing_file("thermal image", frame.thermal, frame.name, self.root)
+        return within(frame.rgb, self.root), thermal
 
-    def _label(self, frame: Frame, hw: tuple[int, ...]) -> Array:
-        """The label at the size of the frame, at the nearest pixel."""
-        assert frame.label is not None, "only frames with a label are asked for it"
-        if not is_there(frame.label):
-            raise InputError(
-                f"'{frame.name}': its label {frame.label} is missing; restore it, or use "
-                "data.on_error=skip to leave the frame out."
-            )
-        read = read_label if frame.label.suffix == ".png" else read_label_array
-        label = read(within(frame.label, self.root), self.num_classes)
+    def _label(self, frame: FreiburgFrame, hw: tuple[int, ...]) -> Array:
+        """The label, resized to the frame with the nearest pixel."""
+        assert frame.label is not None, "the frame has a label"
+        path = existing_file("label", frame.label, frame.name, self.root)
+        read = read_label if path.suffix == ".png" else read_label_array
+        label = read(path, self.num_classes)
         if label.shape != hw:
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
                 raise InputError(
                     f"{frame.label} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
-                    f"{hw[0]}x{hw[1]}, which is another shape and no other size; use the label of "
-                    "the whole frame."
+                    f"{hw[0]}x{hw[1]}, which is another aspect ratio; use the label of the whole "
+                    "frame."
                 )
             size = (hw[1], hw[0])
             label = np.asarray(
                 cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8
             )
-        if self._place(frame) != "train" and self.ignored_test:
+        if self._part(frame) != "train" and self.ignored_test:
             ignored = [self.classes.index(word) for word in self.ignored_test]
             label = np.where(np.isin(label, ignored), np.uint8(IGNORE), label)
         return label
 
 
-def _size(path: Path) -> int:
-    # One question to the file system per file: there are sixty thousand.
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return -1
-
-
-def _check_root(root: Path, given: str) -> None:
-    if not root.is_dir():
-        raise InputError(
-            f"dataset.root: there is no folder '{given}'; give the one that holds train and test."
-        )
+def _check_root(root: Path) -> None:
     if not any(inside(root, part).is_dir() for part in ("train", "test")):
         raise InputError(
             f"dataset.root: '{root}' holds neither the folder train nor test; give the folder into "

@@ -1,4 +1,4 @@
-"""The images of Freiburg Thermal: what is cut out of a frame, counts as grey levels."""
+"""Reads images of Freiburg Thermal: crops them, and converts counts to grey levels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.files import Counts, read_counts, read_rgb
+from rgbt.data.files import CountImage, read_counts, read_rgb
 from rgbt.data.images import PairPattern, read_packed_pair
 from rgbt.data.named_files import check_size
 from rgbt.types import Sample
@@ -23,7 +23,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
 @dataclass(frozen=True)
 class FreiburgImages:
-    """RGB of 8 bits and counts of the thermal camera, both cut (see `rgbt.data.freiburg`).
+    """RGB of 8 bits and counts of the thermal camera, both cropped (see `rgbt.data.freiburg`).
 
     Attributes:
         crop: see `Freiburg`.
@@ -48,19 +48,19 @@ class FreiburgImages:
     thermal_range: tuple[int, int]
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
-        """See `rgbt.data.images.Images`; a packed file is taken as it is, it holds no counts."""
+        """See `rgbt.data.images.PairReader`; a packed file holds grey levels, not counts."""
         if rgb == thermal:
             return read_packed_pair(name, rgb)
         return self.sample(name, *whole_frame(name, rgb, thermal))
 
-    def sample(self, name: str, pixels: Array, counts: Counts) -> Sample:
-        """What is read of a whole frame, RGB (H, W, 3) and counts (H, W); errors as of `cut`."""
+    def sample(self, name: str, pixels: Array, counts: CountImage) -> Sample:
+        """The sample of a whole frame, RGB (H, W, 3) and counts (H, W); errors as of `cut`."""
         levels = np.take(_grey_levels(*self.thermal_range), self.cut(counts, name))
         cut = np.ascontiguousarray(self.cut(pixels, name))
         return Sample(rgb=cut, thermal=levels, label=None, name=name)
 
     def cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
-        """What of a whole frame is read.
+        """The part of a whole frame that is read.
 
         Raises:
             InputError: the frame is smaller than the crop.
@@ -77,7 +77,7 @@ class FreiburgImages:
         return image[top:bottom, left:right]
 
 
-def whole_frame(name: str, rgb: Path, thermal: Path) -> tuple[Array, Counts]:
+def whole_frame(name: str, rgb: Path, thermal: Path) -> tuple[Array, CountImage]:
     """RGB (H, W, 3) and counts (H, W) of a whole frame.
 
     Raises:

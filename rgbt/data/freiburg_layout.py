@@ -1,4 +1,4 @@
-"""Which files of the Freiburg Thermal archives belong together; nothing is opened here."""
+"""The files of each frame of the Freiburg Thermal archives; nothing is opened here."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import NamedTuple
 from rgbt.checks import InputError
 
 RGB, THERMAL, LABEL = "fl_rgb", "fl_ir_aligned", "fl_rgb_labels"
-"""Folders of a training sequence, and beginnings of the names of the files in them."""
+"""Folders of a training sequence, and prefixes of the names of their files."""
 
 TEST_RGB, TEST_THERMAL, TEST_LABEL = "ImagesRGB", "ImagesIR", "SegmentationClass"
-"""Folders of the test part; copies spell them differently, so capitals do not count."""
+"""Folders of the test part; their case differs between copies and is ignored."""
 
 
-class Frame(NamedTuple):
+class FreiburgFrame(NamedTuple):
     """One pair of images and its label.
 
     Attributes:
         name: without slashes: "seq_00_day_00_<seconds>_<nanoseconds>", "test_night_<...>_<...>".
         part: its folder: "train/seq_00_day/00", "test/night".
-        stamp: seconds and nanoseconds, as the RGB file says them.
-        night: whether the path says so.
-        rgb: file that exists.
-        thermal: file that should exist.
-        label: file that should exist; None for training frames at night.
+        stamp: seconds and nanoseconds in the name of the RGB file.
+        night: by the path.
+        rgb: existing file.
+        thermal: expected file.
+        label: expected file; None for training frames at night.
     """
 
     name: str
@@ -48,8 +48,8 @@ class Frame(NamedTuple):
         return sequence, "/".join([sequence, *piece])
 
 
-def find_frames(root: Path) -> tuple[Frame, ...]:
-    """Every frame of which there is an RGB image: training sequences, test by day, test by night.
+def find_frames(root: Path) -> tuple[FreiburgFrame, ...]:
+    """Every frame with an RGB image: training sequences, test by day, test by night.
 
     In a folder frames are sorted by file name, so that the order is the same everywhere.
 
@@ -57,8 +57,8 @@ def find_frames(root: Path) -> tuple[Frame, ...]:
         root: holds `train`, `test` or both.
 
     Raises:
-        InputError: a folder that does not say whether it is day or night, two frames of one name,
-            or two RGB images with one thermal partner.
+        InputError: a folder without a time of day, two frames of one name, or two RGB images with
+            one thermal image.
     """
     frames = [*_training(inside(root, "train")), *_test(inside(root, "test"))]
     names: set[str] = set()
@@ -71,7 +71,7 @@ def find_frames(root: Path) -> tuple[Frame, ...]:
     return tuple(frames)
 
 
-def unused_files(root: Path, frames: tuple[Frame, ...]) -> tuple[Path, ...]:
+def unused_files(root: Path, frames: tuple[FreiburgFrame, ...]) -> tuple[Path, ...]:
     """Thermal images and labels that no frame of `find_frames` names, sorted."""
     used = {path for frame in frames for path in (frame.thermal, frame.label)}
     train, test = inside(root, "train"), inside(root, "test")
@@ -86,7 +86,7 @@ def unused_files(root: Path, frames: tuple[Frame, ...]) -> tuple[Path, ...]:
 
 
 def inside(parent: Path, word: str) -> Path:
-    """The folder `word` of `parent`, however its capitals are spelt; as given where none is."""
+    """The folder `word` of `parent`, ignoring case; `parent / word` if there is none."""
     alike = [path for path in _folders(parent) if path.name.lower() == word.lower()]
     return alike[0] if alike else parent / word
 
@@ -111,7 +111,7 @@ def _pieces(train: Path) -> Iterator[Path]:
         yield from _folders(sequence)
 
 
-def _training(train: Path) -> Iterator[Frame]:
+def _training(train: Path) -> Iterator[FreiburgFrame]:
     for piece in _pieces(train):
         sequence = piece.parent.name
         night = _at_night(piece.parent)
@@ -120,7 +120,7 @@ def _training(train: Path) -> Iterator[Frame]:
             stamp = rgb.stem.removeprefix(f"{RGB}_")
             if stamp == rgb.stem:
                 continue
-            yield Frame(
+            yield FreiburgFrame(
                 name=f"{sequence}_{piece.name}_{stamp}",
                 part=f"train/{sequence}/{piece.name}",
                 stamp=stamp,
@@ -135,13 +135,13 @@ def _at_night(sequence: Path) -> bool:
     words = [word for word in ("day", "night") if word in sequence.name.lower()]
     if len(words) != 1:
         raise InputError(
-            f"{sequence}: expected the name of a sequence to say day or night, such as seq_00_day; "
+            f"{sequence}: expected a name of a sequence with day or night, such as seq_00_day; "
             "rename the folder, or move it out of the training part."
         )
     return words == ["night"]
 
 
-def _test(test: Path) -> Iterator[Frame]:
+def _test(test: Path) -> Iterator[FreiburgFrame]:
     for time in ("day", "night"):
         folder = inside(test, time)
         thermals = _by_stamp(inside(folder, TEST_THERMAL), "_ir", ".png")
@@ -149,8 +149,8 @@ def _test(test: Path) -> Iterator[Frame]:
         partners: dict[Path, Path] = {}
         for rgb in _files(inside(folder, TEST_RGB), (".png",)):
             stamp = rgb.stem.removesuffix("_rgb")
-            # Stamps of RGB and label end in the number of the frame in its burst, always 0; those
-            # of thermal do so in one part of the archive and not in the other.
+            # Stamps of RGB and label end in the number of the frame in its burst, always 0. Stamps
+            # of thermal images do so in one part of the archive only.
             thermal = thermals.get(stamp) or thermals.get(stamp.removesuffix("0"))
             thermal = thermal or inside(folder, TEST_THERMAL) / f"{stamp}_ir.png"
             if thermal in partners:
@@ -159,7 +159,7 @@ def _test(test: Path) -> Iterator[Frame]:
                     "image; remove or rename the wrong one."
                 )
             partners[thermal] = rgb
-            yield Frame(
+            yield FreiburgFrame(
                 name=f"test_{time}_{stamp}",
                 part=f"test/{time}",
                 stamp=stamp,

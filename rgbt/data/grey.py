@@ -1,4 +1,4 @@
-"""Thermal images of 8 bits whose three channels may be almost, and not quite, the same."""
+"""Thermal images of 8 bits, of one channel or of three almost equal ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_grey(path: Path, *, advice: str, most_tint: int = 0) -> Array:
 
     Args:
         path: the image.
-        advice: ends the messages, what to do.
+        advice: end of the messages.
         most_tint: levels by which the channels of a pixel may differ, 0 to 255.
 
     Raises:

@@ -1,7 +1,7 @@
 """Pairs of RGB and thermal images without a label: how a data set reads them.
 
-A data set says how its two images lie (`PairPattern`) and how they are decoded (`Images`), so that
-new images of any folder are read as those of the training were.
+A data set declares the paths of its images (`PairPattern`) and how they are decoded (`PairReader`),
+so that new images of any folder are read like the training images.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PairPattern(NamedTuple):
     Attributes:
         rgb: of the RGB images.
         thermal: of the thermal images; equal to `rgb` where thermal is the fourth channel.
-        label: of the labels, which are not read as images; None where they lie elsewhere.
+        label: of the labels, which are not read as images; None if they lie elsewhere.
     """
 
     rgb: str
@@ -40,16 +40,16 @@ class PairPattern(NamedTuple):
         return f"RGB {self.rgb} with thermal {self.thermal}"
 
 
-class Images(Protocol):
+class PairReader(Protocol):
     """How the two images of a pair are read."""
 
     @property
     def layouts(self) -> tuple[PairPattern, ...]:
-        """How the data set's own images lie."""
+        """Path patterns of the images of the data set."""
         ...
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
-        """The pair as the network was trained on it, without a label.
+        """The pair, read like a training sample, without a label.
 
         Args:
             name: of the sample.
@@ -71,10 +71,10 @@ class ReadsPairs(Protocol):
         images: how the images of any folder are read.
     """
 
-    images: Images
+    images: PairReader
 
     def pair(self, name: str) -> Sample:
-        """The images of a name of a split, without its label; InputError as of `Images.read`."""
+        """The images of a sample, without its label; InputError as in `PairReader.read`."""
         ...
 
 
@@ -83,7 +83,7 @@ class GreyImages:
     """RGB and thermal images of 8 bits.
 
     Attributes:
-        layouts: see `Images`.
+        layouts: see `PairReader`.
         thermal: reads the grey levels (H, W) of a thermal image.
         packed_advice: what to do with a packed file that has not four channels.
     """
@@ -93,7 +93,7 @@ class GreyImages:
     packed_advice: str = PACKED_ADVICE
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
-        """See `Images.read`."""
+        """See `PairReader.read`."""
         if rgb == thermal:
             return read_packed_pair(name, rgb, self.packed_advice)
         return pair_of_one_size(name, read_rgb(rgb), self.thermal(thermal), thermal)

@@ -1,8 +1,8 @@
-"""The bytes of a file, read once, or the sentence that says why it cannot be had whole.
+"""Reads the bytes of a file and refuses damaged ones.
 
-What decoders pass over in silence is refused here: an image that ends before its end or does not
-agree with its check sums, a link that leads nowhere, a folder or a pipe in the place of a file. So
-is an image that would fill the memory. What the bytes mean is said by `rgbt.data.files`.
+Some decoders accept damaged files without an error. Refused here are a truncated image, a wrong
+check sum, a broken link, a folder or a pipe instead of a file, and an image too large for the
+memory. Decoding is in `rgbt.data.files`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from rgbt.checks import InputError
 from rgbt.files.budgets import CONTENT, PIXELS, read_bytes
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-"""How files of these kinds begin, whatever their names end in."""
+"""First bytes of these formats, independent of the suffix of the name."""
 
 PNG_END = b"IEND\xaeB`\x82"
-"""The last chunk of every PNG without its length, which is 0, and with its check sum."""
+"""The last chunk of every PNG, with its check sum but without its length, which is 0."""
 
 JPEG_SCAN, JPEG_END = 0xDA, b"\xff\xd9"
 
@@ -36,15 +36,15 @@ LEFT_OUT = "replace it, or use data.on_error=skip to leave it out"
 
 
 UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
-"""What Pillow raises on headers that are damaged, or of no image."""
+"""Exceptions of Pillow for damaged headers, and for files that are not images."""
 
 
 def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
-    """Every byte of `path`; `advice` says what to do without it.
+    """Every byte of `path`; `advice` is the end of the message.
 
     Raises:
-        InputError: nothing is there, a link that leads nowhere, no regular file, no permission,
-            larger than `CONTENT` allows, or a fault of the disk.
+        InputError: a missing file, a broken link, not a regular file, no permission, larger than
+            `CONTENT` allows, or an error of the disk.
     """
     try:
         return read_bytes(path, CONTENT, advice)
@@ -60,20 +60,20 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
 
 
 def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
-    """Every byte of an image that is not cut short and not too large.
+    """Every byte of an image that is not truncated and not too large.
 
-    The check sums of a PNG are compared, so that no other pixels come out of a damaged one. Of a
-    JPEG the marker of the end comes after the beginning of the picture: a thumbnail before it has
-    an end of its own. JPEG, TIFF and BMP have no check sums: damage inside them is refused where
-    the decoder cannot go on, and gives other pixels where it can. Bytes after the end do no harm.
+    The check sums of a PNG are compared, so damage cannot change pixels. In a JPEG the end marker
+    is searched after the start of the main image, as a thumbnail has an end of its own. JPEG, TIFF
+    and BMP have no check sums: damage inside them is refused if the decoder fails, and otherwise
+    changes pixels. Bytes after the end are ignored.
 
     Args:
         path: of the file.
-        advice: what to do with a file that is refused.
+        advice: end of the message for a refused file.
 
     Raises:
-        InputError: as `read_whole`, an empty file, one that ends before its end, a damaged PNG, or
-            more pixels than `PIXELS` allows.
+        InputError: as `read_whole`, an empty or truncated file, a damaged PNG, or more pixels than
+            `PIXELS` allows.
     """
     data = read_whole(path, advice)
     if not data:
@@ -102,9 +102,9 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
 
 
 def is_there(path: Path) -> bool:
-    """Whether `path` names something: a link that leads nowhere or may not be followed does too.
+    """Whether `path` exists; broken links and links without permission count too.
 
-    For readers that say themselves what a missing file was; `read_whole` says all else.
+    For readers with their own message for a missing file; `read_whole` reports other errors.
     """
     try:
         path.lstat()
@@ -116,14 +116,14 @@ def is_there(path: Path) -> bool:
 
 
 def read_names(path: Path, key: str) -> tuple[str, ...]:
-    """Lines of a list file, without what surrounds them and without empty ones, in order.
+    """Stripped lines of a list file in order, without empty ones.
 
     Args:
         path: text in UTF-8, one name per line.
-        key: of the configuration, which names the list; begins the messages.
+        key: of the configuration for the list; begins the messages.
 
     Raises:
-        InputError: as `read_whole`, no text in UTF-8, or no line.
+        InputError: as `read_whole`, not a text in UTF-8, or no line.
     """
     try:
         text = read_whole(path).decode("utf-8-sig")
@@ -133,7 +133,7 @@ def read_names(path: Path, key: str) -> tuple[str, ...]:
         raise InputError(f"{key}: {error}") from None
     if "\0" in text:
         raise InputError(
-            f"{key}: '{path}' is no text in UTF-8; give a list of one name per line, saved as "
+            f"{key}: '{path}' is not a text in UTF-8; give a list of one name per line, saved as "
             "plain text."
         )
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
@@ -143,17 +143,16 @@ def read_names(path: Path, key: str) -> tuple[str, ...]:
 
 
 def within(path: Path, root: Path) -> Path:
-    """`path`, which lies below `root` once every link is followed.
+    """`path`, if it is below `root` after resolving all links.
 
-    A reader asks this of every file that it opens: a line of a list may say "../..", and a link in
-    a folder that somebody else packed may lead anywhere. A path at which nothing is passes:
-    `read_whole` says so.
+    A reader checks every file that it opens: a line of a list may contain "../..", and a link in a
+    downloaded folder may lead anywhere. A missing file passes; `read_whole` reports it.
 
     Raises:
-        InputError: it leads out of `root`.
+        InputError: it is outside `root`.
     """
     home, found = _resolved(str(root)), _resolved_file(path)
-    # `os.path` where `Path` would raise: a folder that may not be looked into is no way out.
+    # `os.path`, because `Path` raises for a folder without permission, which is not outside.
     if found.startswith(home.rstrip(os.sep) + os.sep) or not os.path.exists(found):  # noqa: PTH110
         return path
     raise InputError(
@@ -163,7 +162,7 @@ def within(path: Path, root: Path) -> Path:
 
 
 def _resolved_file(path: Path) -> str:
-    # Folders hold thousands of files: each is followed once, and of a file only its last link.
+    # Folders hold thousands of files: a folder is resolved once, and a file only if it is a link.
     folder, name = os.path.split(path)
     is_plain = name not in ("", os.curdir, os.pardir) and not os.path.islink(path)  # noqa: PTH114
     return f"{_resolved(folder)}{os.sep}{name}" if is_plain else os.path.realpath(path)
@@ -189,7 +188,7 @@ def _why_missing(path: Path) -> str:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether every chunk up to the last one agrees with its check sum."""
+    """Whether the check sum of every chunk up to the last one is correct."""
     at, view = len(PNG), memoryview(data)
     while at + 12 <= len(data):
         end = at + 12 + int.from_bytes(view[at : at + 4], "big")
@@ -203,7 +202,7 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def _size(data: bytes) -> tuple[int, int]:
-    """Pixels by the header; nothing is decoded. The first chunk of a PNG begins with them."""
+    """Width and height in the header; nothing is decoded. They begin the first chunk of a PNG."""
     if data.startswith(PNG):
         width, height = struct.unpack_from(">II", data, 16)
         return width, height
@@ -212,13 +211,13 @@ def _size(data: bytes) -> tuple[int, int]:
 
 
 def _scan(data: bytes) -> int:
-    """Where the picture of a JPEG begins; its length where the file ends before."""
-    place = 2
-    while 0 <= (place := data.find(b"\xff", place)) < len(data) - 3:
-        marker = data[place + 1]
+    """Offset of the main image of a JPEG; the length of the file if it ends before."""
+    offset = 2
+    while 0 <= (offset := data.find(b"\xff", offset)) < len(data) - 3:
+        marker = data[offset + 1]
         if marker == JPEG_SCAN:
-            return place
-        # 0xFF may be repeated before a marker; every other marker says how long its segment is.
+            return offset
+        # 0xFF may be repeated before a marker; every other marker has the length of its segment.
         is_fill = marker == 0xFF
-        place += 1 if is_fill else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        offset += 1 if is_fill else 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
     return len(data)

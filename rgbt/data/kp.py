@@ -1,6 +1,6 @@
 """KP: the KAIST multispectral street scenes that carry labels of the 19 classes of Cityscapes.
 
-A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -13,25 +13,38 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
+from rgbt.checks import InputError, check_choice
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
-from rgbt.data.kp_names import FORM, MODALITY, NAME, SPLITS, TIMES, parts_of, set_of
-from rgbt.data.kp_names import is_night as is_night
-from rgbt.data.kp_names import sets_of as sets_of
+from rgbt.data.kp_layout import (
+    FORM,
+    LABELS_OF,
+    MODALITY,
+    NAME,
+    SPLITS,
+    TIMES,
+    is_night,
+    parts_of,
+    set_of,
+    sets_of,
+)
 from rgbt.data.named_files import (
+    check_lengths,
+    check_split,
+    existing_root,
     hash_of_files,
     names_in,
     root_nearby,
     with_label,
 )
+from rgbt.data.prepare.kp import PREPARATION
+from rgbt.data.report.kp import KPChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
-Lists = Literal["auto", "files", "sets"]
+ListSource = Literal["auto", "files", "sets"]
 
 CLASSES = (
     *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic_light", "traffic_sign"),
@@ -49,9 +62,6 @@ MOST_TINT = 8
 
 ADVICE = "use the original file of the folder lwir"
 
-LABELS_OF = {False: "val_day", True: "val_night"}
-"""Folders of MS-UDA by whether they hold nights."""
-
 
 class KP:
     """RGB-thermal street scenes by day and at night with labels, as the CRM release lays them out.
@@ -60,36 +70,36 @@ class KP:
         images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg and labels/setXX_VYYY_IZZZZZ.png
         pseudo_KP/{val_day,val_night}/setXX_VYYY_{visible,lwir}_IZZZZZ.png and
             labels/{val_day,val_night}/setXX_VYYY_IZZZZZ.png, as MS-UDA, the labels' origin, has it
-    Images and labels are looked for each on their own, the first form before the second.
+    The layouts of images and of labels are detected separately, the first one first.
 
     Splits: "train", "val", "test" and the day and night of each. Lists hold one name per line, with
-    or without .png. Where there is no list SPLIT_day or SPLIT_night, it is that part of SPLIT by
-    set number; where there is none of SPLIT, it is SPLIT_day and SPLIT_night together, sorted, as
-    the CRM release reads them.
+    or without .png. Without a list SPLIT_day or SPLIT_night, that split is the part of SPLIT by set
+    number; without a list SPLIT, it is SPLIT_day and SPLIT_night together, sorted, as in the CRM
+    release.
 
     Label files hold 0 to K - 1 and K (19) for void, which becomes 255; 255 is accepted as well.
 
-    Thermal is the mean over the three channels of the lwir image, rounded. The releases disagree
-    where channels differ: CRM takes the mean in real numbers, OpenRSS cuts its fraction off. A grey
-    JPEG decodes to equal channels; one that was saved as a colour image may have them apart by a
-    few levels, which is why up to `MOST_TINT` are accepted. Beyond that it is a colour picture.
+    Thermal is the mean over the three channels of the lwir image, rounded. If channels differ, the
+    releases disagree: CRM takes the real mean, OpenRSS truncates it. A grey JPEG decodes to equal
+    channels; if it was saved as a colour image, its channels may differ by a few levels. A
+    difference of up to `MOST_TINT` is accepted; an image with a larger one is a colour image.
 
     Source: images KAIST multispectral pedestrian data set (Hwang et al., CVPR 2015); labels MS-UDA
     (Kim et al., RA-L 2021); split CRM (Shin et al., ICRA 2024).
 
     Args:
         root: folder that holds `images` and `labels`.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
         splits: split -> list file in `root`.
-        lists: "files" reads the lists of `splits`; "sets" takes every label on disk and divides
-            them by set number, as CRM does; "auto" is "files" where there is one of the lists.
+        lists: "files" reads the lists of `splits`; "sets" divides all labels on disk by set number,
+            as CRM does; "auto" is "files" if one of the lists exists.
 
     Raises:
         InputError: no such root, no known layout, numbers of classes, names and colours differ, or
-            `splits` was changed where sets decide.
+            `splits` is set although sets are used.
     """
 
     images = GreyImages(
@@ -105,6 +115,8 @@ class KP:
         thermal=partial(read_grey, advice=ADVICE, most_tint=MOST_TINT),
     )
 
+    preparation = PREPARATION
+
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
 
@@ -117,23 +129,23 @@ class KP:
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         splits: dict[Text, Text] = SPLITS,
-        lists: Lists = "auto",
+        lists: ListSource = "auto",
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds images and labels of KP")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         check_choice("dataset.lists", lists, ("auto", "files", "sets"))
         check_lengths(num_classes, classes, palette)
-        _check_root(self.root, root)
+        _check_root(self.root)
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)
         self._names: dict[str, tuple[str, ...]] = {}
 
     @property
     def splits(self) -> Mapping[str, str]:
-        """Split -> its list, or the sets that it is made of."""
+        """Split -> its list, or its sets."""
         if self.lists == "files":
             return self._files
         return {
@@ -142,24 +154,23 @@ class KP:
         }
 
     def has(self, split: str) -> bool:
-        """Whether anything of `split` is there; InputError where the split is unknown."""
-        self._check_split(split)
+        """Whether any sample of `split` exists; InputError if the split is unknown."""
+        check_split(split, self.splits)
         if self.lists != "files":
             return bool(self._with_labels(split))
         sources = self._sources(split)
         if len(sources) != 1 or sources == (split,):
             return bool(sources)
-        # A part of a list that holds days or nights alone may be empty.
+        # The list may contain days or nights only.
         return any(self._is_of_time(name, split) for name in self._read_list(sources[0]))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in the order of its list, or sorted.
 
         Raises:
-            InputError: unknown split, missing or empty list, a line that is no name, no label of
-                the sets.
+            InputError: unknown split, missing or empty list, an invalid name, no label of the sets.
         """
-        self._check_split(split)
+        check_split(split, self.splits)
         if split not in self._names:
             read = self._of_lists if self.lists == "files" else self._of_sets
             self._names[split] = read(split)
@@ -172,8 +183,8 @@ class KP:
             Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
 
         Raises:
-            InputError: not a name, a file is missing, cannot be decoded, has other channels, bits
-                or size than expected, or the label holds a value that is no class, void or 255.
+            InputError: an invalid name, a file is missing, cannot be decoded, has wrong channels,
+                bits or size, or the label holds a value that is no class, void or 255.
         """
         pair = self.pair(name)
         return with_label(pair, self.label(name), self.label_path(name))
@@ -185,13 +196,13 @@ class KP:
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
-        # One value more than there are classes: void.
+        # The value after the last class is void.
         label = read_label(within(self.files(name)[-1], self.root), self.num_classes + 1)
         label[label == self.num_classes] = IGNORE
         return label
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; InputError where it is not a name."""
+        """RGB, thermal and label of `name`; InputError if the name is invalid."""
         recording, video, frame = parts_of(name)
         if self.has_images:
             folder = self.root / "images" / recording / video
@@ -204,17 +215,17 @@ class KP:
         return (*images, self.label_path(name))
 
     def label_path(self, name: str) -> Path:
-        """The label of `name`; InputError where it is not a name."""
+        """The label of `name`; InputError if the name is invalid."""
         folder = self.root / "labels"
         return (folder if self.has_labels else folder / LABELS_OF[is_night(name)]) / f"{name}.png"
 
     def list_files(self, split: str) -> tuple[str, ...]:
-        """The lists that `split` is read from; () where sets divide, or no list is there."""
-        found = self._sources(split) if self.lists == "files" else ()
-        return tuple(self._files[source] for source in found)
+        """The lists that `split` is read from; () if sets are used, or no list exists."""
+        sources = self._sources(split) if self.lists == "files" else ()
+        return tuple(self._files[source] for source in sources)
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {"num_classes": self.num_classes, "most_tint": MOST_TINT}
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
@@ -226,33 +237,31 @@ class KP:
         splits = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(splits, self.files)
 
+    def checks(self) -> KPChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return KPChecks(self)
+
     @cached_property
     def has_images(self) -> bool:
-        """Whether images lie in folders by set and video, and not as MS-UDA has them."""
+        """Whether images are in folders by set and video, and not in the layout of MS-UDA."""
         return (self.root / "images").is_dir()
 
     @cached_property
     def has_labels(self) -> bool:
-        """Whether labels lie in one folder, and not as MS-UDA has them."""
+        """Whether labels are in one folder, and not in the layout of MS-UDA."""
         folder = self.root / "labels"
         by_time = any((folder / each).is_dir() for each in LABELS_OF.values())
         return not by_time or any(folder.glob("set*.png"))
 
     @cached_property
     def labels_on_disk(self) -> tuple[str, ...]:
-        """Sorted names of the label files, whatever they are called, listed once."""
+        """Sorted names of all label files, valid or not; listed once."""
         folder = self.root / "labels"
         folders = [folder] if self.has_labels else [folder / each for each in LABELS_OF.values()]
         return tuple(sorted({name for each in folders for name in names_in(each)}))
 
-    def _check_split(self, split: str) -> None:
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
-
     def _sources(self, split: str) -> tuple[str, ...]:
-        """Splits whose lists `split` is read from: its own, the one it is a part of, its parts."""
+        """Splits with the lists that `split` is read from: itself, the whole, or its parts."""
 
         def is_there(each: str) -> bool:
             return each in self._files and (self.root / self._files[each]).is_file()
@@ -321,12 +330,7 @@ def _holds_kp(root: Path) -> bool:
     )
 
 
-def _check_root(root: Path, given: str) -> None:
-    if not root.is_dir():
-        raise InputError(
-            f"dataset.root: there is no folder '{given}'; give the one that holds images and "
-            "labels of KP."
-        )
+def _check_root(root: Path) -> None:
     if not _holds_kp(root):
         near = root_nearby(root, _holds_kp) or "the folder that does"
         raise InputError(
@@ -335,15 +339,14 @@ def _check_root(root: Path, given: str) -> None:
         )
 
 
-def _find_lists(root: Path, splits: dict[str, str], wanted: Lists) -> Literal["files", "sets"]:
-    """Who says what a split is made of; a changed `splits` asks for files."""
+def _find_lists(root: Path, splits: dict[str, str], wanted: ListSource) -> Literal["files", "sets"]:
+    """The source of the splits; with a changed `splits` it is files."""
     changed = dict(splits) != SPLITS
     if wanted == "sets":
         if changed:
             raise InputError(
-                "dataset.splits names lists but dataset.lists=sets reads none; leave one of them "
-                "as it is."
+                "dataset.splits names lists but dataset.lists=sets reads none; omit one of them."
             )
         return "sets"
-    there = any((root / path).is_file() for path in splits.values())
-    return "files" if wanted == "files" or there or changed else "sets"
+    exist = any((root / path).is_file() for path in splits.values())
+    return "files" if wanted == "files" or exist or changed else "sets"

@@ -15,7 +15,7 @@ from rgbt.ranges import Byte, Names, NumClasses, Text
 
 @dataclass(frozen=True, kw_only=True)
 class LabelMap:
-    """Which class of a data set stands for each class that a network knows.
+    """The class of a data set for each class of a network.
 
     Ids are mapped after the argmax, as in the thesis: probabilities of classes that come to one
     class are not added up, so that its confidence is that of the class that was most probable.
@@ -23,7 +23,7 @@ class LabelMap:
     Attributes:
         num_source: classes of the network, 1 to 255; their ids are 0 .. num_source - 1.
         targets: names of the classes of the data set, in order of their ids.
-        groups: name of a target class -> ids of the classes that become it; each id stands once.
+        groups: name of a target class -> ids of the classes that become it; each id occurs once.
 
     Raises:
         InputError: a name that is no target, an id that is missing, unknown or there twice.

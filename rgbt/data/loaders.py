@@ -1,7 +1,7 @@
-"""Batches for training and evaluation, whatever the number of worker processes.
+"""Batches for training and evaluation.
 
-Which samples a batch holds and how they are augmented follows from (seed, step) alone; workers only
-decide who decodes them. Batches are not padded: networks pad images and losses pad labels.
+The samples of a batch and their augmentation depend on (seed, step) alone, not on the number of
+worker processes. Batches are not padded: networks pad images and losses pad labels.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from rgbt.data.cache.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
-    Loaded,
-    Source,
+    LoadedBatch,
+    SplitReader,
     TrainExamples,
     no_shared_memory,
     start_worker,
@@ -57,13 +57,13 @@ class LoaderSettings:
     Attributes:
         batch_size: samples of a training batch, >= 1.
         eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
-        num_workers: processes that decode and augment; 0 = the main process does.
-        prefetch: batches that each process prepares ahead of the one that is used.
-        augment: "loader" augments in the processes that read, "device" whole batches where the
-            network is, with the same bits; "auto" does so on a GPU, where the transform can.
+        num_workers: processes that decode and augment; 0: the main process does.
+        prefetch: batches that each process makes in advance.
+        augment: "loader" augments in the reading processes, "device" whole batches on the device
+            of the network, with the same result; "auto": "device" on a GPU if the transform can.
         cache: images are decoded once into memory-mapped files of this folder and read from there
             (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
-        on_error: "raise" stops at a file that cannot be read; "skip" names it once and takes the
+        on_error: "raise" stops at an unreadable file; "skip" names it once and takes the
             next readable sample of the list instead (training) or leaves it out (evaluation).
     """
 
@@ -98,16 +98,16 @@ class Batches(Iterator[Kind]):
         loader = DataLoader(
             reader,
             sampler=keys,
-            batch_size=None,  # a key stands for a whole batch
+            batch_size=None,  # a key is a whole batch
             collate_fn=_unchanged,
             num_workers=settings.num_workers,
             prefetch_factor=settings.prefetch if settings.num_workers else None,
             worker_init_fn=start_worker,
             pin_memory=torch.cuda.is_available(),
-            # Without one of its own, the loader draws a seed for its workers from the global one.
+            # Without it the loader draws the seed of its workers from the global generator.
             generator=torch.Generator(),
         )
-        self._loaded = cast(Iterator[Loaded], _started(loader, settings.num_workers))
+        self._loaded = cast(Iterator[LoadedBatch], _started(loader, settings.num_workers))
 
     def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
@@ -126,7 +126,7 @@ class Batches(Iterator[Kind]):
             if loaded.batch is not None:
                 return cast(Kind, loaded.batch)
 
-    def _wait(self) -> Loaded:
+    def _wait(self) -> LoadedBatch:
         try:
             return next(self._loaded)
         except RuntimeError as error:
@@ -139,9 +139,8 @@ class Batches(Iterator[Kind]):
             ) from error
 
     def close(self) -> None:
-        """Stop the worker processes; nothing comes after it."""
-        # They leave at once when the loader's iterator goes; one that a traceback keeps alive is
-        # collected late, and its workers are then waited for.
+        """Stop the worker processes; no batch can be read afterwards."""
+        # Workers end when the loader's iterator is deleted, and a traceback may keep it alive.
         self._loaded = iter(())
 
     def _report(self, skipped: dict[str, str]) -> None:
@@ -155,17 +154,17 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
     """The loader's iterator, which starts its worker processes.
 
     Raises:
-        InputError: the system refuses them what they need.
+        InputError: the system has no shared memory or locks left.
     """
     try:
-        # A loader that fails half-way prints a traceback of its own; these locks, a few more than
-        # it makes, fail before it.
+        # A loader that fails while it starts prints its own traceback. These locks, a few more than
+        # it needs, fail earlier.
         _ = [multiprocessing.Lock() for _ in range(LOCKS_PER_WORKER * num_workers)]
         return iter(loader)
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        raise InputError(no_shared_memory(str(error.strerror))) from None  # no disk is full
+        raise InputError(no_shared_memory(str(error.strerror))) from None  # not a disk
 
 
 def train_batches(
@@ -186,17 +185,17 @@ def train_batches(
         dataset: where samples come from.
         split: name of the split.
         transform: its `train` makes the examples.
-        settings: batch size, workers, what to do about unreadable files. ``augment="device"`` asks
-            for a `BatchTransform`, whose batches are augmented as they are moved.
+        settings: batch size, workers, unreadable files. ``augment="device"`` needs a
+            `BatchTransform`, which augments batches when they are moved to the device.
         seed: run seed.
         steps: numbers of the batches, counted from the start of the run.
 
     Raises:
-        InputError: the split is smaller than a batch, or, with on_error="skip", wholly unreadable.
+        InputError: the split is smaller than a batch, or, with on_error="skip", unreadable.
     """
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
-    source = Source(dataset, names, transform, settings.on_error == "skip")
+    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     if settings.augment == "device":
         work = cast(BatchTransform, transform)
         reader = BatchReader(TrainExamples(source, work.drawn, seed), work.stack)
@@ -216,10 +215,10 @@ def eval_batches(
         dataset: where samples come from.
         split: name of the split.
         transform: its `test` makes the examples.
-        settings: evaluation batch size, workers, what to do about unreadable files.
+        settings: evaluation batch size, workers, unreadable files.
     """
     names = dataset.names(split)
-    source = Source(dataset, names, transform, settings.on_error == "skip")
+    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     return Batches(
         BatchReader(EvalExamples(source), partial(collate, advice=EVAL_ADVICE)),

@@ -1,6 +1,6 @@
-"""MFNet and every data set in its layout: split lists, images, labels, day or night by name.
+"""MFNet and data sets in its layout: split lists, images, labels, time of day by name.
 
-A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -11,19 +11,24 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
-from rgbt.data.dataset import check_lengths
+from rgbt.checks import InputError
 from rgbt.data.files import read_label, read_thermal, within
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
-from rgbt.data.named_files import hash_of_files, with_label
+from rgbt.data.mfnet_layout import FOLDERS, MIRRORED, SPLITS, base_name, either_layout
+from rgbt.data.named_files import (
+    check_lengths,
+    check_split,
+    existing_root,
+    hash_of_files,
+    with_label,
+)
+from rgbt.data.prepare.mfnet import PREPARATION
+from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
-Layout = Literal["auto", "packed", "folders"]
-
-LAYOUTS = {"packed": ("images", "labels"), "folders": ("RGB", "Thermal", "Label")}
-"""Folders of each layout, beside the split lists; the last one holds the labels."""
+LayoutName = Literal["auto", "packed", "folders"]
 
 CLASSES = (
     *("unlabeled", "car", "person", "bike", "curve"),
@@ -33,24 +38,16 @@ PALETTE = (
     *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
     *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
 )
-SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
-FLIPPED = "_flip"
-"""Ending of the names of mirrored copies, which some copies of the data set write to disk."""
-
-
-def base_name(name: str) -> str:
-    """`name` without the ending of mirrored copies: "00001D_flip" -> "00001D"."""
-    return name.removesuffix(FLIPPED)
 
 
 class MFNet:
-    """RGB-thermal street scenes with labels, as the MFNet archive lays them out.
+    """RGB-thermal street scenes with labels, in the layout of the MFNet archive.
 
     Layouts (NAME is a line of a split list, five digits and D for day or N for night):
         packed:  images/NAME.png with channels R, G, B, thermal, and labels/NAME.png
         folders: RGB/NAME.png, Thermal/NAME.png (one channel, or three equal ones), Label/NAME.png
 
-    A name NAME_flip is read from its own files where a list names it; nothing is mirrored here.
+    A name NAME_flip in a list is read from its own files; nothing is mirrored here.
 
     Source: MFNet (Ha et al., IROS 2017), archive ir_seg_dataset; the folders layout is the one of
     the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
@@ -58,28 +55,30 @@ class MFNet:
 
     Args:
         root: folder that holds the split lists.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
         splits: split -> list file in `root`; two splits may share one list.
-        layout: "packed", "folders", or "auto" for the one whose folders exist (packed first).
+        layout: "packed", "folders", or "auto": the one with existing folders (packed first).
 
     Raises:
-        InputError: no such root, no known layout, numbers of classes, names and colours differ.
+        InputError: no such root, no known layout, or numbers of classes, names and colours differ.
     """
 
     images = GreyImages(
         layouts=tuple(
             PairPattern(f"{folders[0]}/{{name}}.png", f"{folders[-2]}/{{name}}.png")
-            for folders in LAYOUTS.values()
+            for folders in FOLDERS.values()
         ),
         thermal=read_thermal,
         packed_advice="dataset.layout=folders for separate images",
     )
 
+    preparation = PREPARATION
+
     unscored: tuple[str, ...] = ()
-    """Every class counts in the means, as in the published tables."""
+    """Every class is scored, as in the published tables."""
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -90,25 +89,20 @@ class MFNet:
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         splits: dict[Text, Text] = SPLITS,
-        layout: Layout = "auto",
+        layout: LayoutName = "auto",
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, f"that holds {either_layout()} and the split lists")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         self.splits = dict(splits)
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that holds "
-                f"{_either_layout()} and the split lists."
-            )
         check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
 
     def has(self, split: str) -> bool:
-        """Whether the list of `split` is there; InputError where the split is unknown."""
+        """Whether the list of `split` exists; InputError if the split is unknown."""
         return self.list_path(split).is_file()
 
     def names(self, split: str) -> tuple[str, ...]:
@@ -148,11 +142,11 @@ class MFNet:
         return (*self.image_paths(name), self.label_path(name))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {"layout": self.layout, "num_classes": self.num_classes}
 
     def is_night(self, name: str) -> bool:
-        """Whether the letter before the ending says night (N) and not day (D).
+        """Whether the last letter of the name, before the suffix, is N (night) and not D (day).
 
         Raises:
             InputError: the name ends in neither letter.
@@ -160,16 +154,16 @@ class MFNet:
         letter = base_name(name)[-1:]
         if letter not in ("D", "N"):
             raise InputError(
-                f"'{name}' does not say whether it is day or night: expected a name that ends in D "
-                f"or N (before '{FLIPPED}'); rename it in the split lists of {self.root}."
+                f"the name '{name}' has no time of day: expected a name that ends in D or N "
+                f"(before '{MIRRORED}'); rename it in the split lists of {self.root}."
             )
         return letter == "N"
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """`is_night` of every name; None where no name says whether it is day or night.
+        """`is_night` of every name; None if no name contains the time of day.
 
         Raises:
-            InputError: some names say so and others do not.
+            InputError: some names contain it and others do not.
         """
         if not any(base_name(name)[-1:] in ("D", "N") for name in names):
             return None
@@ -178,32 +172,33 @@ class MFNet:
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
-        Nothing is decoded and the root is left out, so that equal copies have equal fingerprints.
-        Splits without a list and files that are missing count as such.
+        Nothing is decoded. The root is left out, so that equal copies have equal fingerprints.
+        Splits without a list are empty; missing files have size -1.
         """
         listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(listed, self.files)
 
+    def checks(self) -> MFNetChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return MFNetChecks(self)
+
     def list_path(self, split: str) -> Path:
-        """The list file of `split`; InputError where the split is unknown."""
-        if split not in self.splits:
-            raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
-            )
+        """The list file of `split`; InputError if the split is unknown."""
+        check_split(split, self.splits)
         return self.root / self.splits[split]
 
     def image_paths(self, name: str) -> tuple[Path, ...]:
         """The packed image of `name`, or its RGB and its thermal image."""
-        *folders, _ = LAYOUTS[self.layout]
+        *folders, _ = FOLDERS[self.layout]
         return tuple(self.root / folder / f"{name}.png" for folder in folders)
 
     def label_path(self, name: str) -> Path:
         """The label of `name`."""
-        return self.root / LAYOUTS[self.layout][-1] / f"{name}.png"
+        return self.root / FOLDERS[self.layout][-1] / f"{name}.png"
 
     def names_on_disk(self) -> frozenset[str]:
         """Names of all PNG files in the folders of images and labels, listed or not."""
-        folders = [self.root / folder for folder in LAYOUTS[self.layout]]
+        folders = [self.root / folder for folder in FOLDERS[self.layout]]
         return frozenset(path.stem for folder in folders for path in folder.glob("*.png"))
 
     def _read_list(self, split: str) -> tuple[str, ...]:
@@ -216,17 +211,13 @@ class MFNet:
         return read_names(path, f"dataset.splits.{split}")
 
 
-def _find_layout(root: Path, wanted: Layout) -> Literal["packed", "folders"]:
+def _find_layout(root: Path, wanted: LayoutName) -> Literal["packed", "folders"]:
     for layout in ("packed", "folders"):
-        folders_exist = all((root / folder).is_dir() for folder in LAYOUTS[layout])
+        folders_exist = all((root / folder).is_dir() for folder in FOLDERS[layout])
         if wanted in ("auto", layout) and folders_exist:
             return layout
-    expected = _either_layout() if wanted == "auto" else "+".join(LAYOUTS[wanted])
+    expected = either_layout() if wanted == "auto" else "+".join(FOLDERS[wanted])
     raise InputError(
         f"dataset.root: '{root}' does not hold the folders {expected}; give the folder of the "
         "data set itself."
     )
-
-
-def _either_layout() -> str:
-    return " or ".join("+".join(folders) for folders in LAYOUTS.values())

@@ -1,6 +1,6 @@
-"""What readers of named files share: folders, images of one size, fingerprints, roots nearby.
+"""Functions shared by the readers of data sets: roots, splits, image sizes, fingerprints.
 
-Part of the readers of data sets; nothing here knows the layout of a data set.
+Nothing here depends on the layout of one data set.
 """
 
 from __future__ import annotations
@@ -14,10 +14,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, nearest
+from rgbt.data.integrity import is_there, within
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
+
+
+def existing_root(root: str, content: str) -> Path:
+    """The folder `root`; InputError if it does not exist.
+
+    Args:
+        root: as configured.
+        content: of the expected folder, for the message.
+    """
+    path = Path(root).expanduser()
+    if not path.is_dir():
+        raise InputError(f"dataset.root: there is no folder '{root}'; give the one {content}.")
+    return path
+
+
+def check_split(split: str, splits: Iterable[str]) -> None:
+    """Refuse a split that is not one of `splits`."""
+    if split not in splits:
+        raise InputError(f"dataset.splits has no split '{split}'; {nearest(split, splits)}.")
+
+
+def existing_file(what: str, path: Path, name: str, root: Path) -> Path:
+    """`path`, one file of the sample `name`; InputError if it is missing or outside `root`."""
+    if not is_there(path):
+        raise InputError(
+            f"'{name}': its {what} {path} is missing; restore it, or use data.on_error=skip to "
+            "leave the frame out."
+        )
+    return within(path, root)
 
 
 def names_in(folder: Path) -> tuple[str, ...]:
@@ -42,7 +72,7 @@ def pair_of_one_size(name: str, rgb: Array, thermal: Array, path: Path) -> Sampl
 
 
 def with_label(pair: Sample, label: Array | None, path: Path | None) -> Sample:
-    """`pair` with its label (H, W), read from `path`; InputError where the sizes differ."""
+    """`pair` with its label (H, W), read from `path`; InputError if the sizes differ."""
     if label is not None:
         check_size(pair.rgb, "its label", label, pair.name, path)
     return replace(pair, label=label)
@@ -67,7 +97,7 @@ def hash_of_files(
 
     Args:
         splits: split -> its names; () where the split is not there.
-        files: name -> its files; those that are missing count as such.
+        files: name -> its files; a missing file has size -1.
     """
     sizes: dict[str, list[int]] = {}
     digest = hashlib.sha256()
@@ -75,30 +105,43 @@ def hash_of_files(
         digest.update(f"{split} {len(splits[split])}\n".encode())
         for name in splits[split]:
             if name not in sizes:
-                sizes[name] = [_size(path) for path in files(name)]
+                sizes[name] = [size_of(path) for path in files(name)]
             digest.update(f"{name} {sizes[name]}\n".encode())
     return digest.hexdigest()
 
 
 def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
-    """The folder just above or below `root` that is one; None where there is none.
+    """The folder directly above or below `root` that is a root; None if there is none.
 
     Args:
-        root: a folder that is no root.
+        root: a folder that is not a root.
         holds: whether a folder is the root of a data set.
     """
 
     def is_one(folder: Path) -> bool:
         try:
             return holds(folder)
-        except OSError:  # a neighbour that may not be looked into is nothing to point to
+        except OSError:  # no permission
             return False
 
     return next(filter(is_one, (root.absolute().parent, *sorted(root.iterdir()))), None)
 
 
-def _size(path: Path) -> int:
-    # A name that leads through a file instead of a folder is missing as well.
+def check_lengths(
+    num_classes: int, classes: tuple[str, ...], palette: tuple[tuple[int, int, int], ...]
+) -> None:
+    """Refuse names or colours that are not one per class."""
+    for key, length in (("classes", len(classes)), ("palette", len(palette))):
+        if length != num_classes:
+            raise InputError(
+                f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                "make them agree."
+            )
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, -1 if it is missing."""
+    # A path through a file instead of a folder is missing as well.
     try:
         return path.stat().st_size
     except (FileNotFoundError, NotADirectoryError):

@@ -1,7 +1,6 @@
-"""Which files of a folder of new images belong together, by the layouts of a data set.
+"""Pairs of files in a folder of new images, by the layouts of a data set.
 
-Nothing is guessed: a folder is read by the first layout of which it holds a whole pair, and what
-belongs to no pair is named.
+A folder is read by the first layout of which it has a complete pair; other files are named.
 """
 
 from __future__ import annotations
@@ -12,26 +11,26 @@ from typing import NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.data.files import channels, decode
-from rgbt.data.folder.pattern import NO_VALUES, Found, Pattern, Values, in_order, what_is_in
+from rgbt.data.folder.pattern import NO_VALUES, PathMatch, Pattern, WordValues, in_order, what_is_in
 from rgbt.data.images import PairPattern
 
 KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Endings of image files, in small letters."""
+"""Suffixes of image files, in lower case."""
 
 ARRAY = ".npy"
-"""What a thermal image may end in as well."""
+"""Another suffix of thermal images."""
 
 PLAIN = (
     PairPattern("rgb/{name}.png", "thermal/{name}.png"),
     PairPattern("{name}.png", "{name}.png"),
 )
-"""Layouts that are understood whatever the data set; endings may be any of `KINDS`."""
+"""Layouts accepted for every data set; suffixes may be any of `KINDS`."""
 
 KEY = "input"
 
 
 class NewPair(NamedTuple):
-    """Two files and what their sample is called; one file twice where thermal is its channel 4."""
+    """Two files and the name of their sample; the same file twice if thermal is its channel 4."""
 
     name: str
     rgb: Path
@@ -39,12 +38,12 @@ class NewPair(NamedTuple):
 
 
 class NewImages(NamedTuple):
-    """What a folder holds.
+    """Content of a folder.
 
     Attributes:
         pairs: in the order of their names, 9 before 10.
-        alone: RGB image without a thermal image -> where that should be.
-        others: images that belong to no pair and are no labels.
+        alone: RGB image without a thermal image -> expected path of the latter.
+        others: images that belong to no pair and are not labels.
     """
 
     pairs: tuple[NewPair, ...]
@@ -56,8 +55,8 @@ def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewIm
     """The pairs in `folder`.
 
     The layouts of the data set are tried from its root, then from the folders inside it (without
-    their first pieces), then `PLAIN`. Capitals do not count. Of each layout, endings other than its
-    own count only where its own give no pair.
+    their first pieces), then `PLAIN`. Case is ignored. Other suffixes than those of a layout are
+    used only if its own give no pair.
 
     Args:
         folder: an existing folder.
@@ -65,7 +64,7 @@ def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewIm
         name: of the data set, for messages.
 
     Raises:
-        InputError: no whole pair, two of one name, or two thermal images for one RGB image.
+        InputError: no complete pair, two of one name, or two thermal images for one RGB image.
     """
     alone: dict[Path, Path] = {}
     for layouts_of_tier, any_kind in _tiers(layouts):
@@ -78,7 +77,7 @@ def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewIm
 
 
 def _tiers(layouts: Sequence[PairPattern]) -> Iterator[tuple[list[PairPattern], bool]]:
-    """Layouts that are tried together, and whether images of another kind count."""
+    """Layouts that are tried together, and whether other suffixes are accepted."""
     inner = list(layouts)
     while inner:
         yield from ((inner, any_kind) for any_kind in (False, True))
@@ -87,7 +86,7 @@ def _tiers(layouts: Sequence[PairPattern]) -> Iterator[tuple[list[PairPattern], 
 
 
 def _inside(layout: PairPattern) -> PairPattern | None:
-    """The layout as its first folder sees it; None where RGB and thermal are not in one."""
+    """The layout relative to its first folder; None if RGB and thermal have different ones."""
     first, _, rgb = layout.rgb.partition("/")
     other, _, thermal = layout.thermal.partition("/")
     if first != other or "{" not in rgb or "{" not in thermal:
@@ -127,9 +126,9 @@ def _in_tier(folder: Path, layouts: Sequence[PairPattern], *, any_kind: bool) ->
 
 
 def _files(
-    text: str | None, folder: Path, values: Values = NO_VALUES, *, any_kind: bool
-) -> Iterator[Found]:
-    """Images whose paths match `text`, or match it but for their ending."""
+    text: str | None, folder: Path, values: WordValues = NO_VALUES, *, any_kind: bool
+) -> Iterator[PathMatch]:
+    """Images whose paths match `text`, or match it except for the suffix."""
     if text is None:
         return
     stem, dot, ending = text.rpartition(".")
@@ -138,8 +137,10 @@ def _files(
         yield from Pattern(f"{stem}{dot}{kind}", KEY).files(folder, values, any_case=True)
 
 
-def _partner(layout: PairPattern, folder: Path, values: Values, *, any_kind: bool) -> Path | None:
-    """The thermal image of an RGB image; the one whose name is exactly so before all others."""
+def _partner(
+    layout: PairPattern, folder: Path, values: WordValues, *, any_kind: bool
+) -> Path | None:
+    """The thermal image of an RGB image; an exact match of the name is preferred."""
     exact = Pattern(layout.thermal, KEY).path(folder, values)
     found = {path: None for path, _ in _files(layout.thermal, folder, values, any_kind=any_kind)}
     if exact in found or not found:
@@ -156,7 +157,7 @@ def _partner(layout: PairPattern, folder: Path, values: Values, *, any_kind: boo
 def _has_four_channels(path: Path) -> bool:
     try:
         return channels(decode(path)) == 4
-    except InputError:  # whoever reads it says why it cannot be read
+    except InputError:  # reading it raises this error again
         return True
 
 
@@ -193,5 +194,5 @@ def _why_nothing(
         f"{KEY}={folder} holds no pair of images: {reason}. Expected were the files of {name} "
         f"({own}; also without the first folders), folders rgb and thermal with equal names, or "
         "PNG files of four channels (red, green, blue, thermal). One pair is predicted with "
-        "rgb=FILE thermal=FILE in the place of input."
+        "rgb=FILE thermal=FILE instead of input."
     )

@@ -4,7 +4,7 @@
 
     next/                 the same layout and the same names, one moment later
     next/flow/NAME.npy    (H, W, 2) float32: for every pixel of the second frame, how many (rows,
-                          columns) further the same point lies in the first; NaN where it is hidden
+                          columns) further the same point lies in the first; NaN if it is hidden
                           there or outside
 """
 
@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.cache.dataset import Decoded
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.files import read_array
 from rgbt.data.mfnet import MFNet
+from rgbt.dataset import LabelledDataset, reader_of
 
 FOLDER = "next"
 
 
 class NextFrames:
-    """The second frames of a data set, and where their points were in the first.
+    """The second frames of a data set, and the positions of their points in the first frames.
 
     Args:
         first: the data set of the first frames, in MFNet's layout.
@@ -38,11 +37,11 @@ class NextFrames:
     """
 
     def __init__(self, first: LabelledDataset) -> None:
-        first = first.source if isinstance(first, Decoded) else first
+        first = reader_of(first)
         if not isinstance(first, MFNet):
             raise InputError(
-                f"{first.name} ({first.root}) cannot hold second frames: they are read in MFNet's "
-                "layout alone; choose dataset=synth with dataset.ego_forward_m=0.5, and "
+                f"{first.name} ({first.root}) has no second frames: they are read in MFNet's "
+                "layout only; choose dataset=synth with dataset.ego_forward_m=0.5, and "
                 "frames=virtual needs none."
             )
         root = first.root / FOLDER
@@ -63,14 +62,14 @@ class NextFrames:
         )
 
     def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
-        """Where each pixel of the second frame was in the first.
+        """Position of each pixel of the second frame in the first frame.
 
         Args:
             name: of the frame.
             image_hw: its size, which the flow must have.
 
         Returns:
-            rows and columns (H, W) int64, nearest pixels; -1 where the point was not seen.
+            rows and columns (H, W) int64, nearest pixels; -1 if the point was not visible.
 
         Raises:
             InputError: no flow, one of another size, or one that leads out of the image.
@@ -79,14 +78,14 @@ class NextFrames:
         rows, columns = np.indices(image_hw)
         grid = np.stack([rows, columns], axis=-1)
         seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
-        place = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
-        if (place < 0).any() or (place >= image_hw).any():
+        first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
+        if (first_yx < 0).any() or (first_yx >= image_hw).any():
             raise InputError(
                 f"{self._path(name)} leads out of the first frame of {image_hw[0]}x{image_hw[1]} "
-                "pixels; points that were not seen there must be NaN."
+                "pixels; points that were not visible there must be NaN."
             )
-        place[~seen] = -1
-        return place[..., 0], place[..., 1]
+        first_yx[~seen] = -1
+        return first_yx[..., 0], first_yx[..., 1]
 
     def _flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
         path = self._path(name)

@@ -14,7 +14,7 @@ from rgbt.types import Loadable, TwoDomains
 
 @dataclass(frozen=True)
 class LoadedPair:
-    """What becomes `TwoDomains` on its way to the device; see there.
+    """The batches of both domains; on the device they are `TwoDomains`.
 
     Attributes:
         source: with labels.

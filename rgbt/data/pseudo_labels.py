@@ -1,10 +1,10 @@
-"""Labels that a trained network predicted, in the place of those of a data set.
+"""Labels that a trained network predicted, used instead of those of a data set.
 
 A folder of them (written by `rgbt.evaluation.pseudo_labels`) holds:
 
     labels/NAME.png       8 bit, class ids of the data set, 255 where the network was not sure
     confidence/NAME.png   16 bit, 65535 times the probability of the predicted class
-    pseudo_labels.json    who predicted what; written last, so that it stands for a whole folder
+    pseudo_labels.json    teacher and settings; written last, so a folder with it is complete
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from rgbt.checks import InputError
-from rgbt.data.batches import Dataset
 from rgbt.data.files import decode, read_label
+from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.files.budgets import read_json
 from rgbt.types import Sample
 
 FORMAT = "rgbt pseudo-labels 1"
 MANIFEST = "pseudo_labels.json"
 FULL = 65535
-"""What confidence 1 is in a file."""
+"""Value of the confidence 1 in a file."""
 
 
 class Manifest(TypedDict, total=False):
@@ -57,13 +57,13 @@ class Manifest(TypedDict, total=False):
 
 
 class PseudoLabels:
-    """A whole folder of pseudo-labels.
+    """A complete folder of pseudo-labels.
 
     Args:
         folder: see the module.
 
     Attributes:
-        folder: where it lies.
+        folder: its path.
         manifest: what ``pseudo_labels.json`` says: "format", "teacher" (a run's key, or a file),
             "weights" (SHA-256 of the teacher's parameters), "network" (SHA-256 of how it is
             built and fed), "view", "head", "label_map" (num_source, targets, groups; None: none),
@@ -73,14 +73,14 @@ class PseudoLabels:
             pixels, "mean_confidence" of those; None without pixels) and "digest".
 
     Raises:
-        InputError: no such folder, or one that is not finished.
+        InputError: no such folder, or an incomplete one.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
         path = self.folder / MANIFEST
         if not path.is_file():
-            state = "is not finished" if self.folder.is_dir() else "is not there"
+            state = "is not complete" if self.folder.is_dir() else "does not exist"
             raise InputError(
                 f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it; "
                 f"write it with python -m rgbt.predict ... out={self.folder} pseudo_labels=true."
@@ -150,8 +150,8 @@ def read_pair(
     return label, np.asarray(confidence, np.uint16)
 
 
-class PseudoLabelled:
-    """A data set whose labels are replaced by pseudo-labels; all else is the data set's.
+class PseudoLabelled(DatasetWrapper):
+    """A data set whose labels are replaced by pseudo-labels.
 
     Args:
         dataset: the data set; its `classes` must be those of the pseudo-labels.
@@ -159,15 +159,16 @@ class PseudoLabelled:
         with_confidence: whether samples carry the confidence as well.
 
     Raises:
-        InputError: no finished folder, or one of other classes.
+        InputError: the folder is not complete, or its classes differ from those of the data set.
     """
 
-    def __init__(self, dataset: Dataset, folder: str | Path, *, with_confidence: bool) -> None:
-        self.dataset = dataset
-        self.name = dataset.name
+    def __init__(
+        self, dataset: LabelledDataset, folder: str | Path, *, with_confidence: bool
+    ) -> None:
+        super().__init__(dataset)
         self.labels = PseudoLabels(folder)
         self.with_confidence = with_confidence
-        classes: tuple[str, ...] = tuple(self.classes)
+        classes = tuple(self.classes)
         if self.labels.classes != classes:
             raise InputError(
                 f"the pseudo-labels of {self.labels.folder} have the classes "
@@ -175,20 +176,13 @@ class PseudoLabelled:
                 "predict them for this data set (label_map=... for a teacher of other classes)."
             )
 
-    def __getattr__(self, key: str) -> Any:
-        return _passed_on(self, key)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        return self.dataset.names(split)
-
     def read(self, name: str) -> Sample:
         """The sample with its pseudo-label.
 
         Raises:
             InputError: as the data set; no pseudo-label, or one of another size.
         """
-        sample = self.dataset.read(name)
+        sample = self.source.read(name)
         label, confidence = self.labels.read(name, len(self.labels.classes))
         if label.shape != sample.thermal.shape:
             sizes = [" x ".join(map(str, each.shape)) for each in (sample.thermal, label)]
@@ -199,32 +193,17 @@ class PseudoLabelled:
         carried = confidence if self.with_confidence else None
         return replace(sample, label=label, confidence=carried)
 
+    def label(self, name: str) -> NDArray[np.uint8]:
+        """The pseudo-label alone."""
+        return self.labels.read(name, len(self.labels.classes))[0]
 
-class Unlabelled:
-    """A data set without labels; all else is the data set's.
 
-    Args:
-        dataset: the data set.
-    """
-
-    def __init__(self, dataset: Dataset) -> None:
-        self.dataset = dataset
-        self.name = dataset.name
-
-    def __getattr__(self, key: str) -> Any:
-        return _passed_on(self, key)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        return self.dataset.names(split)
+class Unlabelled(DatasetWrapper):
+    """A data set without its labels."""
 
     def read(self, name: str) -> Sample:
         """The sample without label and confidence."""
-        return replace(self.dataset.read(name), label=None, confidence=None)
+        return replace(self.source.read(name), label=None, confidence=None)
 
-
-def _passed_on(wrapper: PseudoLabelled | Unlabelled, key: str) -> Any:
-    # Copying and unpickling ask before there is a data set.
-    if key == "dataset" or key.startswith("__"):
-        raise AttributeError(key)
-    return getattr(wrapper.dataset, key)
+    def label(self, name: str) -> None:
+        """None: there are no labels."""

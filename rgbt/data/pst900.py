@@ -1,11 +1,10 @@
-"""PST900: pictures of mines and tunnels, RGB and thermal, with four objects of search and rescue.
+"""PST900: RGB-thermal images of mines and tunnels, with four objects of search and rescue.
 
-A reader only: it never resizes, augments or remaps, and it refuses what it cannot read exactly.
+A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
@@ -16,29 +15,27 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.dataset import check_lengths
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
 from rgbt.data.named_files import (
+    check_lengths,
+    existing_root,
     hash_of_files,
     names_in,
     root_nearby,
     with_label,
 )
+from rgbt.data.prepare.pst900 import PREPARATION
+from rgbt.data.pst900_layout import FOLDERS, PARTS, SPLITS, bag_of
+from rgbt.data.report.pst900 import PST900Checks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
 CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
 PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
-FOLDERS = ("rgb", "thermal", "labels")
-PARTS = ("train", "test")
-SPLITS = ("train", "val", "test")
-
-BAG = re.compile(r"(?:^|_)bag(\d+)_")
-"""Which recording a picture was taken from: 58_bag21_rect_rgb_frame0000000440 is of bag 21."""
 
 ADVICE = (
     "the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the counts of "
@@ -46,20 +43,14 @@ ADVICE = (
 )
 
 
-def bag_of(name: str) -> int | None:
-    """Number of the recording that `name` says; None where it says none."""
-    found = BAG.search(name)
-    return int(found[1]) if found else None
-
-
 class PST900:
-    """Underground RGB-thermal pairs with labels, as the PST900 archive lays them out.
+    """Underground RGB-thermal pairs with labels, in the layout of the PST900 archive.
 
     Layouts (NAME as in 58_bag21_rect_rgb_frame0000000440, the same in each folder):
         folders: {train,test}/{rgb,thermal,labels}/NAME.png, the archive's own; thermal_raw and
-            depth are left alone
-        lists:   {rgb,thermal,labels}/NAME.png with train.txt, test.txt and, if there is one,
-            val.txt, as the LASNet release has it; read where there is neither train nor test
+            depth are not read
+        lists:   {rgb,thermal,labels}/NAME.png with train.txt, test.txt and, optionally,
+            val.txt, as in the LASNet release; used if there is neither train nor test
 
     Splits: "train", "val", "test". The archive has no validation part. As in the CRM and
     SpatialSeg releases "val" is the test part, so that the best checkpoint is chosen on what is
@@ -77,16 +68,16 @@ class PST900:
 
     Args:
         root: folder that holds `train` and `test`, or `rgb`, `thermal`, `labels` and the lists.
-        name: what the data set is called in messages and tables.
+        name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
-        val_bags: recordings of the training part that form "val" and leave "train"; () keeps
-            "val" as described above.
+        val_bags: recordings of the training part that form "val" instead of "train"; (): "val" as
+            described above.
 
     Raises:
-        InputError: no such root, neither layout in it, a bag that is no whole number, numbers of
-            classes, names and colours differ.
+        InputError: no such root, neither layout in it, a bag that is not a whole number, or numbers
+            of classes, names and colours differ.
     """
 
     images = GreyImages(
@@ -96,6 +87,8 @@ class PST900:
         ),
         thermal=partial(read_grey, advice=ADVICE),
     )
+
+    preparation = PREPARATION
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -110,30 +103,25 @@ class PST900:
         palette: tuple[Colour, ...] = PALETTE,
         val_bags: Bags = (),
     ) -> None:
-        self.root = Path(root).expanduser()
+        self.root = existing_root(root, "that holds train and test of PST900")
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
         self.val_bags = val_bags
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that holds train and "
-                "test of PST900."
-            )
         check_lengths(num_classes, classes, palette)
         for bag in val_bags:
             if not isinstance(bag, int):
                 raise InputError(
-                    f"dataset.val_bags: {bag!r} is no whole number; give numbers of bags, such as "
-                    "[3,7]."
+                    f"dataset.val_bags: {bag!r} is not a whole number; give numbers of bags, "
+                    "such as [3,7]."
                 )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
 
     @property
     def splits(self) -> Mapping[str, str]:
-        """Split -> the files or the list that it is made of."""
+        """Split -> its files or its list."""
         made_of = {split: self._made_of(self.part_of(split)) for split in SPLITS}
         if self.val_bags:
             bags = list(self.val_bags)
@@ -156,7 +144,7 @@ class PST900:
         return "val" if self.has_lists and (self.root / "val.txt").is_file() else "test"
 
     def has(self, split: str) -> bool:
-        """Whether anything of `split` is there; InputError where the split is unknown."""
+        """Whether any sample of `split` exists; InputError if the split is unknown."""
         part = self.part_of(split)
         if self.has_lists:
             return self._list(part).is_file()
@@ -204,7 +192,7 @@ class PST900:
         return read_label(within(self.files(name)[2], self.root), self.num_classes)
 
     def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; InputError where no part or both have it."""
+        """RGB, thermal and label of `name`; InputError if no part or both have it."""
         folders = self._folders(name)
         if len(folders) != 1:
             reason = "both train and test have" if folders else "neither train nor test has"
@@ -215,7 +203,7 @@ class PST900:
         return _files_in(folders[0], name)
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {"num_classes": self.num_classes}
 
     def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
@@ -231,6 +219,10 @@ class PST900:
             ],
         )
 
+    def checks(self) -> PST900Checks:
+        """What `rgbt.data.check` checks of this data set."""
+        return PST900Checks(self)
+
     def folders(self) -> tuple[Path, ...]:
         """Every folder that holds rgb, thermal and labels."""
         if self.has_lists:
@@ -244,7 +236,7 @@ class PST900:
         return self.root / f"{part}.txt"
 
     def _part(self, part: str, split: str) -> tuple[str, ...]:
-        """Names of a part; those of folders are listed once, later changes are not seen."""
+        """Names of a part; folders are listed once, so later changes have no effect."""
         if part not in self._parts:
             if self.has_lists:
                 lines = read_names(self._list(part), f"split '{split}' of {self.name}")
@@ -260,16 +252,16 @@ class PST900:
         return tuple(name for name in names if (bag_of(name) in self.val_bags) == (split == "val"))
 
     def _folders(self, name: str) -> tuple[Path, ...]:
-        """Where the three files of `name` are: one folder, or several, or none."""
+        """Folders with an image `name`: one, several or none."""
         return (self.root,) if self.has_lists else self._folders_of.get(name, ())
 
     @cached_property
     def _folders_of(self) -> dict[str, tuple[Path, ...]]:
-        found: dict[str, tuple[Path, ...]] = {}
+        folders: dict[str, tuple[Path, ...]] = {}
         for part in PARTS:
             for name in self._part(part, part):
-                found[name] = (*found.get(name, ()), self.root / part)
-        return found
+                folders[name] = (*folders.get(name, ()), self.root / part)
+        return folders
 
     def _check_bags(self) -> None:
         known = {str(bag_of(name)) for name in self._part("train", "train")} - {"None"}
@@ -285,7 +277,7 @@ class PST900:
         part = self.part_of(split)
         advice = f"unpack the folder '{part}' of the archive there"
         if self.val_bags and part == "train":
-            advice = "every image is of a bag in dataset.val_bags, leave one out of it"
+            advice = "every image is of a bag in dataset.val_bags, remove one of them"
         return (
             f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
             f"{self.root}; {advice}."
@@ -305,7 +297,7 @@ def _is_flat(root: Path) -> bool:
 
 
 def _has_lists(root: Path) -> bool:
-    """Whether `root` is laid out in lists and not in folders; InputError where it is neither."""
+    """Whether `root` has the layout of lists; InputError if it has neither layout."""
     if _has_parts(root):
         return False
     if _is_flat(root) and any((root / f"{part}.txt").is_file() for part in PARTS):

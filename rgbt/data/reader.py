@@ -1,6 +1,6 @@
-"""What a worker process does: read the samples of one batch, transform them, stack them.
+"""The work of a loader process: read the samples of one batch, transform and stack them.
 
-Part of `rgbt.data.loaders`, which decides what each batch holds.
+Part of `rgbt.data.loaders`, which chooses the samples of each batch.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from torch.utils.data import Dataset as TorchDataset
 from torch.utils.data import get_worker_info
 
 from rgbt.checks import InputError
-from rgbt.data.batches import Dataset, Example, Transform
+from rgbt.data.batches import Dataset, Transform, TransformedSample
 from rgbt.randomness import numpy_generator
 from rgbt.types import Loadable, Sample
 
 MakeExample = Callable[[Any, dict[str, str]], Any]
-"""(key, skipped) -> example, or None where it is left out; notes unreadable names in `skipped`."""
+"""(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 
 Stack = Callable[[list[Any]], Loadable]
-"""Examples of one size -> one value; InputError where their sizes differ."""
+"""Examples of one size -> one batch; InputError if their sizes differ."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end a command (`rgbt.runtime.signals`)."""
 
 LOOK_S = 2.0
-"""How often a worker looks whether its main process is still there."""
+"""Interval at which a worker checks that its main process exists."""
 
 
 @dataclass(frozen=True)
-class Source:
-    """Samples of one split and what is done to them.
+class SplitReader:
+    """Reads the samples of one split.
 
     Attributes:
         dataset: reads samples.
         names: the split.
         transform: makes examples.
-        skip_errors: note a sample that cannot be read instead of raising.
+        skip_errors: record an unreadable sample instead of raising.
     """
 
     dataset: Dataset
@@ -54,7 +54,7 @@ class Source:
     skip_errors: bool
 
     def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
-        """The sample; None, with the reason in `skipped`, where it is to be skipped."""
+        """The sample; None, with the reason in `skipped`, if it is skipped."""
         try:
             return self.dataset.read(name)
         except InputError as error:
@@ -69,12 +69,12 @@ class TrainExamples:
     """Augmented examples; a key is (epoch, index in the split).
 
     Attributes:
-        source: what is read.
+        source: reads samples.
         make: (sample, generator) -> example: the transform's `train` or `drawn`.
         seed: run seed.
     """
 
-    source: Source
+    source: SplitReader
     make: Callable[[Sample, np.random.Generator], Any]
     seed: int
 
@@ -101,35 +101,34 @@ class TrainExamples:
 class EvalExamples:
     """Examples for evaluation; a key is a name."""
 
-    source: Source
+    source: SplitReader
 
-    def __call__(self, key: str, skipped: dict[str, str]) -> Example | None:
-        """The example of `key`, or None where it cannot be read."""
+    def __call__(self, key: str, skipped: dict[str, str]) -> TransformedSample | None:
+        """The example of `key`, or None if it cannot be read."""
         sample = self.source.read(key, skipped)
         return None if sample is None else self.source.transform.test(sample)
 
 
 @dataclass(frozen=True)
-class Loaded:
-    """What a worker hands back.
+class LoadedBatch:
+    """The result of a worker.
 
     Attributes:
-        batch: None where every sample was left out, or after an error; a dataclass of tensors.
+        batch: a dataclass of tensors; None if every sample was left out, or after an error.
         skipped: name -> why it could not be read.
-        error: message of an InputError; it travels as text because torch wraps exceptions of
-            workers into others.
+        error: message of an InputError; a text, because torch wraps exceptions of workers.
     """
 
     batch: Loadable | None = None
     skipped: dict[str, str] = field(default_factory=dict)
     error: str = ""
 
-    def pin_memory(self) -> Loaded:
-        """Called by the loader's own thread, so that copies to the device need not wait."""
+    def pin_memory(self) -> LoadedBatch:
+        """The batch in pinned memory; called by a thread of the loader."""
         return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
 
 
-class BatchReader(TorchDataset[Loaded]):
+class BatchReader(TorchDataset[LoadedBatch]):
     """Makes the batch of a list of keys.
 
     Args:
@@ -141,7 +140,7 @@ class BatchReader(TorchDataset[Loaded]):
         self.make_example = make_example
         self.stack = stack
 
-    def __getitem__(self, keys: list[Any]) -> Loaded:
+    def __getitem__(self, keys: list[Any]) -> LoadedBatch:
         """The batch of `keys`, without the samples that are left out."""
         skipped: dict[str, str] = {}
         try:
@@ -151,28 +150,28 @@ class BatchReader(TorchDataset[Loaded]):
             if batch is not None and get_worker_info() is not None:
                 batch = _each(batch, _shared)
         except InputError as error:
-            return Loaded(skipped=skipped, error=str(error))
-        return Loaded(batch, skipped)
+            return LoadedBatch(skipped=skipped, error=str(error))
+        return LoadedBatch(batch, skipped)
 
 
 def start_worker(_: int) -> None:
     """Settings of a worker process."""
-    # The processes are the parallelism; threads of OpenCV beside them only get in each other's way.
+    # There is one process per core; threads of OpenCV would compete with them.
     cv2.setNumThreads(0)
-    # A terminal and a cluster signal all processes of a run. The main one finishes its step first,
-    # for which it needs its workers, and then ends them.
+    # A terminal and a cluster signal all processes of a run. The main process needs its workers
+    # to finish its step, and then ends them.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Leave when the main process says so, or is gone."""
-    # Not os.getppid: inside a sweep a server forks the workers, and outlives the main process.
+    """Exit when the main process sends SIGTERM, or has ended."""
+    # Not os.getppid: in a sweep a server forks the workers, and lives longer than the main process.
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a main process"
     while parent.is_alive():
-        told = signal.sigtimedwait(ENDING, LOOK_S)
-        if told and told.si_signo == signal.SIGTERM and told.si_pid == parent.pid:
+        received = signal.sigtimedwait(ENDING, LOOK_S)
+        if received and received.si_signo == signal.SIGTERM and received.si_pid == parent.pid:
             break
     os._exit(0)
 
@@ -191,8 +190,8 @@ def _pinned(tensor: Tensor) -> Tensor:
 def _shared(tensor: Tensor) -> Tensor:
     """`tensor` in memory that the main process can read.
 
-    The worker's queue would move it there as well, but in a thread whose error nobody sees: the
-    main process would wait for ever.
+    The worker's queue would do so too, but in a thread whose errors are not reported: the main
+    process would wait forever.
     """
     try:
         tensor.share_memory_()  # type: ignore[no-untyped-call]
@@ -202,7 +201,7 @@ def _shared(tensor: Tensor) -> Tensor:
 
 
 def no_shared_memory(reason: str) -> str:
-    """The sentence about shared memory that loader processes do not get.
+    """The message about missing shared memory.
 
     Args:
         reason: what the system reported.

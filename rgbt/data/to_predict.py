@@ -1,4 +1,4 @@
-"""The images that a prediction is made of: a split, a folder of new ones, a file or two files."""
+"""Images to predict: a split, a folder of new images, one file or two files."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.cache.dataset import Decoded
-from rgbt.data.dataset import LabelledDataset
-from rgbt.data.images import Images, ReadsPairs
+from rgbt.data.images import PairReader, ReadsPairs
 from rgbt.data.new_images import find_pairs
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
 
 ENDINGS = (".png", "_overlay.png")
-"""What follows a name in the two files that are written of an image."""
+"""Endings of the two files written per image."""
 
 
 @dataclass(frozen=True)
 class ToPredict:
-    """Images to predict, in order.
+    """PairReader to predict, in order.
 
     Attributes:
-        names: of the images; the names of what is written begin with them.
+        names: of the images; names of written files begin with them.
         read: name -> its images, without a label.
-        folders: where the files lie, which must not be overwritten.
-        skipped: name -> why it was left out; filled by `samples` and by whoever chooses.
-        others: images that were found beside and belong to no pair.
+        folders: of the files, which must not be overwritten.
+        skipped: name -> why it was left out; `samples` adds to it.
+        others: further images, which belong to no pair.
     """
 
     names: tuple[str, ...]
@@ -56,14 +55,14 @@ class ToPredict:
             raise InputError(f"none of the {len(self.names)} images can be read: {first}")
 
     def check_out(self, out: Path) -> None:
-        """Refuse a folder in which images, or what is written of two of them, would be overwritten.
+        """Refuse a folder in which input or output images would be overwritten.
 
         Raises:
             InputError: naming the files.
         """
         if out.resolve() in {folder.resolve() for folder in self.folders}:
             raise InputError(
-                f"out={out} holds the input images, which would be overwritten; take another."
+                f"out={out} holds the input images, which would be overwritten; name another one."
             )
         written: dict[str, str] = {}
         for name in self.names:
@@ -77,10 +76,10 @@ class ToPredict:
 
 
 def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
-    """The images of a split; labels are not read where the data set can leave them."""
+    """The images of a split; labels are not read if the data set can read pairs alone."""
     names = dataset.names(split)
-    plain = _plain(dataset)
-    read = plain.pair if isinstance(plain, ReadsPairs) else plain.read
+    reader = reader_of(dataset)
+    read = reader.pair if isinstance(reader, ReadsPairs) else reader.read
     folders = {path.parent for name in names for path in dataset.files(name)}
     return ToPredict(names, read, frozenset(folders))
 
@@ -89,7 +88,7 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
     """The image of a packed file, or the pairs of a folder (see `find_pairs`).
 
     Args:
-        dataset: whose images they are like.
+        dataset: reads images of this kind.
         text: the path.
         on_error: "skip" leaves out RGB images without a thermal image.
 
@@ -124,7 +123,7 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
 
 
 def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
-    """One pair, called as its RGB file; one file twice is a packed one."""
+    """One pair, named after its RGB file; the same file twice is a packed one."""
     images = images_of(dataset)
     return ToPredict(
         (rgb.stem,),
@@ -133,18 +132,13 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
     )
 
 
-def images_of(dataset: LabelledDataset) -> Images:
-    """How a data set reads images that are in no split; InputError where it does not say."""
-    plain = _plain(dataset)
-    if not isinstance(plain, ReadsPairs):
+def images_of(dataset: LabelledDataset) -> PairReader:
+    """The reader of new images of a data set; InputError if it has none."""
+    reader = reader_of(dataset)
+    if not isinstance(reader, ReadsPairs):
         raise InputError(
-            f"{type(plain).__name__} does not say how new images are read; name one of its splits "
-            f"({', '.join(plain.splits)}), or give it `images` and `pair` "
+            f"{type(reader).__name__} does not declare how new images are read; name one of its "
+            f"splits ({', '.join(reader.splits)}), or give it `images` and `pair` "
             "(docs/extending.md, data set)."
         )
-    return plain.images
-
-
-def _plain(dataset: LabelledDataset) -> LabelledDataset:
-    """The data set without the cache before it, which holds splits alone."""
-    return dataset.source if isinstance(dataset, Decoded) else dataset
+    return reader.images

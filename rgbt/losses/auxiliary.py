@@ -52,7 +52,7 @@ class WithAuxiliary:
         if "aux_logits" not in output.aux:
             raise InputError(
                 "loss=cross_entropy_auxiliary needs a network with an auxiliary head, and this one "
-                "returns no auxiliary scores; choose model=deeplabv2_auxiliary, or "
+                "returns no auxiliary scores; choose a DeepLab v2 with model.auxiliary=true, or "
                 "loss=cross_entropy."
             )
         parts = self.loss(output, batch, generator)

@@ -84,7 +84,7 @@ class Passes:
             raise InputError(
                 f"domain adaptation compares class scores, but {type(model).__name__} returns "
                 "masks of queries in training; choose one that returns scores, such as "
-                "model=deeplab_demo."
+                "model=deeplabv2_tiny."
             )
         self.model = model
         self.loss = loss

@@ -119,7 +119,7 @@ class UnlabelledTarget:
         if guidance_weight and getattr(model, "auxiliary", None) is None:
             raise InputError(
                 f"scheme.guidance_weight={guidance_weight:g} trains an auxiliary head, which "
-                "this network does not have; choose model=deeplab_auxiliary_demo (or _paper), or "
+                "this network does not have; choose a DeepLab v2 with model.auxiliary=true, or "
                 "set it to 0."
             )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients="apart")

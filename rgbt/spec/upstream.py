@@ -16,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS
-from rgbt.config.compose import compose, conf_dir
+from rgbt.config.compose import available, compose, search_path
+from rgbt.config.hydra_messages import forgotten
 from rgbt.spec.run_spec import SHARED, WEIGHTS, CheckpointFile
 
 PREFIX = "experiment:"
@@ -35,12 +36,11 @@ def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] |
         raise InputError(
             f"{key}={value}: expected experiment:NAME/best.pt or experiment:NAME/last.pt."
         )
-    known = [path.stem for path in (conf_dir() / "experiment").glob("*.yaml")]
+    known = available("experiment")
     if name not in known:
         raise InputError(
-            f"{key}={value}: there is no experiment '{name}' in {conf_dir() / 'experiment'}; "
-            f"{nearest(name, known)}. One of your own lies there too, or its run is named by its "
-            f"folder (runs/<key>/{checkpoint})."
+            f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. A run can be "
+            f"named by its folder too: runs/<key>/{checkpoint}.{forgotten()}"
         )
     return name, cast(CheckpointFile, checkpoint)
 
@@ -52,7 +52,7 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
     device, regions, tracking, and the folder of runs; for weights also the network. Everything else
     is the experiment's own.
     """
-    upstream = _composed(experiment, config.scale.name).copy()
+    upstream = _composed(experiment, config.scale.name, *search_path()).copy()
     # Its experiment says whether a network has pretrained weights, the scale says all else.
     shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == WEIGHTS:
@@ -69,9 +69,9 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
 
 
 @cache
-def _composed(experiment: str, scale: str) -> DictConfig:
+def _composed(experiment: str, scale: str, *search_path: str) -> DictConfig:
     """Cached, because composing takes long and the seeds of a table share their upstream runs."""
-    return compose([f"+experiment={experiment}", f"scale={scale}"])
+    return compose([f"+experiment={experiment}", f"scale={scale}", *search_path])
 
 
 def shared_overrides(overrides: Sequence[str], key: str) -> list[str]:

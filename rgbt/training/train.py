@@ -91,7 +91,7 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
 def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
     tables = folder.tables()
     assert tables is not None, "a finished run has its tables"
-    heads = domains.told(domains.tested_head)
+    heads = domains.heads_in_words(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
     show(result_view(ResultTables.from_json(tables), folder.path, links))
 

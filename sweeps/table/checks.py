@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.component import build
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import available, conf_dir
 from rgbt.metrics.named import OF_PAIRS
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def check_table(table: Table, place: str) -> None:
     _check_distinct(names, f"{place}, columns")
     _check_distinct([row.label for row in table.rows], f"{place}, rows")
     if table.regions != "as trained":
-        check_choice(f"{place}, regions", table.regions, _files("metric"))
+        check_choice(f"{place}, regions", table.regions, available("metric"))
     _check_scales(table.at, place)
     for index, column in enumerate(table.columns):
         before = table.columns[:index]
@@ -49,11 +49,7 @@ def _check_distinct(names: list[str], place: str) -> None:
 
 def _check_scales(at: Iterable[str], place: str) -> None:
     for scale in at:
-        check_choice(f"{place}, at", scale, _files("scale"))
-
-
-def _files(group: str) -> list[str]:
-    return [file.stem for file in (conf_dir() / group).glob("*.yaml")]
+        check_choice(f"{place}, at", scale, available("scale"))
 
 
 KINDS = ("metric", "minus", "mean", "parameters", "needs")
@@ -112,7 +108,7 @@ def _check_degradation(column: Column, place: str) -> None:
             f"{place}: 'degradation' is for scores of single frames alone; remove degradation: "
             f"{column.degradation}."
         )
-    check_choice(f"{place}, degradation", column.degradation, _files("degradation"))
+    check_choice(f"{place}, degradation", column.degradation, available("degradation"))
     # Below its key, as in a configuration: sentences about it name degradation.severities.
     file = conf_dir() / "degradation" / f"{column.degradation}.yaml"
     kind = build(OmegaConf.create({"degradation": OmegaConf.load(file)}).degradation)
@@ -148,7 +144,7 @@ def _check_frames(column: Column, place: str) -> None:
 def _check_row(row: Row, table: Table, place: str) -> None:
     names = [column.name for column in table.columns]
     if row.experiment is not None:
-        check_choice(f"{place}, experiment", row.experiment, _files("experiment"))
+        check_choice(f"{place}, experiment", row.experiment, available("experiment"))
     _check_scales(row.at, place)
     for name in row.without:
         check_choice(f"{place}, without", name, names)

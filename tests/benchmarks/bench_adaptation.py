@@ -25,10 +25,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 CASES = {
     "one head": ("sh_adversarial", ()),
     "two heads": ("multi_head_thermal", ()),
-    "two heads, decoder of the text": ("multi_head_thermal", ("model=multi_head_literal_paper",)),
+    "two heads, decoder of the text": (
+        "multi_head_thermal",
+        ("model=deeplabv2_two_heads_literal",),
+    ),
     "two heads, decoder of the code": ("multi_head_modified_thermal", ()),
     "two streams (HeatNet)": ("heatnet_no_teacher", ()),
-    "RGB alone (HeatNet's student)": ("heatnet_no_teacher", ("model=heatnet_rgb_only_paper",)),
+    "RGB alone (HeatNet's student)": ("heatnet_no_teacher", ("model.modalities=rgb",)),
 }
 ROUNDS = {"cpu": 1, "cuda": 20}
 

@@ -26,11 +26,11 @@ from torch.utils.data import DataLoader
 
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.cache.dataset import Decoded
-from rgbt.data.dataset import LabelledDataset
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.synth.dataset import synth
+from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.benchmarks.released_loading import ReleasedSamples
 
@@ -81,7 +81,7 @@ def seconds(batches: Iterator[Any], clock: Callable[[], float]) -> float:
 
 
 def speeds(dataset: MFNet, cache: Path) -> None:
-    mapped = Decoded(dataset, cache, num_threads=2)
+    mapped = CachedDataset(dataset, cache, num_threads=2)
     start = time.perf_counter()
     mapped.ensure(dataset.names("train"))
     built = time.perf_counter() - start
@@ -121,7 +121,7 @@ def compare(dataset: MFNet, cache: Path, draws: int) -> None:
     names = dataset.names("train")
     samples = ReleasedSamples(dataset.root, names)
     rng = np.random.default_rng(1)
-    mapped = Decoded(dataset, cache, num_threads=2)
+    mapped = CachedDataset(dataset, cache, num_threads=2)
     mapped.ensure(names)
 
     def theirs() -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -36,7 +36,7 @@ NETWORKS = (
     *("mask2former_tiny", "mask2former_swin_t", "mask2former_swin_s", "mask2former_swin_b"),
     *("cmx_tiny", "cmx_b0", "cmx_b2", "cmx_b4", "rtfnet_tiny", "rtfnet_50", "rtfnet_152"),
     *("mfnet_tiny", "mfnet", "heatnet_tiny", "heatnet"),
-    *("deeplabv2_tiny", "deeplabv2", "deeplabv2_two_heads"),
+    *("deeplabv2_tiny", "deeplabv2"),
 )
 COMPARED = ("mask2former_swin_t", "cmx_b0", "cmx_b2")
 Step = Callable[[], Tensor]

@@ -16,7 +16,7 @@ import numpy as np
 
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import render_scene
-from rgbt.data.synth.writer import Plan, write_index
+from rgbt.data.synth.writer import SynthPlan, write_index
 
 WANTED = 100.0
 """Scenes per second and core at 120 x 160, rendered only (issue: dataset synth)."""
@@ -40,7 +40,7 @@ def main(num_scenes: int) -> None:
     factors = SceneFactors()
     for index in range(20):
         render_scene(0, index, factors)
-    plan = Plan(seed=0, num_train=num_scenes, num_val=1, num_test=1, factors=factors)
+    plan = SynthPlan(seed=0, num_train=num_scenes, num_val=1, num_test=1, factors=factors)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         (folder / "images").mkdir()

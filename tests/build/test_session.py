@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data.cache.dataset import Decoded
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
+from rgbt.dataset import DatasetWrapper
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.build.session import decode_ahead, heads_of, result_tables, view_of
@@ -112,20 +113,20 @@ def test_heads_of_images_that_are_in_no_list() -> None:
     for asked, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", asked)(("mine", "night")) == (head, head)
     assert session.dataset.asked == 0
-    with pytest.raises(InputError, match=r"night, so that no head can be chosen; say head=source"):
+    with pytest.raises(InputError, match=r"night, so no head can be chosen; set head=source"):
         heads_of(session, "rgb")(("mine",))
     alone = asked_session({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
     assert alone.dataset.asked == 0
 
 
-@pytest.mark.parametrize("degraded", [False, True])
-def test_images_of_the_splits_that_are_asked_for_are_decoded_ahead(
-    write_mfnet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, degraded: bool
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_decode_ahead_caches_the_given_splits(
+    write_mfnet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrapped: bool
 ) -> None:
     splits = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
-    dataset = Decoded(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
-    session = SimpleNamespace(dataset=SimpleNamespace(source=dataset) if degraded else dataset)
+    dataset = CachedDataset(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
+    session = SimpleNamespace(dataset=DatasetWrapper(dataset) if wrapped else dataset)
     decode_ahead(session, "train", "val")
     labels = {name: dataset.source.label(name) for name in (*splits["train"], *splits["val"])}
 

@@ -15,7 +15,7 @@ from rgbt.corruptions.late import Delayed, Frozen
 from rgbt.corruptions.noise import Noise
 from rgbt.corruptions.occluded import Occluded
 from rgbt.corruptions.removed import Removed
-from rgbt.data.dataset import LabelledDataset
+from rgbt.dataset import LabelledDataset
 from tests.corruptions.recorded import NAMES, Recorded, sample
 
 FROZEN, DELAYED = Frozen(severities=(2.0,)), Delayed(severities=(1.0,))

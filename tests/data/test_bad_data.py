@@ -20,12 +20,12 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.kp import KP
 from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
 from rgbt.data.report.dataset import check_dataset
+from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.conftest import write_data
 from tests.data import folder_files, freiburg_files, kp_files, pst900_files
@@ -122,7 +122,7 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept;"),
     "a link to nowhere": (partial(move, link="gone"), "is missing: it is a link to .*/gone, where"),
     "another depth": (change_depth, "expected 8 bits|of 16 bits|whole numbers|got 8 bits"),
-    "another size": (change_size, r"is \d+x\d+ pixels but|which is another shape"),
+    "another size": (change_size, r"is \d+x\d+ pixels but|which is another aspect ratio"),
     "an unknown value": (change_values, "label value 77 "),
 }
 
@@ -166,7 +166,7 @@ def outside(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_check_tells_each_in_one_line(kind: str, tmp_path: Path, outside: Path) -> None:
+def test_check_reports_each_problem_in_one_line(kind: str, tmp_path: Path, outside: Path) -> None:
     make, root = KINDS[kind].make, KINDS[kind].write(tmp_path / "data")
     sound = check_dataset(make(root)).problems
     name = make(root).names("test")[0]
@@ -183,7 +183,7 @@ def test_the_check_tells_each_in_one_line(kind: str, tmp_path: Path, outside: Pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_may_not_be_read(
+def test_file_without_permission_is_refused(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Permission is taken away here and not on the disk, where it would not bind root."""

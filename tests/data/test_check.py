@@ -58,7 +58,7 @@ def test_numbers_of_a_split(write_mfnet, png) -> None:
     assert split.pixels.sum() == 3 * 24 * 32
 
 
-def test_every_kind_of_problem_in_one_line(write_mfnet, expected_pair, png, capsys) -> None:
+def test_each_problem_is_one_line(write_mfnet, expected_pair, png, capsys) -> None:
     names = [f"{number:05d}D" for number in range(10, 17)]
     root = write_mfnet({**SPLITS, "train": [*names, "odd", "00003N"], "val": ["00003N", "00003N"]})
     images, labels = root / "images", root / "labels"
@@ -126,7 +126,7 @@ def test_mirrored_copies_only_in_training(write_mfnet) -> None:
     assert any("split val lists 1 mirrored copies" in problem for problem in problems(root))
 
 
-def test_official_numbers_are_a_note_for_mfnet_alone(write_mfnet) -> None:
+def test_other_numbers_than_official_give_note(write_mfnet) -> None:
     root = write_mfnet(SPLITS)
     notes = check_dataset(MFNet(str(root))).notes
     assert (

@@ -61,7 +61,7 @@ def test_a_sound_data_set(root: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert report.notes[-1].startswith("images are 16x24, the original ones 512x640")
     assert run(root) == 0
     output = capsys.readouterr().out
-    assert "kp (KP as the CRM release has it, splits from list files)" in output
+    assert "kp (KP in the layout of the CRM release, splits from list files)" in output
     assert "0 problem(s)" in output
 
 
@@ -74,9 +74,9 @@ def test_splits_by_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     root = write_ms_uda(tmp_path)
     report = check_dataset(KP(str(root)))
     assert report.problems == ()
-    assert report.notes[0].startswith("no list is read: splits are all labels on disk")
+    assert report.notes[0].startswith("no list is read: all labels on disk are divided")
     assert run(root) == 0
-    assert "kp (KP as MS-UDA has it, splits from set numbers)" in capsys.readouterr().out
+    assert "kp (KP in the layout of MS-UDA, splits from set numbers)" in capsys.readouterr().out
 
 
 def test_an_image_of_void_alone(root: Path) -> None:
@@ -89,23 +89,23 @@ def test_an_image_of_void_alone(root: Path) -> None:
     assert val.images.tolist() == [0] * 19 + [2]
 
 
-def test_the_division_of_ms_uda_is_told(root: Path) -> None:
-    def told() -> bool:
-        return any("as MS-UDA divides KP" in note for note in check_dataset(KP(str(root))).notes)
+def test_division_of_ms_uda_gives_note(root: Path) -> None:
+    def has_note() -> bool:
+        return any("as in MS-UDA" in note for note in check_dataset(KP(str(root))).notes)
 
     days = [name for name in NAMES if name[:5] in ("set00", "set02", "set06", "set07", "set08")]
     nights = [name for name in NAMES if name not in days]
-    assert not told()
+    assert not has_note()
     write_lists(root, {"train": days, "val": nights, "test": nights})
-    assert told()
+    assert has_note()
     # A day of CRM to train on and one of its nights to validate on is no division of MS-UDA.
     write_lists(root, {"train": TRAIN[:2], "val": VAL[1:]})
-    assert not told()
+    assert not has_note()
     write_lists(root, {"train": [*days, TRAIN[2]], "val": VAL[1:]})
-    assert not told()
+    assert not has_note()
 
 
-def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_problem_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_lists(
         root,
         {
@@ -127,7 +127,7 @@ def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFix
         f"split train_day lists '{TRAIN[2]}', which was recorded at night (set03).",
         "split train is not train_day and train_night together: 1 names are in one of them alone, "
         f"the first is '{TRAIN[1]}'.",
-        "1 labels have names that say no set, the first is '00001D.png'.",
+        "1 labels have names without a set, the first is '00001D.png'.",
         f"no split names 1 labels on disk, the first is '{TEST[3]}.png'.",
     ):
         assert sum(text in problem for problem in found) == 1, text
@@ -141,7 +141,7 @@ def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFix
     assert lines == [f"problem: {problem}" for problem in found]
 
 
-def test_splits_that_are_read_from_one_list(root: Path) -> None:
+def test_splits_of_one_list_may_share_names(root: Path) -> None:
     (root / "test.txt").unlink()
     splits = {"train": "train.txt", "val": "val.txt", "val_day": "val_day.txt", "test": "val.txt"}
     report = check_dataset(KP(str(root), splits=splits))

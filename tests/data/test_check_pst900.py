@@ -117,7 +117,7 @@ def test_parts_that_are_exchanged(tmp_path: Path) -> None:
     assert any(note.startswith("split test has 1 of no bag, 1 of bag 25; the") for note in found)
 
 
-def test_every_kind_of_problem_in_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_problem_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_triple(root / "test", TRAIN[0])
     write_png(root / "train/labels" / f"{TEST[0]}.png", np.zeros(HW, np.uint8))
     (root / "train/rgb" / f"{TRAIN[1]}.png").unlink()

@@ -31,7 +31,7 @@ def two(target_is: str, **changes: Any) -> Domains:
 
 @pytest.mark.parametrize("labels", ["given", "none", "/some/folder"])
 @pytest.mark.parametrize("setting", [{"threshold": 0.5}, {"teacher_view": "thermal"}])
-def test_settings_of_a_teacher_without_one_are_refused(labels: str, setting: dict) -> None:
+def test_teacher_settings_without_teacher_are_refused(labels: str, setting: dict) -> None:
     with pytest.raises(InputError, match=f"with labels={labels} they have no effect"):
         domain(labels=labels, **setting)
     assert domain(labels="experiment:x/best.pt", **setting).labels.startswith("experiment:")
@@ -46,12 +46,12 @@ def test_confidence_needs_pseudo_labels(labels: str) -> None:
 
 
 @pytest.mark.parametrize(("source", "target"), [("day", None), (None, "dark")])
-def test_one_domain_alone_with_a_head_is_refused(source: str | None, target: str | None) -> None:
+def test_single_head_is_refused(source: str | None, target: str | None) -> None:
     with pytest.raises(InputError, match=f"got {source or 'null'} and {target or 'null'}"):
         domains(source=domain(head=source), target=domain(head=target))
 
 
-def test_target_is_goes_with_two_heads_and_only_with_them() -> None:
+def test_target_is_requires_two_heads() -> None:
     with pytest.raises(InputError, match="domains.target_is=null with 2 heads"):
         domains(source=domain(head="a"), target=domain(head="b"))
     for named in ("view", "night"):
@@ -68,7 +68,7 @@ def test_a_choice_of_heads_needs_two(head: str | None) -> None:
 
 
 @pytest.mark.parametrize("view", [None, "rgb"])
-def test_two_domains_of_one_view_are_not_told_apart_by_it(view: View | None) -> None:
+def test_target_is_view_requires_two_views(view: View | None) -> None:
     with pytest.raises(InputError, match="target_is=view"):
         domains(
             source=domain(view="rgb", head="a"),
@@ -131,11 +131,11 @@ def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> Non
     ],
     ids=["view", "night", "tested with one"],
 )
-def test_which_head_predicts_what_in_words(found: Domains, own: str) -> None:
+def test_heads_in_words_names_heads(found: Domains, own: str) -> None:
     """As asked, not as configured: the caller knows whether another one was asked for."""
-    assert found.told("own") == own
-    assert found.told("source") == "day for all images"
-    assert found.told("target") == "dark for all images"
+    assert found.heads_in_words("own") == own
+    assert found.heads_in_words("source") == "day for all images"
+    assert found.heads_in_words("target") == "dark for all images"
 
 
 @pytest.mark.parametrize(
@@ -148,6 +148,6 @@ def test_which_head_predicts_what_in_words(found: Domains, own: str) -> None:
     ],
     ids=["none", "one", "two domains", "one of two domains"],
 )
-def test_one_head_is_not_told_of(found: Domains) -> None:
+def test_heads_in_words_is_empty_for_one_head(found: Domains) -> None:
     for asked in ("own", "source", "target"):
-        assert found.told(asked) == ""
+        assert found.heads_in_words(asked) == ""

@@ -273,7 +273,7 @@ def test_lists(tmp_path: Path) -> None:
     for wrong in ("00001D\n".encode("utf-16"), b"\x89PNG\r\n\x1a\n\0\0", b"a\0b\n"):
         path.write_bytes(wrong)
         with pytest.raises(
-            InputError, match=r"^dataset.splits.train: .* is no text in UTF-8; give"
+            InputError, match=r"^dataset.splits.train: .* is not a text in UTF-8; give"
         ):
             read_names(path, "dataset.splits.train")
     path.write_text(" \n\n")
@@ -296,7 +296,7 @@ def bomb(height: int, width: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(kind, each) for kind, each in chunks)
 
 
-def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(path: Path) -> None:
+def test_too_large_image_is_refused_before_decoding(path: Path) -> None:
     path.write_bytes(bomb(30_000, 30_000))
     tracemalloc.start()
     assert refused(path) == (
@@ -316,7 +316,7 @@ def test_the_limit_holds_for_every_format(tmp_path: Path, suffix: str, monkeypat
     assert "set RGBT_MAX_MEGAPIXELS=2" in refused(path)
 
 
-def test_a_png_that_disagrees_with_its_check_sum_is_refused(path: Path) -> None:
+def test_png_with_wrong_check_sum_is_refused(path: Path) -> None:
     """Whatever a version of OpenCV makes of it."""
     image = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     whole = cv2.imencode(".png", image)[1].tobytes()
@@ -327,7 +327,7 @@ def test_a_png_that_disagrees_with_its_check_sum_is_refused(path: Path) -> None:
     assert "damaged (a check sum of the PNG is another one)" in refused(path)
 
 
-def test_a_file_above_the_limit_is_not_read(path: Path) -> None:
+def test_file_above_limit_is_not_read(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(10**12)  # takes no space on the disk
     with pytest.raises(InputError, match="holds 1,000,000 million bytes.*RGBT_MAX_FILE_MB=1000000"):

@@ -17,7 +17,7 @@ from rgbt.config.component import Component, build
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import grey, label_codes, painted
 from rgbt.data.freiburg_images import _grey_levels
-from rgbt.data.report.dataset import check_dataset, layout_of
+from rgbt.data.report.dataset import check_dataset, checks_of
 from tests.conftest import write_png
 from tests.data.folder_files import (
     CLASSES,
@@ -154,7 +154,7 @@ def test_packed_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sample.thermal, image[..., 3])
     assert dataset.files("train_7") == (tmp_path / "train/7.png", tmp_path / "train/7_mask.png")
     assert dataset.decoding()["packed"]
-    assert layout_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
+    assert checks_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
     write_png(tmp_path / "train" / "7.png", image[..., :3])
     assert "got 3; use the original file, or give dataset.thermal its own pattern" in refused(
         lambda: dataset.read("train_7")
@@ -220,8 +220,8 @@ def test_label_values(root: Path) -> None:
     label[1, :3] = (9, 9, 30)
     write_png(path, label)
     assert refused(lambda: dataset.label("train_1")) == (
-        f"{path}: label value 9 (2 pixels, most frequent of 2 unknown ones) stands neither in "
-        "dataset.ids nor in dataset.ignored (known: 0, 7, 24, 26, 255, 400); name it there."
+        f"{path}: label value 9 (2 pixels, most frequent of 2 unknown ones) is neither in "
+        "dataset.ids nor in dataset.ignored (known: 0, 7, 24, 26, 255, 400); add it there."
     )
     # 255 may be a class, where it is said.
     whole = folder(root, ids={**ids, 255: "person", 9: "car", 30: "car"}, ignored=(7,))
@@ -230,7 +230,7 @@ def test_label_values(root: Path) -> None:
     assert found[0, 4] == 1
 
 
-def test_label_values_are_class_indices_unless_said_otherwise(root: Path) -> None:
+def test_label_values_are_class_indices_by_default(root: Path) -> None:
     path = root / "train" / "mask" / "1.png"
     label = np.full(HW, 2, np.uint8)
     label[0, 0] = 255
@@ -238,7 +238,7 @@ def test_label_values_are_class_indices_unless_said_otherwise(root: Path) -> Non
     np.testing.assert_array_equal(folder(root).label("train_1"), label)
     label[0, 1] = 3
     write_png(path, label)
-    assert "label value 3 (1 pixels) stands neither in dataset.ids" in refused(
+    assert "label value 3 (1 pixels) is neither in dataset.ids" in refused(
         lambda: folder(root).label("train_1")
     )
 
@@ -271,8 +271,8 @@ def test_label_colours(root: Path) -> None:
     image[2, :3] = [(60, 20, 220), (60, 20, 220), (1, 2, 3)]
     write_png(path, image)
     assert refused(lambda: dataset.label("train_1")) == (
-        f"{path}: colour [60, 20, 220] (2 pixels, most frequent of 2 unknown ones) stands neither "
-        "in dataset.colours nor in dataset.ignored; name it there, or save labels that were never "
+        f"{path}: colour [60, 20, 220] (2 pixels, most frequent of 2 unknown ones) is neither "
+        "in dataset.colours nor in dataset.ignored; add it there, or save labels that were never "
         "resized."
     )
 
@@ -288,10 +288,10 @@ def test_label_colours(root: Path) -> None:
             "dataset.ids: 'bb' is no class; did you mean 'b'\\? known: a, b",
         ),
         (None, {"x": (0, 0, 0)}, (), "dataset.colours: 'x' is no class"),
-        ({0: "a"}, None, (0,), "dataset.ids: 0 stands twice"),
-        (None, None, (1,), "dataset.ids: 1 stands twice"),
-        (None, {"a": (1, 2, 3), "b": (1, 2, 3)}, (), r"dataset.colours: \[1, 2, 3\] stands twice"),
-        (None, {"a": (1, 2, 3)}, ((1, 2, 3),), r"\[1, 2, 3\] stands twice"),
+        ({0: "a"}, None, (0,), "dataset.ids: 0 occurs twice"),
+        (None, None, (1,), "dataset.ids: 1 occurs twice"),
+        (None, {"a": (1, 2, 3), "b": (1, 2, 3)}, (), r"dataset.colours: \[1, 2, 3\] occurs twice"),
+        (None, {"a": (1, 2, 3)}, ((1, 2, 3),), r"\[1, 2, 3\] occurs twice"),
         (None, {"a": (1, 2, 256)}, (), r"levels from 0 to 255, got \[1, 2, 256\]"),
         ({0: "a"}, None, ((1, 2, 3),), r"dataset.ignored: expected a whole number, .* \[1, 2, 3\]"),
         (None, {"a": (1, 2, 3)}, (255,), r"dataset.ignored: expected a colour .* got 255"),
@@ -333,7 +333,7 @@ def test_day_and_night(sound: Path) -> None:
         ({"num_classes": 4}, "num_classes is 4 but dataset.classes has 3"),
         ({"palette": ((0, 0, 0),)}, "num_classes is 3 but dataset.palette has 1"),
         ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a choice"),
-        ({"classes": ("car", "person", "car")}, "dataset.classes: 'car' stands there twice"),
+        ({"classes": ("car", "person", "car")}, "dataset.classes: 'car' occurs twice"),
         ({"thermal_range": (5, 5)}, r"dataset.thermal_range: .* low < high, .* got \[5, 5\]"),
         ({"thermal_range": (5, float("nan"))}, r"dataset.thermal_range: .* got \[5, nan\]"),
         ({"thermal_range": (0, float("inf"))}, "dataset.thermal_range: "),
@@ -381,7 +381,7 @@ def test_a_sound_data_set(sound: Path) -> None:
     )
 
 
-def test_every_kind_of_problem_in_one_line(root: Path) -> None:
+def test_each_problem_is_one_line(root: Path) -> None:
     write_frame(root, "extra", "1")
     (root / "test" / "rgb" / "2.png").unlink()
     (root / "list.txt").write_text("train_1\ntrain_1\nval_1\nlost_1\n")
@@ -389,7 +389,7 @@ def test_every_kind_of_problem_in_one_line(root: Path) -> None:
     report = check_dataset(listed(root, "train_1", "train_1", "val_1", "lost_1"))
     assert list(report.problems) == [
         f"folder ({root}) has no frame called 'lost_1': there is no such RGB image "
-        "(dataset.rgb='{part}/rgb/{name}.png'); restore it, or take the name off the list.",
+        "(dataset.rgb='{part}/rgb/{name}.png'); restore it, or remove the name from the list.",
         "split train lists 'train_1' 2 times.",
         "splits train and val share 1 names, the first is 'val_1'.",
         "2 thermal images or labels have no RGB image (dataset.rgb) and are in no split, the first "

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.frames import FolderFrame
 from rgbt.data.folder.pattern import Pattern, in_order
 from rgbt.data.folder.splits import ByShare
 from tests.conftest import write_png
@@ -48,10 +48,10 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("rgb/{1}.png", "expected words in braces"),
         ("rgb/{sequence}{name}.png", "with something between"),
         ("rgb/1.png", "is one file; write {name}"),
-        ("rgb/{frame}.png", "says frame but no name; write {name}"),
+        ("rgb/{frame}.png", "has frame but no name; write {name}"),
     ],
 )
-def test_texts_that_are_no_patterns(sound: Path, text: str, said: str) -> None:
+def test_invalid_patterns_are_refused(sound: Path, text: str, said: str) -> None:
     sentence = refused(lambda: folder(sound, rgb=text))
     assert sentence.startswith("dataset.rgb: ")
     assert said in sentence
@@ -113,20 +113,20 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
     )
 
 
-def test_partners_that_are_not_there(root: Path) -> None:
+def test_missing_partners_are_refused(root: Path) -> None:
     assert refused(lambda: folder(root, thermal="{split}/ir/{name}.tif")) == (
-        "dataset.thermal: '{split}/ir/{name}.tif' names no file that is there: the first would be "
-        f"{root}/test/ir/1.tif, ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
+        "dataset.thermal: '{split}/ir/{name}.tif' matches no existing file: the first would be "
+        f"{root}/test/ir/1.tif, but ir holds 1_ir.tif, 2_ir.tif; correct the pattern."
     )
     assert refused(lambda: folder(root, label="{split}/labels/{name}.png")).endswith(
         "labels holds nothing; correct the pattern."
     )
-    assert "needs {scene}, which dataset.rgb='{split}/rgb/{name}.png' does not tell" in refused(
+    assert "needs {scene}, which dataset.rgb='{split}/rgb/{name}.png' does not have" in refused(
         lambda: folder(root, thermal="{scene}/ir/{name}.tif")
     )
     assert refused(lambda: folder(root, label="test/mask/{name}.png")) == (
         f"dataset.label: 'test_1' and 'train_1' would share {root}/test/mask/1.png; use every word "
-        "of dataset.rgb that tells them apart."
+        "of dataset.rgb in which they differ."
     )
     assert "are JPEG files, which change values and colours; save labels as PNG" in refused(
         lambda: folder(root, label="{split}/mask/{name}.JPG")
@@ -149,7 +149,7 @@ def test_two_files_of_one_name(root: Path) -> None:
     )
 
 
-def test_a_folder_that_may_not_be_listed(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_permission_is_refused(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def deny(_: object) -> list[str]:
         raise PermissionError(13, "Permission denied")
 
@@ -179,19 +179,19 @@ def test_splits_by_folder(sound: Path) -> None:
         assert "did you mean 'test'" in said
 
 
-def test_who_says_what_a_split_is(sound: Path) -> None:
+def test_splits_have_one_definition(sound: Path) -> None:
     lists, shares = {"train": "train.txt"}, {"train": 1.0}
     assert refused(lambda: folder(sound, lists=lists)).startswith(
-        "dataset: dataset.lists and {split} in dataset.rgb both say what the splits are; keep one"
+        "dataset: dataset.lists and {split} in dataset.rgb both define the splits; keep one"
     )
     plain = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
-    assert "dataset.lists and dataset.shares both say" in refused(
+    assert "dataset.lists and dataset.shares both define" in refused(
         lambda: folder(sound, lists=lists, shares=shares, **plain)
     )
-    assert "nothing says what the splits are; write {split} in dataset.rgb" in refused(
+    assert "nothing defines the splits; write {split} in dataset.rgb" in refused(
         lambda: folder(sound, **plain)
     )
-    assert "nothing says what the splits are" in refused(
+    assert "nothing defines the splits" in refused(
         lambda: folder(sound, folders={"train": "train"}, **plain)
     )
     for key in ({"shares_seed": 1}, {"block": 3}):
@@ -234,7 +234,7 @@ def test_a_list_elsewhere(root: Path, tmp_path: Path) -> None:
     assert dataset.names("train") == ("test_1",)
 
 
-def frames_of(*paths: str) -> dict[str, Frame]:
+def frames_of(*paths: str) -> dict[str, FolderFrame]:
     """Frames of {sequence}/{name}, or {camera}/{sequence}/{name}; nothing is on the disk."""
     words = ("camera", "sequence", "name")
     frames = {}
@@ -242,11 +242,11 @@ def frames_of(*paths: str) -> dict[str, Frame]:
         pieces = path.split("/")
         values = dict(zip(words[-len(pieces) :], pieces, strict=True))
         name = "_".join(pieces)
-        frames[name] = Frame(name, values, Path(path), Path(path), None)
+        frames[name] = FolderFrame(name, values, Path(path), Path(path), None)
     return frames
 
 
-def drawn(frames: dict[str, Frame], **keys: Any) -> ByShare:
+def drawn(frames: dict[str, FolderFrame], **keys: Any) -> ByShare:
     shares = {"train": 0.5, "val": 0.25, "test": 0.25}
     return ByShare(frames, **{"shares": shares, "seed": 0, "block": None, **keys})
 
@@ -276,7 +276,7 @@ def test_shares_of_blocks() -> None:
         assert rule.has(split)
 
 
-def test_two_cameras_of_one_moment_stay_together() -> None:
+def test_shares_keep_cameras_of_one_moment_together() -> None:
     sides = ("left", "right")
     frames = frames_of(*(f"{side}/s/{number}" for side in sides for number in range(1, 7)))
     rule = drawn(frames, block=4, shares={"train": 0.4, "val": 0.3, "test": 0.3})

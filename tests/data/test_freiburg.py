@@ -9,10 +9,10 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.data import freiburg
-from rgbt.data.dataset import LabelledDataset
 from rgbt.data.freiburg import CLASSES, CROP, PALETTE, THERMAL_RANGE, Freiburg
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
+from rgbt.dataset import LabelledDataset
 from tests.conftest import write_png
 from tests.data import freiburg_files as files
 from tests.data.freiburg_files import reader, write_freiburg
@@ -67,7 +67,7 @@ def test_night_is_what_the_path_says(root: Path) -> None:
         dataset.nights(("other",))
 
 
-def test_a_root_that_says_night_is_no_night(tmp_path: Path) -> None:
+def test_night_in_root_is_ignored(tmp_path: Path) -> None:
     dataset = reader(write_freiburg(tmp_path / "night_drives"))
     assert dataset.nights(dataset.names("test")) == (False, False, True, True)
 
@@ -75,7 +75,7 @@ def test_a_root_that_says_night_is_no_night(tmp_path: Path) -> None:
 @pytest.mark.parametrize("folder", ["seq_05_dusk", "seq_05_day_and_night"])
 def test_a_sequence_of_no_time_is_refused(root: Path, folder: str) -> None:
     (root / "train" / folder / "00").mkdir(parents=True)
-    with pytest.raises(InputError, match=rf"{folder}: expected the name of a sequence to say day"):
+    with pytest.raises(InputError, match=rf"{folder}: expected a name of a sequence with day"):
         reader(root).names("test")
 
 
@@ -104,12 +104,14 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
             r"split 'train_night' of freiburg is empty: expected train/seq_\*_night/.*",
         ),
         ("test", r"split 'test' .* unpack the archive 'test' there\."),
-        ("train", r"every day sequence is in dataset.val_sequences, leave one out of it\."),
+        ("train", r"every day sequence is in dataset.val_sequences, remove one of them\."),
     ):
         assert not dataset.has(split)
         with pytest.raises(InputError, match=said):
             dataset.names(split)
-    with pytest.raises(InputError, match=r"'val' .* is empty: .* it is \[\], name day sequences"):
+    with pytest.raises(
+        InputError, match=r"'val' .* is empty: .* it is \[\], name existing day sequences"
+    ):
         reader(tmp_path, val_sequences=()).names("val")
     with pytest.raises(InputError, match="no split 'tran'; did you mean 'train'"):
         dataset.names("tran")
@@ -119,7 +121,7 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("time", ["day", "night"])
-def test_stamps_of_test_thermal_may_lack_the_last_zero(tmp_path: Path, time: str) -> None:
+def test_stamp_of_thermal_may_lack_last_zero(tmp_path: Path, time: str) -> None:
     files.write_test(tmp_path, time, "1570_120", thermal="1570_12")
     files.write_test(tmp_path, time, "1571_130", thermal="1571_130")
     dataset = reader(tmp_path)
@@ -130,7 +132,7 @@ def test_stamps_of_test_thermal_may_lack_the_last_zero(tmp_path: Path, time: str
         assert dataset.read(name).label is not None
 
 
-def test_two_frames_with_one_thermal_image_are_refused(tmp_path: Path) -> None:
+def test_shared_thermal_image_is_refused(tmp_path: Path) -> None:
     files.write_test(tmp_path, "day", "1570_120", thermal="1570_12")
     files.write_test(tmp_path, "day", "1570_12")
     with pytest.raises(InputError, match=r"would both have .*1570_12_ir.png as their thermal"):
@@ -285,9 +287,7 @@ def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
 
 
 @pytest.mark.parametrize("hw", [(39, 78), (15, 30), (11, 22)])
-def test_labels_of_another_size_are_read_at_the_nearest_pixel(
-    root: Path, hw: tuple[int, int]
-) -> None:
+def test_label_of_other_size_is_resized(root: Path, hw: tuple[int, int]) -> None:
     dataset = reader(root, crop=None, ignored_test=())
     label = files.contents("label", hw)[2]
     write_png(path_of(dataset, "seq_00_day_00_1570_0000", "label"), label)
@@ -309,15 +309,15 @@ def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) ->
     with pytest.raises(InputError) as caught:
         dataset.read("seq_00_day_00_1570_0000")
     assert str(caught.value) == (
-        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another shape and no "
-        "other size; use the label of the whole frame."
+        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another aspect "
+        "ratio; use the label of the whole frame."
     )
 
 
 @pytest.mark.parametrize(
     ("ignored", "gone"), [(("ignore",), [13]), ((), []), (("background", "ignore"), [12, 13])]
 )
-def test_what_is_ignored_is_so_in_testing_alone(
+def test_ignored_test_applies_to_test_only(
     root: Path, ignored: tuple[str, ...], gone: list[int]
 ) -> None:
     dataset = reader(root, ignored_test=ignored, crop=None)
@@ -446,6 +446,6 @@ def test_second_frames_are_of_the_other_layout(root: Path) -> None:
     with pytest.raises(InputError) as caught:
         NextFrames(reader(root))
     assert str(caught.value) == (
-        f"freiburg ({root}) cannot hold second frames: they are read in MFNet's layout alone; "
+        f"freiburg ({root}) has no second frames: they are read in MFNet's layout only; "
         "choose dataset=synth with dataset.ego_forward_m=0.5, and frames=virtual needs none."
     )

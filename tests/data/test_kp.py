@@ -9,7 +9,7 @@ import yaml
 
 from rgbt.checks import InputError
 from rgbt.data.kp import CLASSES, KP, PALETTE
-from rgbt.data.kp_names import SPLITS, is_night
+from rgbt.data.kp_layout import SPLITS, is_night
 from tests.conftest import write_png
 from tests.data.kp_files import (
     HW,
@@ -83,7 +83,7 @@ def test_lists_of_ms_uda(tmp_path: Path) -> None:
     assert (dataset.names("train"), dataset.names("val")) == (TRAIN[:1], (TEST[2],))
 
 
-def test_labels_of_ms_uda_beside_images_of_the_release(root: Path) -> None:
+def test_labels_of_ms_uda_with_images_of_release(root: Path) -> None:
     for name in NAMES:
         time = "val_night" if name[:5] in NIGHTS else "val_day"
         target = root / "labels" / time / f"{name}.png"
@@ -164,7 +164,7 @@ def test_a_list_of_days_alone(root: Path) -> None:
     assert len(data.fingerprint()) == 64
 
 
-def test_a_split_out_of_its_times_of_day(tmp_path: Path) -> None:
+def test_split_is_union_of_day_and_night(tmp_path: Path) -> None:
     root = write_kp(tmp_path)
     write_lists(root, {"test_day": TEST[1::-1], "test_night": TEST[2:], "train_day": TRAIN[:1]}, "")
     dataset = KP(str(root))
@@ -275,7 +275,7 @@ def test_refuses_sizes_that_differ(root: Path) -> None:
         KP(str(root)).read(TRAIN[0])
 
 
-def test_refuses_damaged_files_and_links_out_of_the_root(root: Path, tmp_path: Path) -> None:
+def test_damaged_files_and_outside_links_are_refused(root: Path, tmp_path: Path) -> None:
     for path in KP(str(root)).files(TRAIN[0]):
         content = path.read_bytes()
         path.write_bytes(content[: len(content) // 2])

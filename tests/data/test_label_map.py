@@ -30,9 +30,7 @@ def test_ids_are_mapped_one_by_one() -> None:
         ({"car": (0, 1, -1), "road": (2, 3)}, "but -1 is unknown"),
     ],
 )
-def test_every_id_is_mapped_once_to_a_known_class(
-    groups: dict[str, tuple[int, ...]], said: str
-) -> None:
+def test_every_id_is_mapped_once(groups: dict[str, tuple[int, ...]], said: str) -> None:
     with pytest.raises(InputError, match="label_map.groups") as raised:
         LabelMap(num_source=4, targets=TARGETS, groups=groups)
     assert said in str(raised.value)

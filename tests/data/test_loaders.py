@@ -17,7 +17,7 @@ from rgbt.data import loaders
 from rgbt.data.batches import collate
 from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.reader import Loaded
+from rgbt.data.reader import LoadedBatch
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
 
@@ -219,7 +219,7 @@ def test_raise_names_the_damaged_file(dataset: MFNet, workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_skip_in_training_takes_the_next_of_the_list(
+def test_skip_in_training_reads_next_name(
     dataset: MFNet, workers: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     intact = list(train_batches(dataset, "train", crm(), settings(), 0, range(4)))
@@ -266,9 +266,9 @@ def test_skip_with_nothing_left(dataset: MFNet) -> None:
 
 
 @pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
-def test_words_that_name_no_cache(cache: object) -> None:
+def test_invalid_cache_folder_is_refused(cache: object) -> None:
     """They would be folders where the command was typed."""
-    sentence = rf"^data\.cache: {cache!r} names no folder; expected auto or a folder \(\./NAME .*"
+    sentence = rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(\./NAME .*"
     with pytest.raises(InputError, match=sentence):
         settings(cache=cache)
     for known in (None, "auto", "./none", "/fast/disk"):
@@ -310,7 +310,7 @@ def test_all_of_a_batch_is_pinned(
 
     monkeypatch.setattr(torch.Tensor, "pin_memory", lock)
     batch = next(train_batches(dataset, "train", crm(), settings(augment=augment), 0, range(1)))
-    pinned = Loaded(batch, {"x": "why"}).pin_memory()
+    pinned = LoadedBatch(batch, {"x": "why"}).pin_memory()
     assert pinned.skipped == {"x": "why"}
     assert isinstance(pinned.batch, type(batch))
     values = {each.name: getattr(pinned.batch, each.name) for each in dataclasses.fields(batch)}
@@ -318,7 +318,7 @@ def test_all_of_a_batch_is_pinned(
     assert {"rgb", "thermal", "label", "original_hw"} < tensors
     assert {name for name, value in values.items() if id(value) in locked} == tensors
     assert_equal(batch.to("cpu"), pinned.batch.to("cpu"))
-    empty = Loaded(error="why")
+    empty = LoadedBatch(error="why")
     assert empty.pin_memory() is empty
 
 
@@ -356,9 +356,7 @@ def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
         batch(None, 0.75)
 
 
-def test_full_shared_memory_is_reported_and_does_not_hang(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_shared_memory_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("unable to allocate shared memory(shm): No space left on device (28)")
 
@@ -368,7 +366,7 @@ def test_full_shared_memory_is_reported_and_does_not_hang(
         next(batches)
 
 
-def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
+def test_full_shared_memory_before_start_is_reported(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse() -> None:
@@ -380,9 +378,7 @@ def test_shared_memory_that_is_full_before_the_workers_start_is_reported(
     assert told.value.__suppress_context__, "told once, not as a full disk as well"
 
 
-def test_a_killed_worker_is_reported_in_one_sentence(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     main = os.getpid()
 
     def die(_: str) -> Sample:

@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.mfnet import CLASSES, PALETTE, SPLITS, MFNet, base_name
+from rgbt.data.mfnet import CLASSES, PALETTE, MFNet
+from rgbt.data.mfnet_layout import SPLITS, base_name
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
@@ -77,7 +78,7 @@ def test_day_and_night(write_mfnet) -> None:
     names = ["00001D", "00001N", "00001D_flip", "00001N_flip"]
     assert [dataset.is_night(name) for name in names] == [False, True, False, True]
     assert base_name("00001N_flip") == "00001N"
-    with pytest.raises(InputError, match="'frame7' does not say whether it is day or night"):
+    with pytest.raises(InputError, match="'frame7' has no time of day"):
         dataset.is_night("frame7")
 
 
@@ -178,7 +179,7 @@ def test_refuses_sizes_that_differ(write_mfnet, png) -> None:
         MFNet(str(root)).read("00001D")
 
 
-def test_refuses_labels_out_of_range_but_not_ignore(write_mfnet, png) -> None:
+def test_labels_out_of_range_are_refused(write_mfnet, png) -> None:
     root = write_mfnet({"train": ["00001D"]})
     label = np.zeros((24, 32), np.uint8)
     label[0, :2] = (8, 255)

@@ -10,7 +10,7 @@ def found(root: Path, **splits: tuple[str, ...]) -> str:
     return hash_of_files(splits, lambda name: [root / f"{name}.rgb", root / f"{name}.label"])
 
 
-def test_hash_is_of_splits_names_and_lengths(tmp_path: Path) -> None:
+def test_hash_covers_splits_names_and_lengths(tmp_path: Path) -> None:
     (tmp_path / "a.rgb").write_bytes(b"123")
     (tmp_path / "a.label").write_bytes(b"")
     (tmp_path / "b.rgb").write_bytes(b"12345")

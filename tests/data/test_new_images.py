@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.data.cache.dataset import Decoded
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.freiburg_images import FreiburgImages
 from rgbt.data.images import PairPattern
 from rgbt.data.kp import KP
@@ -121,7 +121,7 @@ FREIBURG = FreiburgImages(None, (21800, 23700))
         ),
     ],
 )
-def test_pairs_by_the_patterns_of_every_data_set(
+def test_find_pairs_uses_patterns_of_data_set(
     tmp_path: Path,
     patterns: tuple[PairPattern, ...],
     files: tuple[str, ...],
@@ -136,7 +136,7 @@ def test_pairs_by_the_patterns_of_every_data_set(
     assert (found.alone, found.others) == ({}, ())
 
 
-def test_partners_labels_and_others_are_no_rgb_images(tmp_path: Path) -> None:
+def test_thermal_images_and_labels_are_not_rgb(tmp_path: Path) -> None:
     flat = (PairPattern("{name}.png", "{name}_ir.png", "{name}_mask.png"),)
     write_png(tmp_path / "7_mask.png", GREY)
     write(tmp_path, *(f"{name}.png" for name in ("10", "9", "7", "9_ir", "10_ir", "7_ir")))
@@ -146,7 +146,7 @@ def test_partners_labels_and_others_are_no_rgb_images(tmp_path: Path) -> None:
     assert found.others == (tmp_path / "notes/x.png", tmp_path / "view.jpg")
 
 
-def test_what_is_no_pair_is_said_with_what_is_there(tmp_path: Path) -> None:
+def test_no_pair_is_refused_with_folder_content(tmp_path: Path) -> None:
     def why(*files: str) -> str:
         root = write(tmp_path / str(len(list(tmp_path.iterdir()))), *files)
         return refused(lambda: find_pairs(root, MINE, "harbour"))
@@ -165,7 +165,7 @@ def test_what_is_no_pair_is_said_with_what_is_there(tmp_path: Path) -> None:
     assert "may both be the thermal image of one pair" in said
 
 
-def test_new_images_are_read_as_those_of_the_training(tmp_path: Path) -> None:
+def test_new_images_are_read_like_training_images(tmp_path: Path) -> None:
     dataset = own.folder(own.write_folder(tmp_path / "known"))
     new = tmp_path / "new"
     own.write_frame(new, "sea", "1")
@@ -185,7 +185,7 @@ def test_new_images_are_read_as_those_of_the_training(tmp_path: Path) -> None:
     assert alone.name == "1"
 
 
-def test_counts_of_freiburg_are_cut_and_scaled(tmp_path: Path) -> None:
+def test_new_freiburg_images_are_cropped_and_scaled(tmp_path: Path) -> None:
     write(tmp_path, "fl_rgb/fl_rgb_1.png", "fl_ir_aligned/fl_ir_aligned_1.png")
     images = FreiburgImages((1, 5, 2, 8), (21800, 23700))
     ((_, rgb, thermal),) = find_pairs(tmp_path, images.layouts, "freiburg").pairs
@@ -196,7 +196,7 @@ def test_counts_of_freiburg_are_cut_and_scaled(tmp_path: Path) -> None:
     assert np.array_equal(sample.thermal, np.minimum((2 * 255 * index + 19) // 38, 255))
 
 
-def test_bad_new_images_stop_or_are_left_out(tmp_path: Path) -> None:
+def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
     dataset = own.folder(own.write_folder(tmp_path / "known"))
     new = write(tmp_path / "new", *(f"rgb/{n}.png" for n in "123"))
     write(new, "ir/1_ir.tif", "ir/2_ir.tif")
@@ -216,11 +216,11 @@ def test_bad_new_images_stop_or_are_left_out(tmp_path: Path) -> None:
     )
 
 
-def test_a_split_is_predicted_without_its_labels(write_mfnet: WriteMFNet, tmp_path: Path) -> None:
+def test_split_is_predicted_without_labels(write_mfnet: WriteMFNet, tmp_path: Path) -> None:
     root = write_mfnet({"new": ["00001D"]})
     (root / "labels" / "00001D.png").unlink()
     dataset = MFNet(str(root), splits={"new": "new.txt"})
-    for each in (dataset, Decoded(dataset, tmp_path / "cache", num_threads=1)):
+    for each in (dataset, CachedDataset(dataset, tmp_path / "cache", num_threads=1)):
         (sample,) = of_split(each, "new").samples("raise")
         assert sample.label is None
 

@@ -13,7 +13,7 @@ from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.writer import Plan, write
+from rgbt.data.synth.writer import SynthPlan, write
 from tests.conftest import write_data
 
 HW = (6, 8)
@@ -52,7 +52,7 @@ def save(root: Path, name: str, flow: np.ndarray) -> None:
     np.save(root / "next" / "flow" / f"{name}.npy", flow)
 
 
-def test_the_second_frames_are_read_like_the_first(root: Path) -> None:
+def test_second_frames_are_read_like_first(root: Path) -> None:
     first = reader(root)
     after = NextFrames(first)
     assert after.dataset.root == root / "next"
@@ -61,7 +61,7 @@ def test_the_second_frames_are_read_like_the_first(root: Path) -> None:
     assert after.dataset.read(NAMES[0]).label.shape == HW
 
 
-def test_no_motion_leads_to_the_same_pixel(root: Path) -> None:
+def test_flow_without_motion_is_identity(root: Path) -> None:
     rows, columns = NextFrames(reader(root)).source(NAMES[0], HW)
     assert rows.dtype == columns.dtype == np.int64
     expected = np.mgrid[:6, :8]
@@ -69,7 +69,7 @@ def test_no_motion_leads_to_the_same_pixel(root: Path) -> None:
     assert np.array_equal(columns, expected[1])
 
 
-def test_flow_is_rows_then_columns_to_the_nearest_pixel(root: Path) -> None:
+def test_flow_is_rows_columns_to_nearest_pixel(root: Path) -> None:
     flow = still()
     flow[2, 3] = (1.4, -2.6)  # (3.4, 0.4): row 3, column 0
     flow[5, 7] = (0.4, 0.4)
@@ -84,9 +84,9 @@ def test_flow_is_rows_then_columns_to_the_nearest_pixel(root: Path) -> None:
     assert (rows == -1).sum() == 3
 
 
-def test_flow_of_the_embedded_data_set_leads_to_the_same_class(tmp_path: Path) -> None:
+def test_flow_of_synth_leads_to_same_class(tmp_path: Path) -> None:
     factors = replace(SceneFactors(), height=48, width=64)
-    plan = Plan(
+    plan = SynthPlan(
         seed=0, num_train=1, num_val=1, num_test=3, factors=factors, motion=EgoMotion(0.5, 2.0)
     )
     write(plan, tmp_path / "synth")
@@ -106,7 +106,7 @@ def test_flow_of_the_embedded_data_set_leads_to_the_same_class(tmp_path: Path) -
 # ---- what is refused ------------------------------------------------------------------------
 
 
-def test_a_data_set_of_single_frames_is_refused(tmp_path: Path) -> None:
+def test_data_set_of_single_frames_is_refused(tmp_path: Path) -> None:
     write_data(tmp_path / "mf", {"test": list(NAMES)}, HW)
     with pytest.raises(InputError, match="mf .* has no second frames: expected the folder next/"):
         NextFrames(reader(tmp_path / "mf"))
@@ -183,7 +183,7 @@ def words(root: Path) -> str:
         *(pickled, archive, broken_archive, words),
     ],
 )
-def test_flow_that_cannot_be_followed_is_named(root: Path, spoil: Callable[[Path], str]) -> None:
+def test_invalid_flow_is_refused(root: Path, spoil: Callable[[Path], str]) -> None:
     sentence = spoil(root)
     after = NextFrames(reader(root))
     with pytest.raises(InputError, match=sentence) as raised:

@@ -72,7 +72,7 @@ def test_each_stream_is_what_it_is_alone(dataset: MFNet) -> None:
     assert both[0].name == both[0].source.name + both[0].target.name
 
 
-def test_lists_of_different_lengths_are_each_shuffled_anew(dataset: MFNet) -> None:
+def test_lists_of_two_lengths_are_shuffled_separately(dataset: MFNet) -> None:
     """Three whole batches of seven by day, two of four at night."""
     both = list(pairs(dataset, range(12)))
     for start in range(0, 12, 3):
@@ -117,7 +117,7 @@ def test_moved_both_are_moved(dataset: MFNet) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_unreadable_file_of_either_domain_stops_both(dataset: MFNet, workers: int) -> None:
+def test_unreadable_file_stops_both_domains(dataset: MFNet, workers: int) -> None:
     dataset.image_paths(NIGHT[0])[0].write_bytes(b"damaged")
     found = pairs(dataset, range(4), num_workers=workers)
     with pytest.raises(InputError, match=f"{NIGHT[0]}.png cannot be decoded"):

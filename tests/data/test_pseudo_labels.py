@@ -59,8 +59,8 @@ def test_labels_and_confidences_are_read(folder: Path) -> None:
     assert confidence == pytest.approx(np.array(expected), abs=1e-7)
 
 
-def test_folders_that_cannot_be_used_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not there"):
+def test_invalid_folders_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
         PseudoLabels(tmp_path / "nowhere")
     say(folder, format="rgbt pseudo-labels 9")
     with pytest.raises(InputError, match=r"expected the format .* got 'rgbt pseudo-labels 9'"):
@@ -69,7 +69,7 @@ def test_folders_that_cannot_be_used_are_refused(folder: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="is damaged"):
         PseudoLabels(folder)
     (folder / "pseudo_labels.json").unlink()
-    with pytest.raises(InputError, match="is not finished"):
+    with pytest.raises(InputError, match="is not complete"):
         PseudoLabels(folder)
 
 
@@ -81,7 +81,7 @@ def test_folders_that_cannot_be_used_are_refused(folder: Path, tmp_path: Path) -
         (None, "got none that can be read"),
     ],
 )
-def test_confidences_that_do_not_fit_are_refused(
+def test_invalid_confidences_are_refused(
     folder: Path, confidence: np.ndarray | None, found: str
 ) -> None:
     path = folder / "confidence" / f"{NAMES[0]}.png"
@@ -94,7 +94,7 @@ def test_confidences_that_do_not_fit_are_refused(
     assert found in str(raised.value)
 
 
-def test_they_stand_in_for_the_labels_of_a_data_set(dataset: MFNet, folder: Path) -> None:
+def test_pseudo_labels_replace_labels(dataset: MFNet, folder: Path) -> None:
     own = dataset.read(NAMES[0])
     sample = PseudoLabelled(dataset, folder, with_confidence=True).read(NAMES[0])
     assert np.array_equal(sample.rgb, own.rgb)
@@ -106,7 +106,7 @@ def test_they_stand_in_for_the_labels_of_a_data_set(dataset: MFNet, folder: Path
     assert PseudoLabelled(dataset, folder, with_confidence=False).read(NAMES[0]).confidence is None
 
 
-def test_the_rest_is_the_data_set_s(dataset: MFNet, folder: Path) -> None:
+def test_other_members_are_those_of_source(dataset: MFNet, folder: Path) -> None:
     for wrapped in (PseudoLabelled(dataset, folder, with_confidence=True), Unlabelled(dataset)):
         assert wrapped.name == "mfnet"
         assert wrapped.names("train") == tuple(NAMES)
@@ -126,7 +126,7 @@ def test_unlabelled_samples_have_no_label(dataset: MFNet) -> None:
     assert np.array_equal(sample.rgb, dataset.read(NAMES[1]).rgb)
 
 
-def test_labels_that_do_not_fit_the_data_set_are_refused(dataset: MFNet, folder: Path) -> None:
+def test_labels_of_other_size_are_refused(dataset: MFNet, folder: Path) -> None:
     labelled = PseudoLabelled(dataset, folder, with_confidence=False)
     with pytest.raises(InputError, match="'00002N' has no pseudo-label in"):
         labelled.read(NAMES[1])

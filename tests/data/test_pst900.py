@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.pst900 import CLASSES, PALETTE, PST900, bag_of
+from rgbt.data.pst900 import CLASSES, PALETTE, PST900
+from rgbt.data.pst900_layout import bag_of
 from tests.conftest import write_png
 from tests.data.pst900_files import (
     HW,
@@ -74,11 +75,13 @@ def test_bags_that_cannot_be_taken(root: Path) -> None:
         with pytest.raises(InputError, match=rf"val_bags: .* has no bag {bags[-1]}; .* are 1, 12"):
             PST900(str(root), val_bags=bags).names("val")
     for bag in ("1", 1.0, None):  # text matches no number, and would take nothing out
-        with pytest.raises(InputError, match=rf"^dataset\.val_bags: {bag!r} is no whole number; "):
+        with pytest.raises(
+            InputError, match=rf"^dataset\.val_bags: {bag!r} is not a whole number; "
+        ):
             PST900(str(root), val_bags=(12, bag))  # type: ignore[arg-type]
     dataset = PST900(str(root), val_bags=(1, 12))
     assert not dataset.has("train")
-    with pytest.raises(InputError, match="'train' of pst900 is empty: .* leave one out of it"):
+    with pytest.raises(InputError, match="'train' of pst900 is empty: .* remove one of them"):
         dataset.names("train")
     assert len(dataset.names("val")) == 3
 
@@ -215,7 +218,7 @@ def test_refuses_sizes_that_differ(root: Path) -> None:
         PST900(str(root)).read(name)
 
 
-def test_refuses_labels_out_of_range_but_not_ignore(root: Path) -> None:
+def test_labels_out_of_range_are_refused(root: Path) -> None:
     path = root / "train/labels" / f"{TRAIN[0]}.png"
     label = np.zeros(HW, np.uint8)
     label[0, :2] = (4, 255)

@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.data.synth import cache, dataset, scene, sheet, writer
-from rgbt.data.synth.camera import Camera, camera_of, flow_between, ground_homography
+from rgbt.data.synth.camera import SynthCamera, camera_of, flow_between, ground_homography
 from rgbt.data.synth.dataset import cached, plan_key, synth
 from rgbt.data.synth.facets import sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
@@ -21,16 +21,16 @@ from rgbt.data.synth.rgb import develop, squared_radius
 from rgbt.data.synth.road import draw_road
 from rgbt.data.synth.scene import Scene, render_pair, render_scene
 from rgbt.data.synth.shapes import CAR, PERSON, box, shape_of
-from rgbt.data.synth.writer import Plan, write
+from rgbt.data.synth.writer import SynthPlan, write
 from rgbt.randomness import numpy_generator
 
 FACTORS = SceneFactors()
 DAY, NIGHT = replace(FACTORS, night_share=0.0), replace(FACTORS, night_share=1.0)
 
 
-def plan(**changes: object) -> Plan:
+def plan(**changes: object) -> SynthPlan:
     small = replace(FACTORS, height=48, width=64)
-    return replace(Plan(seed=3, num_train=4, num_val=2, num_test=4, factors=small), **changes)
+    return replace(SynthPlan(seed=3, num_train=4, num_val=2, num_test=4, factors=small), **changes)
 
 
 def images(scene: Scene) -> tuple[bytes, bytes, bytes]:
@@ -51,7 +51,7 @@ def test_shapes_and_ranges(hw: tuple[int, int]) -> None:
     assert np.isinf(scene.depth[:5]).any()
 
 
-def test_same_arguments_give_the_same_bytes_and_others_do_not() -> None:
+def test_same_arguments_give_same_bytes() -> None:
     first = images(render_scene(0, 7, FACTORS))
     render_scene(1, 2, FACTORS)
     assert images(render_scene(0, 7, FACTORS)) == first
@@ -59,7 +59,7 @@ def test_same_arguments_give_the_same_bytes_and_others_do_not() -> None:
     assert images(render_scene(1, 7, FACTORS))[2] != first[2]
 
 
-def test_every_class_is_frequent_and_large_enough_to_learn() -> None:
+def test_every_class_is_frequent_and_large() -> None:
     pixels, shown, large = np.zeros(9), np.zeros(9), np.zeros(9)
     for index in range(100):
         counts = np.bincount(render_scene(0, index, FACTORS).label.ravel(), minlength=9)
@@ -85,7 +85,7 @@ def test_every_class_is_frequent_and_large_enough_to_learn() -> None:
         ({"night_share": 1.0}, ("label", "depth")),
     ],
 )
-def test_a_factor_changes_its_own_image_and_nothing_else(change: dict, kept: tuple) -> None:
+def test_factor_changes_its_own_image_only(change: dict, kept: tuple) -> None:
     before, after = render_scene(0, 4, DAY), render_scene(0, 4, replace(DAY, **change))
     for name in ("rgb", "thermal", "label", "depth"):
         same = np.array_equal(getattr(before, name), getattr(after, name))
@@ -95,7 +95,7 @@ def test_a_factor_changes_its_own_image_and_nothing_else(change: dict, kept: tup
             assert not same, name
 
 
-def test_more_objects_keep_the_others_where_they_were() -> None:
+def test_more_objects_do_not_move_others() -> None:
     road = draw_road(0, 9)
     few = place_objects(0, 9, road, replace(FACTORS, num_objects=3, num_far_objects=0))
     more = place_objects(0, 9, road, replace(FACTORS, num_objects=8, num_far_objects=0))
@@ -142,7 +142,7 @@ def test_noise_grows_with_the_squared_radius() -> None:
         assert np.std((noise - vignette[..., None])[ring]) == pytest.approx(expected, rel=0.03)
 
 
-def test_squared_radius_is_zero_in_the_middle_and_one_at_the_corners() -> None:
+def test_squared_radius_is_normalised() -> None:
     radius = squared_radius(3, 5)
     assert radius[1, 2] == 0
     assert radius[[0, 0, 2, 2], [0, 4, 0, 4]] == pytest.approx(1)
@@ -162,7 +162,7 @@ def test_far_objects_are_small_and_central() -> None:
     assert np.mean(np.concatenate(offsets)) < 25
 
 
-def test_persons_are_warmer_than_the_street_at_night_and_thermal_is_no_copy_of_the_label() -> None:
+def test_persons_are_warmer_than_street_at_night() -> None:
     gaps, spread = [], []
     for index in range(60):
         scene = render_scene(0, index, NIGHT)
@@ -184,9 +184,9 @@ def test_thermal_contrast_zero_is_flat() -> None:
 # ---- geometry -------------------------------------------------------------------------------
 
 
-def test_label_and_depth_of_one_box_follow_from_the_camera() -> None:
+def test_label_and_depth_of_box_follow_camera() -> None:
     # A 2 m wide, 1 m high box whose front is 10 m ahead; focal length 100, horizon in the middle.
-    camera = Camera(101, 201, focal=100.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+    camera = SynthCamera(101, 201, focal=100.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     shape = shape_of(box((-1.0, 0.0, 10.0), (1.0, 1.0, 12.0), "paint", CAR))
     ground = scene.ground_quads(draw_road(0, 0))
     placed = [scene.Placed(shape, 0.0, 0.0)]
@@ -222,8 +222,8 @@ def test_pitch_moves_the_horizon(pitch: float) -> None:
     assert np.isinf(depth[: int(horizon) - 3]).any()
 
 
-def test_a_camera_that_stays_has_no_flow_and_one_that_turns_shifts_the_sky() -> None:
-    camera = Camera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+def test_flow_of_still_and_of_turning_camera() -> None:
+    camera = SynthCamera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     depth = np.full((11, 21), np.inf, np.float32)
     assert np.abs(flow_between(depth, camera, camera)).max() < 1e-5
     turned = camera.moved(EgoMotion(0.0, 2.0))
@@ -233,7 +233,7 @@ def test_a_camera_that_stays_has_no_flow_and_one_that_turns_shifts_the_sky() -> 
 
 
 def test_flow_of_a_forward_motion_by_hand() -> None:
-    camera = Camera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
+    camera = SynthCamera(11, 21, focal=20.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     flow = flow_between(np.full((11, 21), 8.0, np.float32), camera, camera.moved(EgoMotion(2.0)))
     # From depth 8 to 6 every offset from the centre grows by 8 / 6: (5, 10) becomes (6.67, 13.3).
     assert flow[10, 20] == pytest.approx([5 / 3, 10 / 3], abs=1e-4)
@@ -246,7 +246,7 @@ def test_flow_needs_equal_cameras() -> None:
         flow_between(np.ones((120, 160), np.float32), camera, replace(camera, focal=1.0))
 
 
-def test_ground_homography_agrees_with_the_flow_on_the_ground() -> None:
+def test_ground_homography_agrees_with_flow() -> None:
     motion = EgoMotion(0.9, 2.0)
     pair = render_pair(0, 6, replace(FACTORS, num_objects=0, num_far_objects=0), motion)
     homography = ground_homography(pair.second.camera, pair.first.camera)
@@ -279,7 +279,7 @@ def test_flow_carries_labels_from_frame_to_frame(motion: EgoMotion) -> None:
     assert np.mean(visible) > 0.75
 
 
-def test_the_first_frame_of_a_pair_is_the_scene_itself() -> None:
+def test_first_frame_of_pair_equals_scene() -> None:
     pair = render_pair(0, 11, FACTORS, EgoMotion(0.0))
     assert images(pair.first) == images(render_scene(0, 11, FACTORS))
     assert np.array_equal(pair.second.label, pair.first.label)
@@ -334,7 +334,7 @@ def test_a_pool_writes_the_same_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all((alone / f).read_bytes() == (pooled / f).read_bytes() for f in files)
 
 
-def test_second_frames_are_a_data_set_of_their_own(tmp_path: Path) -> None:
+def test_second_frames_form_data_set(tmp_path: Path) -> None:
     moving = plan(motion=EgoMotion(0.5, 1.0))
     write(moving, tmp_path)
     name = moving.name(8)
@@ -347,7 +347,7 @@ def test_second_frames_are_a_data_set_of_their_own(tmp_path: Path) -> None:
     assert (tmp_path / "next/test.txt").read_text() == (tmp_path / "test.txt").read_text()
 
 
-def test_the_cache_is_used_again_and_named_by_the_plan(
+def test_folder_is_reused_and_named_by_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = cached(plan(), tmp_path)
@@ -365,7 +365,7 @@ def test_an_interrupted_generation_leaves_nothing(
 ) -> None:
     real = writer.write_index
 
-    def interrupted(made: Plan, folder: Path, index: int) -> None:
+    def interrupted(made: SynthPlan, folder: Path, index: int) -> None:
         if index == 3:
             raise KeyboardInterrupt
         real(made, folder, index)
@@ -378,10 +378,8 @@ def test_an_interrupted_generation_leaves_nothing(
     assert (cached(plan(), tmp_path) / "test.txt").is_file()
 
 
-def test_of_two_generations_at_once_the_first_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def overtaken(made: Plan, folder: Path) -> None:
+def test_first_of_two_generations_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def overtaken(made: SynthPlan, folder: Path) -> None:
         write(made, folder)
         other = tmp_path / f"synth-{plan_key(made)}"
         other.mkdir()
@@ -424,13 +422,13 @@ def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_cache_that_is_a_file_is_named(tmp_path: Path) -> None:
+def test_cache_dir_that_is_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="dataset.cache_dir"):
         synth(cache_dir=str(tmp_path / "file"))
 
 
-def test_the_yaml_names_every_setting_with_its_default() -> None:
+def test_yaml_has_every_setting_with_default() -> None:
     import inspect
 
     from rgbt.config.compose import compose

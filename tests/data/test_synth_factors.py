@@ -16,7 +16,7 @@ def made(*, seed: int = 3, factors: SceneFactors) -> tuple[int, SceneFactors]:
     return seed, factors
 
 
-def test_factors_stand_in_the_signature_with_their_types_and_defaults() -> None:
+def test_signature_has_factors_with_types_and_defaults() -> None:
     parameters = inspect.signature(made).parameters
     names = {factor.name for factor in fields(SceneFactors)} - {"night_share"}
     assert set(parameters) == {"seed"} | names
@@ -26,7 +26,7 @@ def test_factors_stand_in_the_signature_with_their_types_and_defaults() -> None:
     assert set(hints) == set(parameters) | {"return"}
 
 
-def test_keywords_become_the_factors_and_the_rest_keep_their_defaults() -> None:
+def test_keywords_set_factors() -> None:
     assert made() == (3, SceneFactors(height=96))
     assert made(seed=4, width=80) == (4, SceneFactors(height=96, width=80))
     with pytest.raises(TypeError, match="night_share"):

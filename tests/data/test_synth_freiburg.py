@@ -84,7 +84,7 @@ def test_files_hold_the_scenes(data: Freiburg) -> None:
             assert np.array_equal(sample.label, label)
 
 
-def test_what_is_odd_about_the_archives_is_there(data: Freiburg) -> None:
+def test_archive_peculiarities_are_reproduced(data: Freiburg) -> None:
     frames = data.frames
     labels = {frame.part: frame.label for frame in frames if frame.label is not None}
     sizes = {
@@ -134,7 +134,7 @@ def test_equal_plans_give_equal_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all((alone / path).read_bytes() == (pooled / path).read_bytes() for path in found)
 
 
-def test_the_cache_is_used_again_and_named_by_the_plan(
+def test_folder_is_reused_and_named_by_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = plan(num_train_day=1, num_train_night=1, num_val=1, num_test=2)
@@ -152,7 +152,7 @@ def test_the_cache_is_used_again_and_named_by_the_plan(
 # ---- scenes ---------------------------------------------------------------------------------
 
 
-def test_every_class_is_seen_by_day_and_at_night(many: Freiburg) -> None:
+def test_every_class_occurs_by_day_and_night(many: Freiburg) -> None:
     for split in ("train_day", "test_day", "test_night"):
         labels = np.stack([many.read(name).label for name in many.names(split)])
         shares = np.bincount(labels.ravel(), minlength=256) / labels.size
@@ -161,7 +161,7 @@ def test_every_class_is_seen_by_day_and_at_night(many: Freiburg) -> None:
         assert shares[8] > 0.05
 
 
-def test_nights_are_much_darker_and_hardly_colder(many: Freiburg) -> None:
+def test_nights_are_darker_but_hardly_colder(many: Freiburg) -> None:
     day, night = (
         [many.read(name) for name in many.names(split)] for split in ("train_day", "train_night")
     )
@@ -214,7 +214,7 @@ def test_counts_by_hand() -> None:
     assert counts_of(grey).tolist() == [[21800, 23700, 22750, 20850, 23890]]
 
 
-def test_margins_are_slanted_and_reach_into_the_crop_a_little() -> None:
+def test_margins_reach_into_crop() -> None:
     seen = seen_in_thermal(98, 288)
     assert seen.sum(1).min() > 180
     assert len(set(seen.argmax(1))) > 3
@@ -225,7 +225,7 @@ def test_margins_are_slanted_and_reach_into_the_crop_a_little() -> None:
 # ---- settings -------------------------------------------------------------------------------
 
 
-def test_settings_of_the_reader_are_passed_on(data: Freiburg) -> None:
+def test_reader_gets_its_settings(data: Freiburg) -> None:
     cache = str(data.root.parent)
     whole = synth_freiburg(cache_dir=cache, **SMALL, crop=None, ignored_test=())
     assert whole.root == data.root
@@ -238,7 +238,7 @@ def test_settings_of_the_reader_are_passed_on(data: Freiburg) -> None:
         small.read(small.names("train")[0])
 
 
-def test_the_yaml_names_every_setting_with_its_default() -> None:
+def test_yaml_has_every_setting_with_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_freiburg"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.freiburg.synth_freiburg"
@@ -249,14 +249,14 @@ def test_the_yaml_names_every_setting_with_its_default() -> None:
     }
 
 
-def test_it_is_chosen_on_the_command_line(tmp_path: Path) -> None:
+def test_data_set_is_chosen_on_command_line(tmp_path: Path) -> None:
     words = [f"dataset.{key}={value}" for key, value in SMALL.items()]
     config = compose(["dataset=synth_freiburg", f"dataset.cache_dir={tmp_path}", *words])
     Component.from_node(config.dataset, "dataset")
     assert build(config.dataset).name == "synth_freiburg"
 
 
-def test_a_data_set_may_be_as_small_as_one_frame_a_split(tmp_path: Path) -> None:
+def test_one_frame_per_split_is_enough(tmp_path: Path) -> None:
     numbers = {"num_train_day": 1, "num_train_night": 1, "num_val": 1, "num_test": 2}
     one = synth_freiburg(cache_dir=str(tmp_path), **numbers)
     sizes = {split: len(one.names(split)) for split in one.splits}

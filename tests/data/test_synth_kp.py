@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.data.kp import CLASSES, KP, set_of
+from rgbt.data.kp import CLASSES, KP
+from rgbt.data.kp_layout import set_of
 from rgbt.data.synth import kp, people
 from rgbt.data.synth.classes import ids_in
 from rgbt.data.synth.factors import SceneFactors
@@ -22,7 +23,7 @@ from rgbt.data.synth.kp_writer import names_of, write
 from rgbt.data.synth.materials import INDEX
 from rgbt.data.synth.scene import Scene, render_scene
 from rgbt.data.synth.shapes import BIKE, BUMP, CAR, CAR_STOP, CURVE, GUARDRAIL, PERSON
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 
 SMALL = {"num_train": 9, "num_val": 4, "num_test": 8, "height": 48, "width": 64}
 FACTORS = SceneFactors(height=48, width=64, night_share=0.48)
@@ -40,8 +41,8 @@ def scenes() -> list[Scene]:
     return [render_scene(0, index, SceneFactors()) for index in range(12)]
 
 
-def plan(**changes: object) -> Plan:
-    made = Plan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
+def plan(**changes: object) -> SynthPlan:
+    made = SynthPlan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
     return replace(made, **changes)
 
 
@@ -80,7 +81,7 @@ def test_files_hold_the_scenes(data: KP) -> None:
     assert max(tints) > 3, "red and blue are told apart"
 
 
-def test_the_files_are_of_the_kind_that_kp_has(data: KP) -> None:
+def test_files_have_format_of_kp(data: KP) -> None:
     rgb, lwir, label = data.files(data.names("test")[0])
     assert [path.suffix for path in (rgb, lwir, label)] == [".jpg", ".jpg", ".png"]
     assert (rgb.parent.name, lwir.parent.name) == ("visible", "lwir")
@@ -93,7 +94,7 @@ def test_the_files_are_of_the_kind_that_kp_has(data: KP) -> None:
     assert (data.root / "val_day.txt").read_text().splitlines()[0].endswith(".png")
 
 
-def test_names_are_of_the_recordings_of_their_split() -> None:
+def test_names_belong_to_recordings_of_split() -> None:
     found = names_of(plan(num_train=60, num_val=20, num_test=40))
     sets = {split: {set_of(name) for name in names} for split, names in found.items()}
     assert sets == {"train": {0, 1, 2, 3, 4, 5}, "val": {6, 10}, "test": {7, 8, 9, 11}}
@@ -113,7 +114,7 @@ def test_equal_plans_give_equal_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all((alone / path).read_bytes() == (pooled / path).read_bytes() for path in found)
 
 
-def test_the_cache_is_used_again_and_named_by_the_plan(
+def test_folder_is_reused_and_named_by_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = plan(num_train=1, num_val=1, num_test=1)
@@ -128,7 +129,7 @@ def test_the_cache_is_used_again_and_named_by_the_plan(
             assert cached(small, tmp_path) != folder
 
 
-def test_without_nights_there_are_no_lists_of_them(tmp_path: Path) -> None:
+def test_no_night_lists_without_nights(tmp_path: Path) -> None:
     small = {"num_train": 1, "num_val": 1, "num_test": 1, "height": 32, "width": 40}
     days = synth_kp(cache_dir=str(tmp_path), **small, night_share=0.0)
     assert [days.has(f"test{time}") for time in ("", "_day")] == [True, True]
@@ -167,7 +168,7 @@ def test_every_label_and_material_has_one_class() -> None:
     assert {*CLASSES, VOID} - given == ABSENT
 
 
-def test_who_rides_a_bicycle_is_no_person(scenes: list[Scene]) -> None:
+def test_rider_is_not_person(scenes: list[Scene]) -> None:
     persons = riders = 0
     for scene in scenes:
         ids = class_ids(scene)
@@ -184,7 +185,7 @@ def test_who_rides_a_bicycle_is_no_person(scenes: list[Scene]) -> None:
     assert riders > 3
 
 
-def test_owners_are_the_objects_and_nobody_owns_ground_and_sky(scenes: list[Scene]) -> None:
+def test_owner_is_object_except_ground_and_sky(scenes: list[Scene]) -> None:
     for scene in scenes[:3]:
         nobody = np.isinf(scene.depth) | np.isin(
             scene.material, [INDEX[name] for name in ("grass", "asphalt", "paving", "line")]
@@ -194,7 +195,7 @@ def test_owners_are_the_objects_and_nobody_owns_ground_and_sky(scenes: list[Scen
         assert scene.owner.max() < len(scene.placed)
 
 
-def test_every_class_that_there_is_is_often_seen(scenes: list[Scene]) -> None:
+def test_every_present_class_is_frequent(scenes: list[Scene]) -> None:
     shown = np.zeros(20)
     for scene in scenes:
         shown += np.bincount(class_ids(scene).ravel(), minlength=20) > 0
@@ -206,7 +207,7 @@ def test_every_class_that_there_is_is_often_seen(scenes: list[Scene]) -> None:
 # ---- settings -------------------------------------------------------------------------------
 
 
-def test_the_yaml_names_every_setting_with_its_default() -> None:
+def test_yaml_has_every_setting_with_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_kp"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.kp.synth_kp"

@@ -12,14 +12,15 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.data.pst900 import CLASSES, PST900, bag_of
+from rgbt.data.pst900 import CLASSES, PST900
+from rgbt.data.pst900_layout import bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.pst900 import cached, synth_pst900
 from rgbt.data.synth.pst900_writer import CLASS_OF, shots_of, write
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.shapes import BUMP, CAR, CAR_STOP, COLOR_CONE, PERSON
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 
 SMALL = {"num_train": 6, "num_val": 2, "num_test": 5, "height": 36, "width": 64}
 FACTORS = SceneFactors(height=36, width=64, field_of_view_deg=80.0)
@@ -31,8 +32,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> PST900:
     return synth_pst900(cache_dir=str(tmp_path_factory.mktemp("cache")), **SMALL)
 
 
-def plan(**changes: object) -> Plan:
-    made = Plan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
+def plan(**changes: object) -> SynthPlan:
+    made = SynthPlan(seed=3, num_train=4, num_val=2, num_test=5, factors=FACTORS)
     return replace(made, **changes)
 
 
@@ -58,7 +59,7 @@ def test_files_hold_the_scenes(data: PST900) -> None:
         assert np.array_equal(sample.label, CLASS_OF[scene.label])
 
 
-def test_the_files_are_of_the_kind_that_pst900_has(data: PST900) -> None:
+def test_files_have_format_of_pst900(data: PST900) -> None:
     assert sorted(str(path.relative_to(data.root)) for path in data.root.glob("*/*")) == [
         f"{part}/{kind}" for part in ("test", "train") for kind in ("labels", "rgb", "thermal")
     ]
@@ -93,7 +94,7 @@ def test_classes_by_hand() -> None:
     assert len(CLASS_OF) == 9
 
 
-def test_the_four_objects_are_rare_and_there() -> None:
+def test_four_objects_are_present_and_rare() -> None:
     factors = SceneFactors(width=214, field_of_view_deg=80.0)
     counts = [
         np.bincount(CLASS_OF[render_scene(0, index, factors).label].ravel(), minlength=5)
@@ -118,7 +119,7 @@ def test_equal_plans_give_equal_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all((alone / path).read_bytes() == (pooled / path).read_bytes() for path in found)
 
 
-def test_the_cache_is_used_again_and_named_by_the_plan(
+def test_folder_is_reused_and_named_by_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = plan(num_train=1, num_val=1, num_test=1)
@@ -133,13 +134,13 @@ def test_the_cache_is_used_again_and_named_by_the_plan(
             assert cached(small, tmp_path) != folder
 
 
-def test_a_bag_that_is_not_there_is_named(data: PST900) -> None:
+def test_missing_bag_is_refused(data: PST900) -> None:
     other = synth_pst900(cache_dir=str(data.root.parent), **SMALL, val_bags=(33,))
     with pytest.raises(InputError, match=r"dataset.val_bags: .* has no bag 33"):
         other.names("val")
 
 
-def test_the_yaml_names_every_setting_with_its_default() -> None:
+def test_yaml_has_every_setting_with_default() -> None:
     node = OmegaConf.to_container(compose(["dataset=synth_pst900"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
     assert node.pop("_target_") == "rgbt.data.synth.pst900.synth_pst900"

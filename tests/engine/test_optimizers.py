@@ -86,7 +86,7 @@ def test_heads_learn_ten_times_as_fast_as_the_backbone_that_they_share() -> None
 
 
 def test_two_heads_of_the_network_itself() -> None:
-    model = network("deeplabv2_two_heads_tiny", 14)
+    model = network("deeplabv2_tiny", 14, heads="[source,target]")
     names = {name for name, _ in model.named_parameters()}
     optimizer = BUILDERS[1](model, without=("heads.source.",))
     found = set().union(*names_in(model, optimizer))

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
-from rgbt.data.cache.dataset import Decoded
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES
@@ -304,7 +304,7 @@ def test_images_come_from_the_cache(
 ) -> None:
     """Where data.cache asks for one; labels are the same."""
     expected = written(session, tmp_path / "without")
-    dataset = Decoded(session.dataset, tmp_path / "cache", num_threads=1)
+    dataset = CachedDataset(session.dataset, tmp_path / "cache", num_threads=1)
     found = written(replace(session, dataset=dataset), tmp_path / "with")
     assert found.digest == expected.digest
 
@@ -333,7 +333,7 @@ def test_killed_in_between_it_goes_on(
     monkeypatch.setattr(pseudo, "write_atomic", dies)
     with pytest.raises(KeyboardInterrupt):
         written(session, out)
-    with pytest.raises(InputError, match="is not finished"):
+    with pytest.raises(InputError, match="is not complete"):
         PseudoLabels(out)
     monkeypatch.setattr(pseudo, "write_atomic", real)
 

@@ -67,7 +67,7 @@ def test_it_reads_confidence_where_its_loss_does(make_batch: Any) -> None:
 
 def test_raises(make_batch: Any) -> None:
     batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
-    with pytest.raises(InputError, match="choose model=deeplabv2_auxiliary"):
+    with pytest.raises(InputError, match="choose a DeepLab v2 with model.auxiliary=true"):
         with_auxiliary()(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
 
 

@@ -36,6 +36,7 @@ RELEASED = {
     "align_corners": False,
 }
 LITERAL = {"ceil_mode": False, "decoder": "modified_thesis", "align_corners": False}
+HEADS = "[source,target]"
 R50 = "[3,4,6,3]"
 
 
@@ -60,10 +61,10 @@ def count(net: nn.Module) -> int:
         ("deeplabv2", 14, {}, 43_532_408),
         ("deeplabv2", 14, {"auxiliary": True}, 44_048_560),
         ("deeplabv2", 19, {"auxiliary": True}, 44_601_560),
-        ("deeplabv2_two_heads", 14, {}, 44_564_656),
+        ("deeplabv2", 14, {"heads": HEADS}, 44_564_656),
         ("deeplabv2_two_heads_literal", 14, {}, 44_575_498),
         ("deeplabv2_two_heads_modified", 14, {}, 198_594_658),
-        ("deeplabv2_two_heads", 14, {"depths": R50}, 25_572_528),
+        ("deeplabv2", 14, {"heads": HEADS, "depths": R50}, 25_572_528),
     ],
 )
 def test_parameter_count(
@@ -79,8 +80,8 @@ def test_parameter_count(
         ("deeplabv2", 14, {"depths": R50, "auxiliary": True}, 25.056),
         ("deeplabv2_two_heads_literal", 14, {"depths": R50}, 25.583),
         ("deeplabv2_two_heads_modified", 14, {"depths": R50}, 179.603),
-        ("deeplabv2_two_heads", 12, {}, 44.270),
-        ("deeplabv2_two_heads", 13, {}, 44.417),
+        ("deeplabv2", 12, {"heads": HEADS}, 44.270),
+        ("deeplabv2", 13, {"heads": HEADS}, 44.417),
     ],
 )
 def test_parameter_count_that_is_known_roughly(
@@ -117,8 +118,8 @@ def test_backbone_has_the_names_of_torchvision() -> None:
 @pytest.mark.parametrize(
     ("yaml", "ceil_mode", "size"),
     [
-        ("deeplabv2_two_heads", True, (41, 81)),
-        ("deeplabv2_two_heads", False, (40, 80)),
+        ("deeplabv2", True, (41, 81)),
+        ("deeplabv2", False, (40, 80)),
         ("deeplabv2_two_heads_modified", False, (40, 80)),
     ],
 )

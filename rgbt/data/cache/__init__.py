@@ -1,1 +1,1 @@
-"""Images decoded once and read from a map of memory ever after; a command and a reader."""
+"""The image cache: images are decoded once and then read from memory-mapped files."""

@@ -1,6 +1,6 @@
-"""Command that fills the cache of decoded images, or removes it.
+"""Command that fills the image cache, or removes it.
 
-python -m rgbt.data.cache dataset=mfnet dataset.root=... cache=auto    # decode, show the size
+python -m rgbt.data.cache dataset=mfnet dataset.root=... cache=auto    # fill it, show the size
 python -m rgbt.data.cache dataset=mfnet dataset.root=... remove=true   # and remove it
 """
 
@@ -19,14 +19,14 @@ from rich.progress import Progress, TaskID
 from rgbt.config.command import built
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.cache.dataset import Decoded, check_cache, decoded_dataset
-from rgbt.data.cache.store import Told, gigabytes, remove, size_of
-from rgbt.data.dataset import LabelledDataset
+from rgbt.data.cache.dataset import CachedDataset, cached_dataset, check_cache
+from rgbt.data.cache.folder import OnProgress, gigabytes, remove, size_of
+from rgbt.dataset import LabelledDataset
 
 
 @contextmanager
-def shown() -> Iterator[Told]:
-    """Progress bars on stderr for `Decoded.ensure`, one for each thing that is done."""
+def progress_bars() -> Iterator[OnProgress]:
+    """Progress bars on stderr for `CachedDataset.ensure`, one per kind of work."""
     with Progress(console=Console(stderr=True)) as progress:
         tasks: dict[str, TaskID] = {}
 
@@ -42,25 +42,26 @@ def shown() -> Iterator[Told]:
 class Options:
     """Of the cache."""
 
-    cache: Annotated[str, Help("auto, or the folder where caches lie")] = "auto"
+    cache: Annotated[str, Help("auto, or the folder that holds caches")] = "auto"
     remove: Annotated[
-        bool, Help("true: remove the cache, and those of earlier states of the same folder")
+        bool, Help("true: remove the cache, and those of former states of the same data set")
     ] = False
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Decode every split of a data set into a cache and show its size, or remove it.
+    """Decode every split of a data set into the image cache and show its size, or remove it.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """
     check_cache("cache", options.cache)
     source: LabelledDataset = built("dataset", overrides)
-    dataset = decoded_dataset(source, options.cache, num_threads=os.cpu_count() or 1)
-    assert isinstance(dataset, Decoded)
+    dataset = cached_dataset(source, options.cache, num_threads=os.cpu_count() or 1)
+    assert isinstance(dataset, CachedDataset)
     if not options.remove:
         splits = [split for split in source.splits if source.has(split)]
-        with shown() as advance:
-            dataset.ensure(tuple(name for split in splits for name in source.names(split)), advance)
+        names = tuple(name for split in splits for name in source.names(split))
+        with progress_bars() as on_progress:
+            dataset.ensure(names, on_progress)
     for cache in dataset.caches():
         sys.stdout.write(f"{cache}: {gigabytes(size_of(cache))}{' removed' * options.remove}\n")
         if options.remove:

@@ -1,9 +1,8 @@
-"""Frames that are decoded once and then read from a map of memory.
+"""A data set whose images are decoded once and then read from memory-mapped files.
 
-`Decoded` stands before a data set and is one. Decoding a PNG of 480x640 pixels takes ten
-milliseconds, a view of the map none to speak of, and a cut of it touches only its own pages.
-Nothing is augmented here, and nothing is kept that the data set would not return today: a frame is
-decoded again when one of its files changes, or when its bytes in the cache are damaged.
+Decoding a PNG of 480x640 pixels takes ten milliseconds; a view of the map takes almost no time, and
+a crop of it reads only its own pages. Nothing is augmented here. A sample is decoded again when one
+of its files changes, or when its bytes in the cache are damaged.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import json
 import logging
 import re
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -24,28 +23,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.cache.file import bytes_of, crc_of
-from rgbt.data.cache.stamps import is_fresh, stamp_of
-from rgbt.data.cache.store import (
+from rgbt.data.cache.file_state import are_unchanged, state_of
+from rgbt.data.cache.folder import (
     FINGERPRINT,
     ROOT,
-    Fresh,
-    Placed,
-    Store,
-    Told,
-    stores_like,
+    CachedSample,
+    CacheFolder,
+    NewSample,
+    OnProgress,
+    caches_like,
 )
-from rgbt.data.dataset import LabelledDataset
+from rgbt.data.cache.sample_file import bytes_of, crc_of
 from rgbt.data.synth.cache import default_cache
+from rgbt.dataset import DatasetWrapper, LabelledDataset, layers
 from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)
 
 FORMAT = 2
-"""Part of the key; rises when the files are laid out otherwise."""
+"""Version of the file format, a part of the cache's key."""
 
 NO_FOLDERS = ("", "none", "null", "true", "false", "yes", "no", "on", "off")
-"""What people type who do not mean a folder."""
+"""Words that are not accepted as the name of a folder."""
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -53,160 +52,126 @@ def _silent(what: str, done: int, total: int) -> None:
 
 
 def default_folder() -> Path:
-    """$XDG_CACHE_HOME/rgbt/decoded, or ~/.cache/rgbt/decoded where that is not set."""
+    """$XDG_CACHE_HOME/rgbt/decoded, or ~/.cache/rgbt/decoded if that is not set."""
     return default_cache() / "decoded"
 
 
 def check_cache(key: str, cache: object) -> None:
-    """Refuse words that would name a folder by mistake: "" is the current one.
+    """Refuse words that would name a folder by mistake; "" would be the current folder.
 
     Args:
-        key: of the configuration, for the message.
-        cache: as `decoded_dataset` takes it.
+        key: of the configuration; begins the message.
+        cache: see `cached_dataset`.
 
     Raises:
-        InputError: no text, an empty one, or a word for nothing such as "none".
+        InputError: not a text, an empty one, or a word such as "none".
     """
     if cache is None:
         return
     if not isinstance(cache, str) or cache.strip().lower() in NO_FOLDERS:
         raise InputError(
-            f"{key}: {cache!r} names no folder; expected auto or a folder (./NAME where it is "
-            f"called so), or omit {key}."
+            f"{key}: {cache!r} is not a folder; expected auto or a folder (./NAME if that is its "
+            f"name), or omit {key}."
         )
 
 
-def decoded_dataset(
+def cached_dataset(
     dataset: LabelledDataset, cache: str | None, *, num_threads: int
 ) -> LabelledDataset:
-    """`dataset`, or a `Decoded` before it.
+    """`dataset`, or a `CachedDataset` of it.
 
     Args:
-        dataset: reads files.
+        dataset: reads the files.
         cache: None: no cache; "auto": `default_folder`; otherwise a folder.
-        num_threads: frames decoded at a time when the cache is filled.
+        num_threads: images decoded at a time when the cache is filled.
     """
     if cache is None:
         return dataset
     folder = default_folder() if cache == "auto" else Path(cache).expanduser()
-    return Decoded(dataset, folder, num_threads=num_threads)
+    return CachedDataset(dataset, folder, num_threads=num_threads)
 
 
-class Decoded:
-    """A data set whose frames come from a cache, once `ensure` has put them there.
+def cached_layer(dataset: LabelledDataset) -> CachedDataset | None:
+    """`dataset` itself or the data set behind it that reads from a cache; None without a cache."""
+    return next((each for each in layers(dataset) if isinstance(each, CachedDataset)), None)
 
-    The cache is a folder in `folder`, named by the data set's class, `decoding()`, `fingerprint()`
-    and the version of the format. Of every frame the length and the time of change of its files
-    are kept, and a CRC-32 of their bytes: where only the time differs the bytes are compared, so
-    that a copy of the data set elsewhere finds the same cache. When files are changed so that the
-    fingerprint is another one, the new cache takes the frames that are the same from the old one;
-    the old one stays until somebody removes it. An old one is known by the folder of the data set:
-    other data sets of the same name are nobody's earlier state.
+
+class CachedDataset(DatasetWrapper):
+    """A data set whose samples are read from a cache after `ensure` has added them.
+
+    The cache is a sub-folder of `folder`, named by the class, `decoding()` and `fingerprint()` of
+    the data set and the version of the format. The cache keeps length, times and CRC-32 of each
+    file of a sample. If only the times differ the bytes are compared, so a copy of the data set
+    elsewhere uses the same cache. If files change so that the fingerprint changes, the new cache
+    takes the unchanged samples from the old one, which is kept until somebody removes it. The old
+    cache is the one with the same root; other data sets of the same name are never used.
 
     Args:
-        dataset: what is decoded; its samples must not carry confidences.
-        folder: where caches lie, made when needed.
-        num_threads: frames decoded at a time, >= 1.
-
-    Attributes:
-        source: the data set.
+        dataset: is decoded; its samples must not carry confidences.
+        folder: holds caches; made when needed.
+        num_threads: images decoded at a time, >= 1.
     """
 
     def __init__(self, dataset: LabelledDataset, folder: Path, *, num_threads: int) -> None:
-        self.source = dataset
+        super().__init__(dataset)
         self.folder = Path(folder)
         self.num_threads = num_threads
-        self.root = dataset.root
-        self.name = dataset.name
-        self.num_classes = dataset.num_classes
-        self.classes = dataset.classes
-        self.palette = dataset.palette
-        self.unscored = dataset.unscored
-        self._placed: dict[str, Placed] = {}
+        self._cached: dict[str, CachedSample] = {}
         self._unreadable: dict[str, str] = {}
 
-    def ensure(self, names: tuple[str, ...], advance: Told = _silent) -> None:
-        """Make `read` take `names` from the cache; decodes what is missing, changed or damaged.
+    def ensure(self, names: tuple[str, ...], on_progress: OnProgress = _silent) -> None:
+        """Decode those of `names` that are missing, changed or damaged, and use the cache for all.
 
-        A frame that cannot be decoded is left out, and is tried again by the next call.
+        A sample that cannot be decoded is left out; the next call tries again.
 
         Args:
             names: of any splits.
-            advance: called as (what is being done, how many are done, of how many).
+            on_progress: called with (name of the work, number done, total number).
 
         Raises:
-            InputError: the cache cannot be written, or the disk is too small for it.
+            InputError: the cache cannot be written, or the disk is too small.
         """
         wanted = tuple(dict.fromkeys(names))
         for name in wanted:
-            self._placed.pop(name, None)
+            self._cached.pop(name, None)
             self._unreadable.pop(name, None)
         about = self._about()
-        store = Store(self.folder / _store_name(about), about, self.num_threads)
-        store.load(advance)
-        size = self._first_size(self._missing(store, wanted))
+        cache = CacheFolder(self.folder / _cache_name(about), about, self.num_threads)
+        cache.load(on_progress)
+        size = self._first_size(self._missing(cache, wanted))
         if size is not None:
-            with store.building():
-                self._adopt(store)
-                store.load(advance)
-                missing = self._missing(store, wanted)
-                store.check_space(size * len(missing))
-                with closing(self._fresh(missing, advance)) as frames:
-                    store.add(frames)
-        self._placed |= {name: store.frames[name] for name in wanted if name in store.frames}
+            with cache.building():
+                self._adopt(cache)
+                cache.load(on_progress)
+                missing = self._missing(cache, wanted)
+                cache.check_space(size * len(missing))
+                with closing(self._decode_all(missing, on_progress)) as samples:
+                    cache.add(samples)
+        self._cached |= {name: cache.samples[name] for name in wanted if name in cache.samples}
 
     def read(self, name: str) -> Sample:
         """The sample as `source.read` returns it.
 
-        Names that `ensure` was given come as read-only views of the cache, all others are decoded.
+        Samples of `ensure` are read-only views of the cache; all others are decoded.
 
         Raises:
-            InputError: it could not be decoded, in the words of the data set.
+            InputError: it could not be decoded, with the message of the data set.
         """
         if name in self._unreadable:
             raise InputError(self._unreadable[name])
-        if name in self._placed:
-            file, frame = self._placed[name]
+        if name in self._cached:
+            file, record = self._cached[name]
             with suppress(OSError, ValueError):  # somebody removed the cache
-                return file.read(frame)
+                return file.read(record)
         return self.source.read(name)
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone, (H, W); None where the pair is unlabelled."""
-        return self.read(name).label if name in self._placed else self.source.label(name)
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        """As the data set says."""
-        return self.source.splits
-
-    def has(self, split: str) -> bool:
-        """As the data set says."""
-        return self.source.has(split)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """As the data set says."""
-        return self.source.names(split)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """As the data set says: the files that were decoded, not those of the cache."""
-        return self.source.files(name)
-
-    def decoding(self) -> dict[str, Any]:
-        """As the data set says."""
-        return self.source.decoding()
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """As the data set says."""
-        return self.source.nights(names)
-
-    def fingerprint(self) -> str:
-        """As the data set says."""
-        return self.source.fingerprint()
+        """The label of `read` alone, (H, W); None if the pair is unlabelled."""
+        return self.read(name).label if name in self._cached else self.source.label(name)
 
     def caches(self) -> list[Path]:
-        """Caches in `folder` of this data set, those of earlier states of its folder too."""
-        return stores_like(self.folder, self._about())
+        """Caches in `folder` of this data set, and of former states of its files."""
+        return caches_like(self.folder, self._about())
 
     def _about(self) -> dict[str, Any]:
         kind = type(self.source)
@@ -218,44 +183,44 @@ class Decoded:
             FINGERPRINT: self.source.fingerprint(),
             ROOT: str(Path(self.root).resolve()),
         }
-        # As it comes back from a file: tuples are lists there.
+        # As read from a file, where tuples are lists.
         return dict(json.loads(json.dumps(about)))
 
-    def _missing(self, store: Store, names: tuple[str, ...]) -> list[str]:
-        """Names that are not in `store`, or whose files have changed since."""
+    def _missing(self, cache: CacheFolder, names: tuple[str, ...]) -> list[str]:
+        """Names that are not in `cache`, or whose files have changed since."""
 
         def is_missing(name: str) -> bool:
-            placed = store.frames.get(name)
-            if placed is None:
+            cached = cache.samples.get(name)
+            if cached is None:
                 return True
             try:
-                return not is_fresh(self.source.files(name), placed.frame.stamps)
-            except InputError:  # `_decode` finds out again, and keeps the sentence
+                return not are_unchanged(self.source.files(name), cached.record.sources)
+            except InputError:  # `_decode` raises it again and keeps the message
                 return True
 
         with ThreadPoolExecutor(self.num_threads) as pool:
-            found = pool.map(is_missing, names)
-            return [name for name, missing in zip(names, found, strict=True) if missing]
+            results = pool.map(is_missing, names)
+            return [name for name, missing in zip(names, results, strict=True) if missing]
 
     def _first_size(self, names: list[str]) -> int | None:
-        """Bytes of the first of `names` that can be decoded; None where none can.
+        """Bytes of the first of `names` that can be decoded; None if none can.
 
-        So a cache that lacks nothing but damaged frames is not written to.
+        A cache in which only undecodable samples are missing is not written to.
         """
         for result in self._results(names):
             if result is not None:
                 return bytes_of(result.sample)
         return None
 
-    def _fresh(self, names: list[str], advance: Told) -> Generator[Fresh]:
+    def _decode_all(self, names: list[str], on_progress: OnProgress) -> Generator[NewSample]:
         for done, result in enumerate(self._results(names), 1):
             if result is not None:
                 yield result
-            advance("decoding", done, len(names))
+            on_progress("decoding", done, len(names))
 
-    def _results(self, names: list[str]) -> Iterator[Fresh | None]:
-        """Each of `names` decoded, in order; None where that cannot be done."""
-        waiting: deque[Future[Fresh | None]] = deque()
+    def _results(self, names: list[str]) -> Iterator[NewSample | None]:
+        """Each of `names` decoded, in order; None for one that cannot be decoded."""
+        waiting: deque[Future[NewSample | None]] = deque()
         pool = ThreadPoolExecutor(self.num_threads)
         try:
             for name in names:
@@ -267,38 +232,38 @@ class Decoded:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _decode(self, name: str) -> Fresh | None:
+    def _decode(self, name: str) -> NewSample | None:
         try:
-            # Before decoding: a file that changes meanwhile has another stamp the next time.
-            stamps = tuple(stamp_of(path) for path in self.source.files(name))
+            # Before decoding, so that a change during decoding is noticed the next time.
+            sources = tuple(state_of(path) for path in self.source.files(name))
             sample = self.source.read(name)
-            _check_kept(sample)
+            _check_sample(sample)
         except InputError as error:
             self._unreadable[name] = str(error)
             return None
         except OSError as error:
             self._unreadable[name] = f"{error.filename or name}: {error.strerror or error}."
             return None
-        assert sample.confidence is None, "pseudo-labels are joined to what the cache returns"
-        return Fresh(replace(sample, name=name), crc_of(sample), stamps)
+        assert sample.confidence is None, "pseudo-labels are added to the samples of the cache"
+        return NewSample(replace(sample, name=name), crc_of(sample), sources)
 
-    def _adopt(self, store: Store) -> None:
-        """Let a new store begin with the files of the one that was last used before it."""
-        if store.frames:
+    def _adopt(self, cache: CacheFolder) -> None:
+        """Start a new cache with the files of the most recent cache of the same data set."""
+        if cache.samples:
             return
-        like = [path for path in self.caches() if path != store.folder]
-        if like:
-            latest = max(like, key=lambda path: path.stat().st_mtime_ns)
-            store.adopt(latest)
+        alike = [path for path in self.caches() if path != cache.folder]
+        if alike:
+            latest = max(alike, key=lambda path: path.stat().st_mtime_ns)
+            cache.adopt(latest)
             LOG.warning(
-                "%s has changed: %s takes what is the same from %s, which stays; "
+                "%s has changed: %s takes the unchanged images from %s, which is kept; "
                 "python -m rgbt.data.cache ... remove=true removes such caches.",
-                *(self.name, store.folder, latest),
+                *(self.name, cache.folder, latest),
             )
 
 
-def _check_kept(sample: Sample) -> None:
-    """Refuse what the cache cannot hold; only readers of one's own make such samples."""
+def _check_sample(sample: Sample) -> None:
+    """Refuse a sample that the cache cannot hold; only a user's own data set returns one."""
     height, width = sample.thermal.shape[:2]
     expected = {"rgb": (height, width, 3), "thermal": (height, width), "label": (height, width)}
     for what, shape in expected.items():
@@ -306,13 +271,13 @@ def _check_kept(sample: Sample) -> None:
         if image is not None and (image.dtype != np.uint8 or image.shape != shape):
             raise InputError(
                 f"'{sample.name}': {what} must be uint8 of shape {shape}, like the thermal image, "
-                f"got {image.dtype} {image.shape}; the cache holds nothing else, read without it "
-                "(data.cache=null)."
+                f"got {image.dtype} {image.shape}; correct the data set, or read without the "
+                "cache (data.cache=null)."
             )
 
 
-def _store_name(about: dict[str, Any]) -> str:
-    # Equal copies are one cache, wherever they lie.
+def _cache_name(about: dict[str, Any]) -> str:
+    # Equal copies share one cache, whatever their root.
     same = {key: value for key, value in about.items() if key != ROOT}
     key = hashlib.sha256(json.dumps(same, sort_keys=True).encode()).hexdigest()[:16]
     return f"{re.sub(r'[^A-Za-z0-9_-]', '_', about['name'])}-{key}"

@@ -1,1 +1,1 @@
-"""Anybody's own RGB-thermal data, described by one YAML."""
+"""A user's own RGB-thermal data, described by one YAML file."""

@@ -1,4 +1,4 @@
-"""Anybody's own RGB-thermal data, described by one YAML: patterns of files, splits, label values.
+"""A user's own RGB-thermal data, described by one YAML file: paths, splits, label values.
 
 A reader only: it maps values to classes and to grey levels as the configuration says, never resizes
 or aligns, and refuses what it cannot read exactly. docs/datasets.md has a worked example.
@@ -19,12 +19,10 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.dataset import check_lengths
-from rgbt.data.files import within
-from rgbt.data.folder.frames import Frame, check_partners, find_frames, patterns_of
+from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
-from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, Rule
+from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
 from rgbt.data.folder.values import (
     LabelValue,
     Range,
@@ -34,8 +32,14 @@ from rgbt.data.folder.values import (
     painted,
 )
 from rgbt.data.images import PairPattern
-from rgbt.data.integrity import is_there
-from rgbt.data.named_files import hash_of_files, with_label
+from rgbt.data.named_files import (
+    check_lengths,
+    existing_file,
+    existing_root,
+    hash_of_files,
+    with_label,
+)
+from rgbt.data.report.folder import FolderChecks
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 from rgbt.types import Sample
 
@@ -46,10 +50,9 @@ class Folder:
     """RGB-thermal pairs in any folder whose paths follow patterns.
 
     A pattern is a path below the root with words in braces (`rgbt.data.folder.pattern`): {name}
-    stands for a frame, {split} for the split it is of, {sequence} for frames that follow one
-    another, any other word for whatever differs. What the words stand for in the path of the RGB
-    image, joined by "_", is the name of a sample; thermal image and label are found with the same
-    words.
+    is the frame, {split} its split, {sequence} a group of consecutive frames, and any other word
+    matches any text. The values of the words in the path of the RGB image, joined by "_", are the
+    name of a sample; thermal image and label have the same values in their paths.
 
     Args:
         root: folder that the patterns are relative to.
@@ -63,20 +66,20 @@ class Folder:
         palette: (red, green, blue) of each class, 0..255; None: those of `colours`, or colours
             that differ.
         unscored: classes that are counted but left out of every mean over classes.
-        folders: split -> what stands for {split}; None: train, val and test are called so.
-        lists: split -> list file in `root`, in the place of `folders`.
-        shares: split -> share of the frames, together 1, in the place of `folders`.
-        shares_seed: of the draw of `shares`.
-        block: neighbouring frames that stay together in the draw; None: whole sequences do.
-        unlabelled: splits whose frames have no labels; no file is looked for.
+        folders: split -> value of {split}; None: train, val and test.
+        lists: split -> list file in `root`; replaces `folders`.
+        shares: split -> share of the frames, 1 in total; replaces `folders`.
+        shares_seed: seed of the draw of `shares`.
+        block: number of consecutive frames that are drawn together; None: whole sequences.
+        unlabelled: splits without labels; no label files are expected.
         ids: label value -> class; None: values are class indices.
-        colours: class -> its colour in label images, or several; in the place of `ids`.
+        colours: class -> its colour in label images, or several; replaces `ids`.
         ignored: label values, or colours, that do not count.
         thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
-        night: pattern of the names of night images, with * and ?; None: the data does not say.
+        night: pattern of the names of night images, with * and ?; None: unknown.
 
     Raises:
-        InputError: no such root, patterns that match nothing, or settings that cannot be.
+        InputError: no such root, patterns that match nothing, or invalid settings.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -103,7 +106,6 @@ class Folder:
         thermal_range: Range | None = None,
         night: Text | None = None,
     ) -> None:
-        self.root = Path(root).expanduser()
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
@@ -114,36 +116,32 @@ class Folder:
         check_lengths(num_classes, classes, self.palette)
         for word in classes:
             if classes.count(word) > 1:
-                raise InputError(f"dataset.classes: '{word}' stands there twice; rename one.")
+                raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
         for word in unscored:
             check_choice("dataset.unscored", word, classes)
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
-        if not self.root.is_dir():
-            raise InputError(
-                f"dataset.root: there is no folder '{root}'; give the one that dataset.rgb='{rgb}' "
-                "begins in."
-            )
+        self.root = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
         self.patterns = patterns_of(rgb, thermal, label)
         self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
-        self.frames: Mapping[str, Frame] = find_frames(self.root, self.patterns)
+        self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
         self._rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self._names: dict[str, tuple[str, ...]] = {}
         self.unlabelled = unlabelled
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
-        # New images may be of the day alone, and have no labels.
+        # Without labelled splits these may be new images, of the day alone and without labels.
         if set(self.splits) - set(unlabelled):
             self._check_labels()
             self._check_night()
 
     @property
     def splits(self) -> dict[str, str]:
-        """Split -> the pattern, list or share that it is made of."""
+        """Split -> its pattern, list or share."""
         return self._rule.splits
 
     def has(self, split: str) -> bool:
-        """Whether anything of `split` is there; InputError where the split is unknown."""
+        """Whether any frame of `split` exists; InputError if the split is unknown."""
         self._check_split(split)
         return self._rule.has(split)
 
@@ -163,7 +161,7 @@ class Folder:
 
         Returns:
             Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8; the label is None
-            where the data set, or the split of the frame, has none.
+            if the data set, or the split of the frame, has none.
 
         Raises:
             InputError: no such name, a file is missing, cut short, outside the root, cannot be
@@ -180,7 +178,7 @@ class Folder:
         return self.images.read(name, rgb, self._there("thermal image", frame.thermal, name))
 
     def label(self, name: str) -> Array | None:
-        """The label of `read` alone, (H, W) uint8; None where there is none; errors as there."""
+        """The label of `read` alone, (H, W) uint8; None if it has none; errors as there."""
         frame = self.frame(name)
         if frame.label is None or name in self._without_labels:
             return None
@@ -200,7 +198,7 @@ class Folder:
         return tuple(dict.fromkeys(path for path in paths if path is not None))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides, beside the files, what `read` makes of them."""
+        """Settings that change what `read` makes of the files."""
         return {
             "packed": self.packed,
             "thermal_range": self.thermal_range,
@@ -210,7 +208,7 @@ class Folder:
         }
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each name is one of the night; None where `night` is not given."""
+        """Whether each name matches `night`; None if it is not given."""
         if self.night is None:
             return None
         return tuple(fnmatchcase(name, self.night) for name in names)
@@ -218,8 +216,8 @@ class Folder:
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
-        What labels look like belongs to it. Nothing is decoded and the root is left out, so that
-        equal copies have equal fingerprints; files that are missing count as such.
+        It includes the meaning of label values, but not the root, so that equal copies have equal
+        fingerprints. Nothing is decoded; missing files have size -1.
         """
         listed = {
             split: tuple(name for name in self.names(split) if name in self.frames)
@@ -231,13 +229,17 @@ class Folder:
         files = hash_of_files(listed, self.files)
         return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
 
-    def frame(self, name: str) -> Frame:
-        """The files of `name`; InputError where there is no such frame."""
+    def checks(self) -> FolderChecks:
+        """What `rgbt.data.check` checks of this data set."""
+        return FolderChecks(self)
+
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`; InputError if there is no such frame."""
         if name not in self.frames:
             raise InputError(
                 f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
-                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or take the name off "
-                "the list."
+                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or remove the name "
+                "from the list."
             )
         return self.frames[name]
 
@@ -259,12 +261,7 @@ class Folder:
             check_partners(self.patterns.label, labelled, self.root)
 
     def _there(self, what: str, path: Path, name: str) -> Path:
-        if not is_there(path):
-            raise InputError(
-                f"'{name}': its {what} {path} is missing; restore it, or use data.on_error=skip to "
-                "leave the frame out."
-            )
-        return within(path, self.root)
+        return existing_file(what, path, name, self.root)
 
     def _rule_of(
         self,
@@ -272,15 +269,15 @@ class Folder:
         lists: dict[str, str] | None,
         shares: dict[str, float] | None,
         draw: tuple[int, int | None],
-    ) -> Rule:
+    ) -> SplitRule:
         given = {"folders": folders, "lists": lists, "shares": shares}
-        told = [f"dataset.{key}" for key, value in given.items() if value is not None]
+        keys = [f"dataset.{key}" for key, value in given.items() if value is not None]
         in_path = SPLIT in self.patterns.rgb.words
-        if len(told) > 1 or (in_path and told not in ([], ["dataset.folders"])):
+        if len(keys) > 1 or (in_path and keys not in ([], ["dataset.folders"])):
             braces = [f"{{{SPLIT}}} in dataset.rgb"] if in_path else []
             raise InputError(
-                f"dataset: {' and '.join([*told, *braces])} both say what the splits are; keep one "
-                f"(a folder that says something else needs another word, such as {{part}})."
+                f"dataset: {' and '.join([*keys, *braces])} both define the splits; keep one "
+                f"(a folder with another meaning needs another word, such as {{part}})."
             )
         if shares is None and draw != (0, None):
             raise InputError(
@@ -293,8 +290,8 @@ class Folder:
             return ByList(self.frames, self.root, lists)
         if not in_path:
             raise InputError(
-                f"dataset: nothing says what the splits are; write {{{SPLIT}}} in dataset.rgb "
-                "where train, val and test stand, or give dataset.lists or dataset.shares."
+                f"dataset: nothing defines the splits; write {{{SPLIT}}} in dataset.rgb instead of "
+                "train, val and test, or give dataset.lists or dataset.shares."
             )
         return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
 

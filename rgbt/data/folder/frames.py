@@ -1,4 +1,4 @@
-"""Which files of a folder belong to one frame, as patterns say; nothing is opened here."""
+"""The files of each frame of a folder, by the patterns of paths; nothing is opened here."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.folder.pattern import NAME, Pattern, Values, in_order, what_is_in
+from rgbt.data.folder.pattern import NAME, Pattern, WordValues, in_order, what_is_in
 
 
-class Frame(NamedTuple):
+class FolderFrame(NamedTuple):
     """One pair of images and its label.
 
     Attributes:
-        name: what stands for the words of the RGB pattern, joined by "_".
-        values: what stands for each of them.
-        rgb: file that is there.
-        thermal: file that should be there; the same one where it is the fourth channel.
-        label: file that should be there; None where the data set has no labels.
+        name: values of the words of the RGB pattern, joined by "_".
+        values: value of each word.
+        rgb: existing file.
+        thermal: expected file; the same one if thermal is its fourth channel.
+        label: expected file; None if the data set has no labels.
     """
 
     name: str
-    values: Values
+    values: WordValues
     rgb: Path
     thermal: Path
     label: Path | None
 
 
 class Patterns(NamedTuple):
-    """Where the three images of a frame lie; `label` is None for a data set without labels."""
+    """Patterns of the three images of a frame; `label` is None for a data set without labels."""
 
     rgb: Pattern
     thermal: Pattern
@@ -41,8 +41,8 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     """The patterns of the configuration.
 
     Raises:
-        InputError: a text that is no pattern, no {name} in the first, words that only the others
-            have, or labels in a format that changes values.
+        InputError: an invalid pattern, no {name} in the first, words that only the others have,
+            or labels in a format that changes values.
     """
     found = Patterns(
         Pattern(rgb, "dataset.rgb"),
@@ -51,15 +51,15 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     )
     if NAME not in found.rgb.words:
         raise InputError(
-            f"dataset.rgb: '{rgb}' says {', '.join(found.rgb.words)} but no {NAME}; write "
-            f"{{{NAME}}} where the names of frames stand."
+            f"dataset.rgb: '{rgb}' has {', '.join(found.rgb.words)} but no {NAME}; write "
+            f"{{{NAME}}} instead of the names of frames."
         )
     for pattern in [each for each in found if each is not None]:
         for word in pattern.words:
             if word not in found.rgb.words:
                 raise InputError(
                     f"{pattern.key}: '{pattern.text}' needs {{{word}}}, which dataset.rgb='{rgb}' "
-                    f"does not tell; {nearest(word, found.rgb.words)}."
+                    f"does not have; {nearest(word, found.rgb.words)}."
                 )
     if label is not None and label.lower().endswith((".jpg", ".jpeg")):
         raise InputError(
@@ -69,7 +69,7 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     return found
 
 
-def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
+def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
     """Name -> frame, of every RGB image, in the order of the names (9 before 10).
 
     Args:
@@ -81,7 +81,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
             share a partner.
     """
     rgb, thermal, label = patterns
-    frames: dict[str, Frame] = {}
+    frames: dict[str, FolderFrame] = {}
     for frame in _candidates(root, patterns):
         if frame.name in frames:
             raise InputError(
@@ -102,8 +102,8 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
     return found
 
 
-def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> None:
-    """Refuse a pattern that names no file that is there, of any of some frames.
+def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) -> None:
+    """Refuse a pattern by which none of the frames has an existing file.
 
     Args:
         pattern: of thermal images or labels.
@@ -111,25 +111,25 @@ def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> Non
         root: what the pattern is relative to.
 
     Raises:
-        InputError: naming the first file and what is there in its place.
+        InputError: naming the first file and the content of its folder.
     """
     paths = [pattern.path(root, frame.values) for frame in frames]
     if paths and not any(map(os.path.lexists, paths)):
         raise InputError(
-            f"{pattern.key}: '{pattern.text}' names no file that is there: the first would be "
-            f"{paths[0]}, {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct the "
-            "pattern."
+            f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
+            f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct "
+            "the pattern."
         )
 
 
-def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
-    """What the RGB pattern matches, but for thermal images and labels of what it matches.
+def _candidates(root: Path, patterns: Patterns) -> list[FolderFrame]:
+    """Files that match the RGB pattern, without thermal images and labels of other matches.
 
-    Where all lie in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
     """
     rgb, thermal, label = patterns
     found = [
-        Frame(
+        FolderFrame(
             name="_".join(values[word] for word in rgb.words),
             values=values,
             rgb=path,
@@ -142,13 +142,13 @@ def _candidates(root: Path, patterns: Patterns) -> list[Frame]:
     return [frame for frame in found if frame.rgb not in partners]
 
 
-def _check_shared(pattern: Pattern, frames: dict[str, Frame], root: Path) -> None:
+def _check_shared(pattern: Pattern, frames: dict[str, FolderFrame], root: Path) -> None:
     partners: dict[Path, str] = {}
     for name, frame in frames.items():
         path = pattern.path(root, frame.values)
         if path in partners:
             raise InputError(
                 f"{pattern.key}: '{partners[path]}' and '{name}' would share {path}; use every "
-                "word of dataset.rgb that tells them apart."
+                "word of dataset.rgb in which they differ."
             )
         partners[path] = name

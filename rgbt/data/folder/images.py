@@ -1,4 +1,4 @@
-"""The images of somebody's own data: RGB of 8 bits, thermal values as grey levels."""
+"""Reads images of a user's own data: RGB of 8 bits, thermal values as grey levels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RGB_ADVICE = "dataset.thermal with the same pattern reads a fourth channel as th
 
 @dataclass(frozen=True)
 class FolderImages:
-    """See `rgbt.data.images.Images`.
+    """See `rgbt.data.images.PairReader`.
 
     Attributes:
         layouts: the patterns of the configuration.
@@ -31,8 +31,9 @@ class FolderImages:
     thermal_range: Range | None
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
-        """See `rgbt.data.images.Images`; a packed file of a data set that has none such holds grey
-        levels, which are taken as they are.
+        """See `rgbt.data.images.PairReader`.
+
+        A packed file given to a data set of separate images holds grey levels, used unchanged.
         """
         (own,) = self.layouts
         if rgb != thermal:

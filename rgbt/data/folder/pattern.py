@@ -1,4 +1,4 @@
-"""Patterns of files such as "{split}/rgb/{name}.png": which files match, and what they are called.
+"""Patterns of paths such as "{split}/rgb/{name}.png", and the files that match them.
 
 Part of `rgbt.data.folder`; nothing is opened here.
 """
@@ -15,37 +15,37 @@ from typing import NamedTuple
 from rgbt.checks import InputError
 
 NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
-"""Words that mean something: a frame, the split it is of, frames that follow one another."""
+"""Words with a meaning: the frame, its split, a group of consecutive frames."""
 
-Values = Mapping[str, str]
-"""Word -> what stands for it in the path of a file."""
+WordValues = Mapping[str, str]
+"""Word -> its value in the path of a file."""
 
-NO_VALUES: Values = MappingProxyType({})
+NO_VALUES: WordValues = MappingProxyType({})
 
 
-class Found(NamedTuple):
-    """A file, or a folder on the way to one, and what its path says."""
+class PathMatch(NamedTuple):
+    """A file, or a folder above it, and the values of the words in its path."""
 
     path: Path
-    values: Values
+    values: WordValues
 
 
 class Pattern:
-    """Paths below a root in which words in braces stand for any text without a slash.
+    """Paths below a root, in which a word in braces matches any text without a slash.
 
-    A word that occurs twice stands for the same text in both places. Of two words in one piece of
-    the path the first takes as much as it can: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
+    A word that occurs twice has the same value in both positions. Of two words in one piece of the
+    path the first matches as much as possible: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
 
     Args:
         text: pieces joined by "/", relative to the root; such as "{split}/ir/{name}_ir.tif".
         key: of the configuration, for messages.
 
     Attributes:
-        words: what stands in braces, in order.
+        words: in braces, in order.
 
     Raises:
-        InputError: an absolute path, "..", a brace without its partner, two words with nothing
-            between them, or no word at all.
+        InputError: an absolute path, "..", an unpaired brace, two words with nothing between them,
+            or no word.
     """
 
     def __init__(self, text: str, key: str) -> None:
@@ -65,34 +65,34 @@ class Pattern:
             )
         if not self.words:
             raise InputError(
-                f"{key}: '{text}' is one file; write {{{NAME}}} where the names of frames stand, "
+                f"{key}: '{text}' is one file; write {{{NAME}}} instead of the names of frames, "
                 f"such as rgb/{{{NAME}}}.png."
             )
 
-    def path(self, root: Path, values: Values) -> Path:
-        """The file of `values`, which hold every word."""
+    def path(self, root: Path, values: WordValues) -> Path:
+        """The file of `values`, which has every word."""
         return root / _filled(self.text, values)
 
     def files(
-        self, root: Path, values: Values = NO_VALUES, *, any_case: bool = False
-    ) -> Iterator[Found]:
-        """What matches below `root`: files, and anything else of such a name.
+        self, root: Path, values: WordValues = NO_VALUES, *, any_case: bool = False
+    ) -> Iterator[PathMatch]:
+        """The paths below `root` that match.
 
-        Files whose names begin with a dot are left out: systems write them beside others.
+        Names that begin with a dot are left out, as operating systems write such files.
 
         Args:
             root: what the pattern is relative to.
-            values: of the words that are known; the others may stand for anything.
-            any_case: whether capitals count for nothing.
+            values: of the known words; the others match any text.
+            any_case: whether case is ignored.
 
         Raises:
             InputError: a folder may not be listed.
         """
-        return _walk(Found(root, values), self.pieces, any_case=any_case)
+        return _walk(PathMatch(root, values), self.pieces, any_case=any_case)
 
     def why_nothing(self, root: Path) -> str:
-        """Where the first piece that matches nothing should be, and what is there instead."""
-        reached = [Found(root, {})]
+        """The folder in which a piece matches nothing, and its content."""
+        reached = [PathMatch(root, {})]
         for piece in self.pieces:
             further = [found for folder in reached for found in _matching(folder, piece)]
             if not further:
@@ -120,7 +120,7 @@ def in_order(text: str) -> list[tuple[bool, int, str]]:
     ]
 
 
-def _walk(start: Found, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[Found]:
+def _walk(start: PathMatch, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[PathMatch]:
     piece, *rest = pieces
     for found in _matching(start, piece, any_case=any_case):
         if rest:
@@ -129,22 +129,22 @@ def _walk(start: Found, pieces: tuple[str, ...], *, any_case: bool) -> Iterator[
             yield found
 
 
-def _matching(start: Found, piece: str, *, any_case: bool = False) -> Iterator[Found]:
+def _matching(start: PathMatch, piece: str, *, any_case: bool = False) -> Iterator[PathMatch]:
     folder, values = start
     filled = _filled(piece, values)
     if "{" not in filled and not any_case:
-        # A link that leads nowhere is there: whoever opens it says where it should lead.
+        # A broken link matches too; the reader reports its target.
         if os.path.lexists(folder / filled):
-            yield Found(folder / filled, values)
+            yield PathMatch(folder / filled, values)
         return
     expression = re.compile(_expression(filled), re.DOTALL | (re.IGNORECASE * any_case))
     for name in _listed(folder):
         match = expression.fullmatch(name)
         if match and (not name.startswith(".") or filled.startswith(".")):
-            yield Found(folder / name, {**values, **match.groupdict()})
+            yield PathMatch(folder / name, {**values, **match.groupdict()})
 
 
-def _filled(text: str, values: Values) -> str:
+def _filled(text: str, values: WordValues) -> str:
     """`text` with words replaced whose values are known."""
     return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
 

@@ -1,7 +1,6 @@
-"""Which frames of a folder are trained on, chosen with and tested on: three ways to say so.
+"""Three rules that divide the frames of a folder into splits: by path, by list, by random shares.
 
-Part of `rgbt.data.folder`: by a folder that the path names, by list files, or by shares that are
-drawn.
+Part of `rgbt.data.folder`.
 """
 
 from __future__ import annotations
@@ -14,42 +13,42 @@ from pathlib import Path
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.data.folder.frames import Frame
+from rgbt.data.folder.frames import FolderFrame
 from rgbt.data.folder.pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
 from rgbt.data.integrity import is_there, read_names
 from rgbt.randomness import numpy_generator
 
 FOLDERS = {split: split for split in ("train", "val", "test")}
-"""What {split} stands for where the configuration does not say so."""
+"""Default values of {split}."""
 
-Frames = Mapping[str, Frame]
+Frames = Mapping[str, FolderFrame]
 
 
-class Rule(Protocol):
-    """How splits are told."""
+class SplitRule(Protocol):
+    """A rule that divides frames into splits."""
 
     @property
     def splits(self) -> dict[str, str]:
-        """Split -> what it is made of."""
+        """Split -> its definition, for messages."""
         ...
 
     def has(self, split: str) -> bool:
-        """Whether anything of a known split is there."""
+        """Whether a known split has a frame or a list."""
         ...
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a known split; InputError where it is missing or empty."""
+        """Names of a known split; InputError if it is missing or empty."""
         ...
 
 
 @dataclass(frozen=True)
 class ByFolder:
-    """A split is what stands for {split} in the path of its RGB images.
+    """A split is the value of {split} in the path of the RGB image.
 
     Attributes:
         frames: all.
         pattern: of the RGB images.
-        folders: split -> what stands for {split}; two splits may have one folder.
+        folders: split -> value of {split}; two splits may share a folder.
     """
 
     frames: Frames
@@ -69,7 +68,7 @@ class ByFolder:
         return bool(self._of(split))
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in its folder; InputError where there are none."""
+        """Names in its folder; InputError if there are none."""
         names = self._of(split)
         if not names:
             known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
@@ -89,9 +88,9 @@ class ByFolder:
 class ByList:
     """A split is a file of one line per frame.
 
-    A line is the name of the frame; or what stands for the words of the RGB pattern, joined by
-    "/"; or {name} alone where no two frames share it; or the path of the RGB image below the root.
-    Each may end in a suffix.
+    A line is the name of the frame; or the values of the words of the RGB pattern, joined by "/";
+    or the value of {name}, if it is unique; or the path of the RGB image below the root. Each may
+    have a suffix.
 
     Attributes:
         frames: all.
@@ -109,13 +108,13 @@ class ByList:
         return dict(self.lists)
 
     def has(self, split: str) -> bool:
-        """Whether its list is there."""
+        """Whether its list exists."""
         return is_there(self._path(split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names in the order of the list.
 
-        A line that is no frame stays as it is, so that reading it says so; InputError where none
+        A line that is no frame stays as it is, so that reading it says so; InputError if none
         is, or there is no such list.
         """
         path, key = self._path(split), f"dataset.lists.{split}"
@@ -151,11 +150,11 @@ class ByList:
 
 @dataclass(frozen=True)
 class ByShare:
-    """Splits are drawn once, by a seed of their own; neighbouring frames stay together.
+    """Splits are drawn with a seed of their own; consecutive frames are drawn together.
 
-    What is drawn are units: the frames of one {sequence}, or of the whole folder where the pattern
-    has no such word, cut into blocks of `block` neighbours. In the order drawn, each unit goes to
-    the split that lacks most frames of its share.
+    The unit of the draw is one {sequence}, or the whole folder if the pattern has no such word,
+    divided into blocks of `block` frames. In the order drawn, each unit is added to the split that
+    lacks most frames of its share.
 
     Attributes:
         frames: all.
@@ -216,12 +215,12 @@ class ByShare:
     @cached_property
     def units(self) -> list[list[str]]:
         """Names that stay together."""
-        sequences: dict[str, list[Frame]] = defaultdict(list)
+        sequences: dict[str, list[FolderFrame]] = defaultdict(list)
         for frame in self.frames.values():
             sequences[frame.values.get(SEQUENCE, "")].append(frame)
         units = []
         for sequence in sorted(sequences, key=in_order):
-            # Two cameras of one moment are neighbours, whatever word comes first in the path.
+            # Two cameras of one moment are consecutive, whatever word is first in the path.
             names = [frame.name for frame in sorted(sequences[sequence], key=_moment)]
             size = self.block or len(names)
             units += [names[start : start + size] for start in range(0, len(names), size)]
@@ -239,11 +238,11 @@ class ByShare:
         return found
 
 
-def _moment(frame: Frame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
+def _moment(frame: FolderFrame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
     return in_order(frame.values[NAME]), in_order(frame.name)
 
 
-def _below(root: Path, frame: Frame) -> str:
+def _below(root: Path, frame: FolderFrame) -> str:
     return frame.rgb.relative_to(root).as_posix()
 
 

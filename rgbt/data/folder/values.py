@@ -1,4 +1,4 @@
-"""What the values of somebody's own files mean: label values as classes, thermal values as grey.
+"""The meaning of values in a user's files: labels become classes, thermal values grey levels.
 
 Part of `rgbt.data.folder`.
 """
@@ -48,11 +48,11 @@ class LabelCodes:
         """
         raw = self._raw(path)
         known = np.array(sorted(self.codes), np.int64)
-        places = np.minimum(np.searchsorted(known, raw), len(known) - 1)
-        unknown = known[places] != raw
+        indices = np.minimum(np.searchsorted(known, raw), len(known) - 1)
+        unknown = known[indices] != raw
         if unknown.any():
-            raise InputError(f"{path}: {self._said(raw[unknown])}")
-        return np.array([self.codes[code] for code in known.tolist()], np.uint8)[places]
+            raise InputError(f"{path}: {self._unknown(raw[unknown])}")
+        return np.array([self.codes[code] for code in known.tolist()], np.uint8)[indices]
 
     def _raw(self, path: Path) -> NDArray[Any]:
         if self.of_colours:
@@ -68,19 +68,19 @@ class LabelCodes:
             )
         return raw
 
-    def _said(self, unknown: NDArray[Any]) -> str:
+    def _unknown(self, unknown: NDArray[Any]) -> str:
         codes, counts = np.unique(unknown, return_counts=True)
         code, count = int(codes[counts.argmax()]), counts.max()
         more = f", most frequent of {len(codes)} unknown ones" if len(codes) > 1 else ""
         if self.of_colours:
             colour = [code // 65536, code // 256 % 256, code % 256]
             return (
-                f"colour {colour} ({count} pixels{more}) stands neither in dataset.colours nor in "
-                "dataset.ignored; name it there, or save labels that were never resized."
+                f"colour {colour} ({count} pixels{more}) is neither in dataset.colours nor in "
+                "dataset.ignored; add it there, or save labels that were never resized."
             )
         return (
-            f"label value {code} ({count} pixels{more}) stands neither in dataset.ids nor in "
-            f"dataset.ignored (known: {', '.join(map(str, sorted(self.codes)))}); name it there."
+            f"label value {code} ({count} pixels{more}) is neither in dataset.ids nor in "
+            f"dataset.ignored (known: {', '.join(map(str, sorted(self.codes)))}); add it there."
         )
 
 
@@ -102,8 +102,8 @@ def label_codes(
         ignored: values, or colours, that do not count.
 
     Raises:
-        InputError: both ids and colours, an unknown class, a value or colour that cannot be or
-            stands twice.
+        InputError: both ids and colours, an unknown class, an invalid value or colour, or one
+            that occurs twice.
     """
     if ids is not None and colours is not None:
         raise InputError(
@@ -121,8 +121,8 @@ def label_codes(
         code = _code(value, of_colours=colours is not None)
         if code in codes:
             raise InputError(
-                f"{key}: {_plain(value)} stands twice among the classes and dataset.ignored; every "
-                "value means one thing."
+                f"{key}: {_plain(value)} occurs twice in the classes and dataset.ignored; every "
+                "value must have one meaning."
             )
         codes[code] = index
     if colours is None:

@@ -1,1 +1,1 @@
-"""From a download to what the readers read: ``python -m rgbt.data.prepare``."""
+"""Prepares the files of a data set from a download: ``python -m rgbt.data.prepare``."""

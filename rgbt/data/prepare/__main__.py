@@ -1,4 +1,4 @@
-"""Command that turns an official download into the files that are read, then checks them.
+"""Command that copies the needed files of an official download, then checks them.
 
     python -m rgbt.data.prepare dataset=mfnet    source=ir_seg_dataset.zip      out=/data/MFNet
     python -m rgbt.data.prepare dataset=pst900   source=PST900_RGBT_Dataset.zip out=/data/PST900
@@ -10,31 +10,25 @@ Progress goes to stderr, the report of `rgbt.data.check` to stdout. The download
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated
 
+from hydra.utils import get_object
+from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import Progress
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, check_choice
+from rgbt.config.compose import conf_dir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.check import print_report
-from rgbt.data.dataset import LabelledDataset
-from rgbt.data.freiburg import Freiburg
-from rgbt.data.kp import KP
-from rgbt.data.mfnet import MFNet
+from rgbt.data.check import check_and_print
 from rgbt.data.prepare.copying import Item, check_out, claimed, write_all
-from rgbt.data.prepare.kp import plan_kp
-from rgbt.data.prepare.plans import Given, plan_freiburg, plan_mfnet, plan_pst900
-from rgbt.data.prepare.source import Source
-from rgbt.data.pst900 import PST900
-from rgbt.data.report.dataset import check_dataset, num_listed
+from rgbt.data.prepare.download import SourceFiles
+from rgbt.data.prepare.plans import Download, Preparable
 
 OPTIONAL = ("labels", "lists")
 
@@ -43,7 +37,7 @@ OPTIONAL = ("labels", "lists")
 class Options:
     """What to prepare, and where."""
 
-    dataset: Annotated[Literal["mfnet", "pst900", "kp", "freiburg"], Help("its name")]
+    dataset: Annotated[str, Help("mfnet, pst900, kp or freiburg")]
     source: Annotated[
         Path,
         Help(
@@ -68,66 +62,44 @@ class Options:
         return {key: path for key, path in given.items() if path is not None}
 
 
-class Kind(NamedTuple):
-    """What is known about preparing a data set.
-
-    Attributes:
-        plan: what to write of a download.
-        reads: the data set in a prepared folder.
-        archives: names of archives that are opened where a folder holds them.
-        takes: which of `OPTIONAL` have a meaning.
-    """
-
-    plan: Callable[[Given], list[Item]]
-    reads: Callable[[str], LabelledDataset]
-    archives: str
-    takes: tuple[str, ...] = ()
-
-
-KINDS = {
-    "mfnet": Kind(plan_mfnet, MFNet, r"ir_seg_dataset.*\.zip", ("lists",)),
-    "pst900": Kind(plan_pst900, PST900, r"pst900.*\.zip"),
-    "kp": Kind(plan_kp, KP, r"(set\d\d|.*labels.*)\.zip", ("labels", "lists")),
-    "freiburg": Kind(plan_freiburg, Freiburg, r"(train|test)\.zip"),
-}
+def preparable() -> dict[str, Preparable]:
+    """File of conf/dataset -> class of the data set, of those that declare a preparation."""
+    nodes = {path.stem: OmegaConf.load(path) for path in sorted(conf_dir().glob("dataset/*.yaml"))}
+    classes = {
+        name: get_object(node._target_) for name, node in nodes.items() if "_target_" in node
+    }
+    return {name: each for name, each in classes.items() if isinstance(each, Preparable)}
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Copy what is read of a download into a new folder, and check it. Called again, it resumes."""
+    """Copy the needed files of a download to a new folder and check them; it can be resumed."""
     del overrides  # none is heeded
     name, out, paths = options.dataset, options.out, options.paths
-    kind = KINDS[name]
+    classes = preparable()
+    check_choice("dataset", name, classes)
+    preparation = classes[name].preparation
     for key in paths:
-        if key in OPTIONAL and key not in kind.takes:
-            raise InputError(f"{key} has no meaning for dataset={name}; leave it out.")
+        if key in OPTIONAL and key not in preparation.options:
+            raise InputError(f"{key} has no effect for dataset={name}; omit it.")
     plan = {"dataset": name, **{key: str(path.resolve()) for key, path in paths.items()}}
     check_out(out, tuple(paths.values()), plan)
     with ExitStack() as opened:
         sources = {
-            key: opened.enter_context(Source(path, key, kind.archives))
+            key: opened.enter_context(SourceFiles(path, key, preparation.archives))
             for key, path in paths.items()
         }
-        items = kind.plan(Given(**sources))
+        items = preparation.plan(Download(**sources))
         opened.enter_context(claimed(out, plan))
         _copy(items, out)
-    return _check(kind.reads(str(out)), f"dataset={name} dataset.root={out}")
+    code = check_and_print(classes[name](str(out)))
+    sys.stdout.write(f"prepared: dataset={name} dataset.root={out}\n")
+    return code
 
 
 def _copy(items: list[Item], out: Path) -> None:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("copying", total=sum(item.size for item in items))
         write_all(items, out, lambda size: progress.advance(task, size))
-
-
-def _check(dataset: LabelledDataset, words: str) -> int:
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("reading", total=num_listed(dataset))
-        report = check_dataset(
-            dataset, num_threads=os.cpu_count() or 1, advance=lambda: progress.advance(task)
-        )
-    print_report(dataset, report)
-    sys.stdout.write(f"prepared: {words}\n")
-    return 1 if report.problems else 0
 
 
 entry = PlainCommand(Options, main, heeds=())

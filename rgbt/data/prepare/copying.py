@@ -1,4 +1,4 @@
-"""Writing what was planned: whole files or none, again and again until all are there.
+"""Writes planned files, each one completely or not at all; an interrupted copy can be resumed.
 
 Part of `rgbt.data.prepare`.
 """
@@ -15,26 +15,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError
-from rgbt.data.prepare.source import Entry
+from rgbt.data.prepare.download import SourceFile
 from rgbt.files.budgets import read_json
 
 PLAN = ".prepare.json"
-"""In the folder that is written: what from, so that an interrupted command goes on."""
+"""File in the new folder with the arguments of the command, so that it can be resumed."""
 
 SPARE = 2**24
-"""Bytes left free on the disk beside what is copied."""
+"""Bytes that must stay free on the disk."""
 
 
 class Item(NamedTuple):
     """A file to be written.
 
     Attributes:
-        target: where to, in the folder that is written, with "/".
+        target: path in the new folder, with "/".
         content: a file of the download, or its bytes.
     """
 
     target: str
-    content: Entry | bytes
+    content: SourceFile | bytes
 
     @property
     def size(self) -> int:
@@ -46,7 +46,7 @@ class Item(NamedTuple):
         return iter((self.content,)) if isinstance(self.content, bytes) else self.content.chunks()
 
     def is_at(self, path: Path) -> bool:
-        """Whether `path` holds these bytes: all are compared, a download may have been repaired."""
+        """Whether `path` holds these bytes; all are compared, as downloads may be repaired."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
         with path.open("rb") as file:
@@ -54,25 +54,25 @@ class Item(NamedTuple):
 
 
 def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> None:
-    """Refuse a folder that is not ours to write; nothing is written yet.
+    """Refuse a folder that this command must not write to; nothing is written yet.
 
     Args:
         out: new, empty, or begun by the same command.
-        sources: what must not be written into.
-        plan: what identifies the command.
+        sources: must not contain `out`.
+        plan: arguments of the command.
 
     Raises:
-        InputError: it lies in one of `sources`, holds other things, or was begun by another
-            command.
+        InputError: it is inside one of `sources`, holds other files, or was begun with other
+            arguments.
     """
     for source in sources:
         if out.resolve().is_relative_to(source.resolve()):
             raise InputError(
-                f"out: {out} lies in {source}, which is only read; name a folder outside of it."
+                f"out: {out} is inside {source}, which is only read; name a folder outside it."
             )
     path = out / PLAN
     if not path.is_file():
-        # Killed before anything else, a command leaves its note half written.
+        # A command that was killed at its start may leave an incomplete note.
         others = [each for each in _listed(out) if not each.name.startswith(PLAN)]
         if others:
             raise InputError(
@@ -85,18 +85,18 @@ def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> Non
         begun = None
     if begun != plan:
         raise InputError(
-            f"out: {out} was begun from something else ({path} says what); give the same arguments "
+            f"out: {out} was begun with other arguments (see {path}); give the same arguments "
             "again, name another folder, or remove this one."
         )
 
 
 @contextmanager
 def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
-    """`out`, made, and ours alone until the end.
+    """Make `out` and lock it until the end.
 
     Args:
-        out: that passed `check_out`.
-        plan: kept in it.
+        out: passed `check_out`.
+        plan: written into it.
 
     Raises:
         InputError: it is being written by another process, or cannot be written.
@@ -114,22 +114,22 @@ def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
     except OSError as error:
         raise InputError(
             f"out: cannot write {error.filename or out} ({error.strerror or error}); free some "
-            "space, or name a folder that can be written. What was copied stays: the same command "
-            "goes on."
+            "space, or name a writable folder. Copied files are kept: the same command "
+            "resumes."
         ) from error
 
 
 def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) -> None:
-    """Write those of `items` that are not there yet.
+    """Write those of `items` that do not exist yet.
 
     Args:
         items: with different targets.
         out: of `claimed`.
-        advance: called with the bytes of every file that is there or has been written.
+        advance: called with the bytes of every file that exists or has been written.
 
     Raises:
-        InputError: other files lie in the folders, too little space, or a file of the download
-            that cannot be read or is shorter or longer than it said.
+        InputError: other files in the folders, too little space, or a file of the download that
+            cannot be read or has another size than listed.
         OSError: `out` cannot be written.
     """
     _refuse_others(items, out)
@@ -142,8 +142,8 @@ def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) ->
     needed, free = sum(item.size for item in missing) + SPARE, shutil.disk_usage(out).free
     if needed > free:
         raise InputError(
-            f"out: {needed / 1e9:.2f} GB are to be copied to {out}, and its disk has "
-            f"{free / 1e9:.2f} GB left; free some, or name a folder on another disk."
+            f"out: {needed / 1e9:.2f} GB are to be copied to {out}, but its disk has "
+            f"{free / 1e9:.2f} GB left; free some space, or name a folder on another disk."
         )
     for item in missing:
         _write(item, out / item.target)
@@ -151,7 +151,7 @@ def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) ->
 
 
 def _refuse_others(items: list[Item], out: Path) -> None:
-    """Refuse files beside those that are written, which a reader would take for part of the set."""
+    """Refuse other files in the folders, which a reader would use as well."""
     targets = {item.target for item in items}
     folders = {out / target.rpartition("/")[0] for target in targets if "/" in target}
     found = (path for folder in sorted(folders) if folder.is_dir() for path in folder.iterdir())
@@ -164,13 +164,13 @@ def _refuse_others(items: list[Item], out: Path) -> None:
     ]
     if others:
         raise InputError(
-            f"out: {len(others)} files lie in {out} that the download does not hold, the first is "
+            f"out: {out} contains {len(others)} files that are not in the download, the first is "
             f"{min(others)}; remove them, or name another folder."
         )
 
 
 def _listed(out: Path) -> list[Path]:
-    """What lies in a folder; a file lies in itself."""
+    """Content of a folder; of a file, the file itself."""
     return list(out.iterdir()) if out.is_dir() else [path for path in (out,) if path.exists()]
 
 
@@ -185,8 +185,8 @@ def _lock(descriptor: int, out: Path) -> None:
 
 def _write(item: Item, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Not flushed to the disk one by one, which takes longer than copying: what a failure of power
-    # leaves is found by its length, or by the check that reads everything afterwards.
+    # Files are not flushed one by one, which takes longer than copying. After a power failure the
+    # length, or the check that reads everything, shows the damage.
     temporary = path.with_name(f".{path.name}.part")
     size = 0
     with temporary.open("wb") as file:
@@ -195,7 +195,7 @@ def _write(item: Item, path: Path) -> None:
             size += len(chunk)
     if size != item.size:
         raise InputError(
-            f"{item.content!s} holds {size} bytes and not {item.size}, as was listed; is it still "
-            "being downloaded? Give the same command again when it is complete."
+            f"{item.content!s} holds {size} bytes but {item.size} were listed; is it still "
+            "being downloaded? Repeat the command when it is complete."
         )
     temporary.replace(path)

@@ -1,1 +1,1 @@
-"""What a data set holds and what is wrong with it; `rgbt.data.check` prints it."""
+"""Checks of data sets and their report, which `rgbt.data.check` prints."""

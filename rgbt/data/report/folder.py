@@ -1,18 +1,20 @@
-"""What is checked of somebody's own folder: lists, files without a partner, thermal values."""
+"""Checks of a user's own folder: lists, unused files, thermal values."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import plain
 from rgbt.data.report.lists import listed_twice, shared
-from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
+
+if TYPE_CHECKING:
+    from rgbt.data.folder.dataset import Folder
 
 MOST_CLIPPED = 0.5
-"""Share of the thermal values of a split that may lie outside the range that is read."""
+"""Largest share of the thermal values of a split that may be outside `thermal_range`."""
 
 
 class _Clipped(NamedTuple):
@@ -24,8 +26,8 @@ class _Clipped(NamedTuple):
     highest: float
 
 
-class FolderLayout:
-    """See `rgbt.data.report.values.Layout`."""
+class FolderChecks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: Folder) -> None:
         self.dataset = dataset
@@ -33,22 +35,22 @@ class FolderLayout:
 
     @property
     def title(self) -> str:
-        """Where its images are."""
+        """The patterns of its images."""
         rgb, thermal, _ = self.dataset.patterns
         where = "channel 4" if self.dataset.packed else thermal.text
         return f"RGB {rgb.text}, thermal {where}"
 
     def repeats(self, split: str) -> bool:
-        """Parts of a split by time of day need not be there."""
+        """Parts of a split by time of day need not exist."""
         return split.endswith(("_day", "_night"))
 
-    def times(self, names: tuple[str, ...]) -> Times:
-        """By `dataset.night`; none where it is not given."""
+    def times(self, names: tuple[str, ...]) -> DayNight:
+        """By `dataset.night`; zeros if it is not given."""
         nights = self.dataset.nights(names)
-        return Times(0, 0) if nights is None else Times(len(names) - sum(nights), sum(nights))
+        return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
 
-    def thermal(self, name: str) -> Thermal | None:
-        """Values before they are grey levels; None where they are grey levels already."""
+    def thermal(self, name: str) -> ThermalStatistics | None:
+        """Statistics of the values of the camera; None if the files hold grey levels."""
         limits = self.dataset.thermal_range
         if limits is None:
             return None
@@ -59,7 +61,7 @@ class FolderLayout:
         )
         lowest, highest = (float(end(filled)) if filled.size else 0.0 for end in (np.min, np.max))
         self._clipped[name] = _Clipped(filled.size, below + above, lowest, highest)
-        return Thermal(
+        return ThermalStatistics(
             pixels=values.size,
             empty=values.size - filled.size,
             below=below,
@@ -68,8 +70,8 @@ class FolderLayout:
             highest=int(np.ceil(highest)),
         )
 
-    def problems(self, lists: Lists) -> list[str]:
-        """Names given twice, files that no RGB image goes with, a range that misses the values."""
+    def problems(self, lists: SplitNames) -> list[str]:
+        """Names listed twice, files without an RGB image, a range that excludes the values."""
         splits = self.dataset.splits
         return [
             *listed_twice(lists),
@@ -79,19 +81,17 @@ class FolderLayout:
         ]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """How much of the thermal values lies outside the range, and frames of no split."""
+        """Shares of thermal values outside the range, and frames of no split."""
         return [*self._outside(splits), *self._unlisted()]
 
     def _unused(self) -> list[str]:
-        """Thermal images and labels of which the RGB image is not there."""
+        """Thermal images and labels without an RGB image."""
         dataset = self.dataset
         _, *partners = dataset.patterns
         frames = dataset.frames.values()
         used = {path for frame in frames for path in (frame.rgb, frame.thermal, frame.label)}
-        matching = [
-            found for each in partners if each is not None for found in each.files(dataset.root)
-        ]
-        unused = sorted({found.path for found in matching} - used)
+        matches = [match for each in partners if each for match in each.files(dataset.root)]
+        unused = sorted({match.path for match in matches} - used)
         if not unused:
             return []
         return [
@@ -99,7 +99,7 @@ class FolderLayout:
             f"split, the first is {unused[0]}."
         ]
 
-    def _missed(self, lists: Lists) -> list[str]:
+    def _missed(self, lists: SplitNames) -> list[str]:
         problems = []
         for split, names in lists.items():
             read = [self._clipped[name] for name in set(names) if name in self._clipped]

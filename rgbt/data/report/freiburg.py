@@ -1,16 +1,20 @@
-"""What is checked of Freiburg Thermal alone: partners, frames in two parts, counts of thermal."""
+"""Checks of Freiburg Thermal: missing images, frames in two parts, thermal counts."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from rgbt.data.freiburg import Freiburg
 from rgbt.data.freiburg_layout import unused_files
-from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
+
+if TYPE_CHECKING:
+    from rgbt.data.freiburg import Freiburg
 
 
-class FreiburgLayout:
-    """See `rgbt.data.report.values.Layout`."""
+class FreiburgChecks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: Freiburg) -> None:
         self.dataset = dataset
@@ -24,17 +28,17 @@ class FreiburgLayout:
         """The split "train" is "train_day", and "test" the day followed by the night."""
         return split in ("train", "test")
 
-    def times(self, names: tuple[str, ...]) -> Times:
+    def times(self, names: tuple[str, ...]) -> DayNight:
         """By the folders."""
         nights = sum(self.dataset.nights(names))
-        return Times(len(names) - nights, nights)
+        return DayNight(len(names) - nights, nights)
 
-    def thermal(self, name: str) -> Thermal:
-        """Counts of what is cut out of the frame."""
+    def thermal(self, name: str) -> ThermalStatistics:
+        """Statistics of the counts in the crop."""
         counts = self.dataset.counts(name)
         low, high = self.dataset.thermal_range
         filled = counts[counts > 0]
-        return Thermal(
+        return ThermalStatistics(
             pixels=counts.size,
             empty=counts.size - filled.size,
             below=int(np.count_nonzero(filled < low)),
@@ -43,12 +47,12 @@ class FreiburgLayout:
             highest=int(counts.max()),
         )
 
-    def problems(self, lists: Lists) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:
         """Files without an RGB image, and test frames that training has as well."""
         return [*self._unused(), *self._overlaps(lists)]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """How much of the thermal images lies outside the range that is read."""
+        """Shares of thermal pixels outside `thermal_range`."""
         low, high = self.dataset.thermal_range
         notes = []
         for split in splits:
@@ -72,8 +76,8 @@ class FreiburgLayout:
             f"first is {unused[0]}."
         ]
 
-    def _overlaps(self, lists: Lists) -> list[str]:
-        """Names differ between the parts, so that frames are compared by their time stamps."""
+    def _overlaps(self, lists: SplitNames) -> list[str]:
+        """Frames in two parts, by their time stamps; names differ between the parts."""
         problems = []
         for test in ("test_day", "test_night"):
             for other in ("train_day", "train_night", "val"):

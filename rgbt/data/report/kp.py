@@ -1,11 +1,15 @@
-"""What is checked of KP alone: where its splits come from, days and nights, published numbers."""
+"""Checks of KP: source of its splits, days and nights, published numbers."""
 
 from __future__ import annotations
 
-from rgbt.data.kp import KP
-from rgbt.data.kp_names import NAME, TIMES, is_night, set_of
+from typing import TYPE_CHECKING
+
+from rgbt.data.kp_layout import NAME, TIMES, is_night, set_of
 from rgbt.data.report.lists import listed_twice, other_sizes, other_times, shared
-from rgbt.data.report.values import Lists, SplitReport, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport
+
+if TYPE_CHECKING:
+    from rgbt.data.kp import KP
 
 OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 """Day and night images of each split of the CRM release: 499, 140 and 311."""
@@ -13,32 +17,32 @@ OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 HW = (512, 640)
 
 
-class KPLayout:
-    """See `rgbt.data.report.values.Layout`."""
+class KPChecks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: KP) -> None:
         self.dataset = dataset
 
     @property
     def title(self) -> str:
-        """Which layout images and labels have, and who divides them."""
+        """The layout of images and labels, and the source of the splits."""
         images = "the CRM release" if self.dataset.has_images else "MS-UDA"
         origin = "list files" if self.dataset.lists == "files" else "set numbers"
-        return f"KP as {images} has it, splits from {origin}"
+        return f"KP in the layout of {images}, splits from {origin}"
 
     def repeats(self, split: str) -> bool:
         """Splits by time of day only repeat names of others."""
         return split.endswith(("_day", "_night"))
 
-    def times(self, names: tuple[str, ...]) -> Times:
+    def times(self, names: tuple[str, ...]) -> DayNight:
         """By the sets."""
         nights = sum(self.dataset.nights(names))
-        return Times(len(names) - nights, nights)
+        return DayNight(len(names) - nights, nights)
 
     def thermal(self, name: str) -> None:
-        """Thermal images come as grey levels."""
+        """None: thermal images are grey levels."""
 
-    def problems(self, lists: Lists) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice, in two splits or at the wrong time; labels that are in no split."""
         return [
             *listed_twice(lists),
@@ -49,29 +53,29 @@ class KPLayout:
         ]
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """Who divides the images, and how the numbers differ from the published split."""
+        """The source of the splits, and differences from the published split."""
         notes = [self._division()]
         if self.dataset.name != "kp":
             return notes
         if self._is_ms_uda(splits):
             notes.append(
-                "training holds days and validation nights alone, as MS-UDA divides KP: scores do "
-                "not compare with those of CRM, which trains on both; dataset.lists=sets is CRM's "
-                "division."
+                "the training split has only days and the validation split only nights, as in "
+                "MS-UDA: scores are not comparable with those of CRM, which trains on both; "
+                "dataset.lists=sets divides as CRM does."
             )
         return [*notes, *other_times(splits, OFFICIAL_DAY_NIGHT), *other_sizes(splits, HW)]
 
     def _division(self) -> str:
         if self.dataset.lists == "sets":
             return (
-                "no list is read: splits are all labels on disk, divided by set numbers as in the "
-                "CRM release."
+                "no list is read: all labels on disk are divided into splits by set numbers, as in "
+                "the CRM release."
             )
         files = [path for split in self.dataset.splits for path in self.dataset.list_files(split)]
         return f"splits are read from the lists {', '.join(dict.fromkeys(files)) or '(none)'}."
 
     def _share_a_list(self, one: str, other: str) -> bool:
-        """Whether the configuration reads both from one file, as for a set without a test list."""
+        """Whether the configuration reads both from one file, for example without a test list."""
         return not set(self.dataset.list_files(one)).isdisjoint(self.dataset.list_files(other))
 
     def _is_ms_uda(self, splits: tuple[SplitReport, ...]) -> bool:
@@ -84,15 +88,14 @@ class KPLayout:
         sets = {set_of(name) for name in self.dataset.names("train")} if is_divided else set()
         return not sets.isdisjoint({6, 7, 8})
 
-    def _unlisted(self, lists: Lists) -> list[str]:
+    def _unlisted(self, lists: SplitNames) -> list[str]:
         listed = set().union(*lists.values())
         unlisted = [name for name in self.dataset.labels_on_disk if name not in listed]
         strange = [name for name in unlisted if NAME.fullmatch(name) is None]
         problems = []
         if strange:
             problems.append(
-                f"{len(strange)} labels have names that say no set, the first is "
-                f"'{strange[0]}.png'."
+                f"{len(strange)} labels have names without a set, the first is '{strange[0]}.png'."
             )
         if len(unlisted) > len(strange):
             first = next(name for name in unlisted if name not in set(strange))
@@ -103,7 +106,7 @@ class KPLayout:
         return problems
 
 
-def _wrong_times(lists: Lists) -> list[str]:
+def _wrong_times(lists: SplitNames) -> list[str]:
     problems = []
     for split, names in lists.items():
         time = split.rpartition("_")[2]
@@ -116,8 +119,8 @@ def _wrong_times(lists: Lists) -> list[str]:
     return problems
 
 
-def _lists_that_disagree(lists: Lists) -> list[str]:
-    """Where all three are listed, a split is its day and its night."""
+def _lists_that_disagree(lists: SplitNames) -> list[str]:
+    """Problems of splits that are not the union of their day and their night."""
     problems = []
     for split, names in lists.items():
         parts = [f"{split}_{time}" for time in TIMES]

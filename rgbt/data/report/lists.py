@@ -1,4 +1,4 @@
-"""What is checked of any lists of names, and how numbers of days and nights are compared."""
+"""Checks of lists of names, of numbers of days and nights, and of image sizes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from itertools import combinations
 
-from rgbt.data.report.values import Lists, SplitReport
+from rgbt.data.report.values import SplitNames, SplitReport
 
 
-def listed_twice(lists: Lists) -> list[str]:
+def listed_twice(lists: SplitNames) -> list[str]:
     """Names that one split lists several times."""
     return [
         f"split {split} lists '{name}' {count} times."
@@ -19,12 +19,14 @@ def listed_twice(lists: Lists) -> list[str]:
     ]
 
 
-def shared(lists: Lists, may_share: Callable[[str, str], bool] = lambda *_: False) -> list[str]:
+def shared(
+    lists: SplitNames, may_share: Callable[[str, str], bool] = lambda *_: False
+) -> list[str]:
     """Names in two splits, unless one is a part of the other by name.
 
     Args:
         lists: split -> names.
-        may_share: whether two splits that are no parts of each other may have names in common.
+        may_share: whether two splits may have names in common although neither is a part.
     """
     problems = []
     for one, other in combinations(lists, 2):
@@ -48,31 +50,31 @@ def is_part(one: str, other: str) -> bool:
 def other_times(
     splits: tuple[SplitReport, ...], official: Mapping[str, tuple[int, int]]
 ) -> list[str]:
-    """How numbers of day and night images differ from the official ones.
+    """Differences from the official numbers of day and night images.
 
     Args:
-        splits: what was read.
-        official: split -> (day, night), of the splits that are compared.
+        splits: of the report.
+        official: split -> (day, night) of the splits that are compared.
     """
     notes = []
     for split in splits:
-        found = (split.num_day, split.num_night)
-        expected = official.get(split.split, found)
-        if found != expected:
+        counts = (split.num_day, split.num_night)
+        expected = official.get(split.split, counts)
+        if counts != expected:
             notes.append(
-                f"split {split.split} has {found[0]} day and {found[1]} night images, the "
+                f"split {split.split} has {counts[0]} day and {counts[1]} night images, the "
                 f"official list has {expected[0]} and {expected[1]} ({sum(expected)} in all)."
             )
     return notes
 
 
 def other_sizes(splits: tuple[SplitReport, ...], official: tuple[int, int]) -> list[str]:
-    """Which sizes images have beside the official (height, width)."""
+    """Image sizes other than the official (height, width)."""
     others = sorted({size for split in splits for size in split.sizes} - {official})
     if not others:
         return []
     listed = ", ".join(f"{height}x{width}" for height, width in others)
     return [
         f"images are {listed}, the original ones {official[0]}x{official[1]}: scores of resized "
-        "images do not compare with those of whole ones."
+        "images are not comparable with those of original ones."
     ]

@@ -1,16 +1,20 @@
-"""What is checked of PST900 alone: the two parts, their recordings, pixels without thermal."""
+"""Checks of PST900: the two parts, their recordings, pixels without thermal values."""
 
 from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rgbt.data.named_files import names_in
-from rgbt.data.pst900 import FOLDERS, PST900, bag_of
+from rgbt.data.pst900_layout import FOLDERS, bag_of
 from rgbt.data.report.lists import listed_twice, other_sizes, shared
-from rgbt.data.report.values import Lists, SplitReport, Thermal, Times
+from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
+
+if TYPE_CHECKING:
+    from rgbt.data.pst900 import PST900
 
 NUM_TRAIN = 597
 """Pairs of the training part on disk; the data set's page says 606."""
@@ -21,30 +25,30 @@ TEST_BAGS = {21: 40, 22: 59, 23: 28, 24: 72, 25: 89}
 HW = (720, 1280)
 
 
-class PST900Layout:
-    """See `rgbt.data.report.values.Layout`."""
+class PST900Checks:
+    """See `rgbt.data.report.values.DatasetChecks`."""
 
     def __init__(self, dataset: PST900) -> None:
         self.dataset = dataset
 
     @property
     def title(self) -> str:
-        """Which of the two layouts it is."""
+        """One of the two layouts."""
         return f"PST900 in {'lists' if self.dataset.has_lists else 'folders'}"
 
     def repeats(self, split: str) -> bool:
         """The validation split is the test part, unless it has a list or bags of its own."""
         return self._is_test(split) and split != "test"
 
-    def times(self, names: tuple[str, ...]) -> Times:  # noqa: ARG002 - as every layout
-        """There is no day underground."""
-        return Times(0, 0)
+    def times(self, names: tuple[str, ...]) -> DayNight:  # noqa: ARG002 - as every layout
+        """None: images are taken underground."""
+        return DayNight(0, 0)
 
-    def thermal(self, name: str) -> Thermal:
+    def thermal(self, name: str) -> ThermalStatistics:
         """Grey levels; those of 0 were not measured."""
         thermal = self.dataset.thermal(name)
         filled = thermal[thermal > 0]
-        return Thermal(
+        return ThermalStatistics(
             pixels=thermal.size,
             empty=thermal.size - filled.size,
             below=0,
@@ -53,7 +57,7 @@ class PST900Layout:
             highest=int(thermal.max()),
         )
 
-    def problems(self, lists: Lists) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice or in two parts, files that belong to no image of a split."""
         own = {split: names for split, names in lists.items() if not self.repeats(split)}
         return [*listed_twice(own), *shared(own), *self._unused(own)]
@@ -74,8 +78,8 @@ class PST900Layout:
             "chosen on what is reported; dataset.val_bags takes recordings out of training instead."
         )
 
-    def _unused(self, lists: Lists) -> list[str]:
-        """Files that no image of a split opens."""
+    def _unused(self, lists: SplitNames) -> list[str]:
+        """Files that belong to no sample of a split."""
         unused: list[Path] = []
         for folder in self.dataset.folders():
             with_rgb = names_in(folder / FOLDERS[0])

@@ -1,18 +1,18 @@
-"""What a check of a data set finds, as values."""
+"""The report of a data set, and the checks that a data set declares for it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-Counts = NDArray[np.int64]
+PixelCounts = NDArray[np.int64]
 
 
-class Times(NamedTuple):
-    """Names of a split by time of day; mirrored copies are counted apart."""
+class DayNight(NamedTuple):
+    """Images of a split by time of day; mirrored copies are counted separately."""
 
     day: int
     night: int
@@ -28,14 +28,14 @@ class SplitReport:
         num_names: lines of the list, or frames of the folders.
         num_read: names that could be read, each counted once.
         num_unlabelled: of these, those without a label.
-        num_day: names of day images; mirrored copies apart.
-        num_night: names of night images; mirrored copies apart.
+        num_day: names of day images without mirrored copies.
+        num_night: names of night images without mirrored copies.
         num_flipped: names of mirrored copies.
         sizes: (height, width) -> number of images.
         pixels: (K + 1,) pixels per class; the last are ignored.
         images: (K + 1,) images in which a class occurs.
-        thermal: what was counted of thermal images before they became grey; None where they come
-            as grey levels.
+        thermal: statistics of the thermal images before conversion to grey levels; None if the
+            files hold grey levels.
     """
 
     split: str
@@ -46,12 +46,12 @@ class SplitReport:
     num_night: int
     num_flipped: int
     sizes: dict[tuple[int, int], int]
-    pixels: Counts
-    images: Counts
-    thermal: Thermal | None
+    pixels: PixelCounts
+    images: PixelCounts
+    thermal: ThermalStatistics | None
 
 
-class Thermal(NamedTuple):
+class ThermalStatistics(NamedTuple):
     """Pixels of thermal images by their counts.
 
     Attributes:
@@ -72,20 +72,20 @@ class Thermal(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Report:
-    """A data set: its splits, what is wrong, what is worth knowing; one sentence each."""
+class DatasetReport:
+    """A data set: its splits, and one sentence for each problem and each note."""
 
     splits: tuple[SplitReport, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 
 
-Lists = dict[str, tuple[str, ...]]
-"""Split -> names, of the splits that could be listed."""
+SplitNames = dict[str, tuple[str, ...]]
+"""Split -> names, of the splits whose names could be read."""
 
 
-class Layout(Protocol):
-    """What is to be known about a data set beside what every data set has."""
+class DatasetChecks(Protocol):
+    """The checks of one data set, in addition to those of every data set."""
 
     @property
     def title(self) -> str:
@@ -93,21 +93,30 @@ class Layout(Protocol):
         ...
 
     def repeats(self, split: str) -> bool:
-        """Whether a split that cannot be listed only repeats what other splits hold."""
+        """Whether a split only repeats images of other splits, and need not exist."""
         ...
 
-    def times(self, names: tuple[str, ...]) -> Times:
-        """How many names are of the day and of the night."""
+    def times(self, names: tuple[str, ...]) -> DayNight:
+        """Number of day and of night images."""
         ...
 
-    def thermal(self, name: str) -> Thermal | None:
-        """Counts of one thermal image; InputError as where it is read."""
+    def thermal(self, name: str) -> ThermalStatistics | None:
+        """Counts of one thermal image, or None; InputError if it cannot be read."""
         ...
 
-    def problems(self, lists: Lists) -> list[str]:
-        """What is wrong with names and files, without opening any."""
+    def problems(self, lists: SplitNames) -> list[str]:
+        """Problems of names and files; no file is opened."""
         ...
 
     def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
-        """What is worth knowing about what was read."""
+        """Remarks about the samples that were read."""
+        ...
+
+
+@runtime_checkable
+class Checkable(Protocol):
+    """A data set that declares its checks."""
+
+    def checks(self) -> DatasetChecks:
+        """The checks of this data set."""
         ...

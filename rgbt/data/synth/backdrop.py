@@ -8,7 +8,7 @@ import numpy as np
 
 from rgbt.data.synth.shapes import (
     MAX_CORNERS,
-    Part,
+    Face,
     Shape,
     box,
     disc,
@@ -33,7 +33,7 @@ def building() -> Shape:
 @cache
 def vent() -> Shape:
     """A warm outlet on a wall: a distractor that only the thermal camera notices."""
-    return shape_of([Part(sideways(rectangle(-0.5, 0.0, 0.5, 0.7)), "vent", thin=True)])
+    return shape_of([Face(sideways(rectangle(-0.5, 0.0, 0.5, 0.7)), "vent", thin=True)])
 
 
 @cache
@@ -54,10 +54,10 @@ def tree(kind: int, near: bool = True) -> Shape:
         near: with branches and six blobs rather than three.
     """
     generator = numpy_generator(0, "synth/tree", kind)
-    parts = [Part(upright(tube((0, 0), (0.1, 2.8), 0.30)), "bark", thin=True)]
+    parts = [Face(upright(tube((0, 0), (0.1, 2.8), 0.30)), "bark", thin=True)]
     if near:
         parts += [
-            Part(upright(tube((0.08, 2.0), (x, 3.6), 0.12)), "bark", thin=True) for x in (-0.8, 0.9)
+            Face(upright(tube((0.08, 2.0), (x, 3.6), 0.12)), "bark", thin=True) for x in (-0.8, 0.9)
         ]
     for level, material in enumerate(
         ("leaf_dark", "leaf_dark", "leaf", "leaf", "leaf_light", "leaf_light")
@@ -67,7 +67,7 @@ def tree(kind: int, near: bool = True) -> Shape:
         radius = float(generator.uniform(1.0, 1.5)) * (1.1 - 0.09 * level)
         blob = _blob(generator, x, y, radius)
         if near or level % 2 == 0:
-            parts.append(Part(upright(blob, -0.04 * level), material, thin=True))
+            parts.append(Face(upright(blob, -0.04 * level), material, thin=True))
     return shape_of(parts)
 
 
@@ -88,7 +88,7 @@ def hedge() -> Shape:
     generator = numpy_generator(0, "synth/hedge")
     parts = box((-0.5, 0.0, -0.5), (0.5, 0.9, 0.5), ("leaf_dark", "leaf", "leaf_light"))
     parts += [
-        Part(upright(_blob(generator, x, 0.72, 0.34), -0.51), "leaf", thin=True)
+        Face(upright(_blob(generator, x, 0.72, 0.34), -0.51), "leaf", thin=True)
         for x in (-0.2, 0.2)
     ]
     return shape_of(parts)
@@ -99,10 +99,10 @@ def street_lamp() -> Shape:
     """A pole of 6.5 m with an arm towards +x and a lamp."""
     return shape_of(
         [
-            Part(upright(rectangle(-0.07, 0.0, 0.07, 6.4)), "pole", thin=True),
-            Part(upright(rectangle(0.0, 6.3, 1.5, 6.4)), "pole", thin=True),
-            Part(upright(rectangle(1.0, 6.2, 1.7, 6.36), -0.01), "lamp", thin=True),
-            Part(sideways(rectangle(-0.3, 6.2, 0.3, 6.34), 1.4), "lamp", thin=True),
+            Face(upright(rectangle(-0.07, 0.0, 0.07, 6.4)), "pole", thin=True),
+            Face(upright(rectangle(0.0, 6.3, 1.5, 6.4)), "pole", thin=True),
+            Face(upright(rectangle(1.0, 6.2, 1.7, 6.36), -0.01), "lamp", thin=True),
+            Face(sideways(rectangle(-0.3, 6.2, 0.3, 6.34), 1.4), "lamp", thin=True),
         ]
     )
 
@@ -112,10 +112,10 @@ def utility_pole() -> Shape:
     """A concrete pole of 9 m with cross-arms and a warm transformer."""
     return shape_of(
         [
-            Part(upright(rectangle(-0.15, 0.0, 0.15, 9.0)), "pole", thin=True),
-            Part(upright(rectangle(-0.9, 8.2, 0.9, 8.34), -0.01), "pole", thin=True),
-            Part(upright(rectangle(-0.7, 7.4, 0.7, 7.52), -0.01), "pole", thin=True),
-            Part(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "transformer", thin=True),
+            Face(upright(rectangle(-0.15, 0.0, 0.15, 9.0)), "pole", thin=True),
+            Face(upright(rectangle(-0.9, 8.2, 0.9, 8.34), -0.01), "pole", thin=True),
+            Face(upright(rectangle(-0.7, 7.4, 0.7, 7.52), -0.01), "pole", thin=True),
+            Face(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "transformer", thin=True),
         ]
     )
 
@@ -123,7 +123,7 @@ def utility_pole() -> Shape:
 @cache
 def wire() -> Shape:
     """A cable of one metre along z, scaled to the distance of two poles."""
-    return shape_of([Part(sideways(rectangle(0.0, 0.0, 1.0, 0.05)), "wire", thin=True)])
+    return shape_of([Face(sideways(rectangle(0.0, 0.0, 1.0, 0.05)), "wire", thin=True)])
 
 
 NUM_SIGNS = 3
@@ -136,17 +136,17 @@ def sign(kind: int) -> Shape:
     Args:
         kind: 0 to `NUM_SIGNS` - 1.
     """
-    parts = [Part(upright(rectangle(-0.04, 0.0, 0.04, 2.7)), "pole", thin=True)]
+    parts = [Face(upright(rectangle(-0.04, 0.0, 0.04, 2.7)), "pole", thin=True)]
     if kind == 0:
         rings = ((0.34, "sign_red"), (0.25, "sign_white"), (0.12, "sign_blue"))
         parts += [
-            Part(upright(disc(0, 2.6, radius), -0.01 * n), name, thin=True)
+            Face(upright(disc(0, 2.6, radius), -0.01 * n), name, thin=True)
             for n, (radius, name) in enumerate(rings, 1)
         ]
     else:
         plate = rectangle(-0.32, 2.2, 0.32, 2.9) if kind == 1 else rectangle(-0.25, 1.6, 0.25, 2.9)
         parts.append(
-            Part(upright(plate, -0.01), "sign_blue" if kind == 1 else "sign_white", thin=True)
+            Face(upright(plate, -0.01), "sign_blue" if kind == 1 else "sign_white", thin=True)
         )
     return shape_of(parts)
 
@@ -156,14 +156,14 @@ def vending_machine() -> Shape:
     """A vending machine: warm all day and glowing by night."""
     parts = box((-0.4, 0.0, -0.5), (0.4, 1.85, 0.5), ("vending_body", "vending", "vending_body"))
     for x in (-0.41, 0.41):
-        parts.append(Part(sideways(rectangle(-0.45, 0.1, 0.45, 0.75), x), "vending_body"))
+        parts.append(Face(sideways(rectangle(-0.45, 0.1, 0.45, 0.75), x), "vending_body"))
     return shape_of(parts)
 
 
 @cache
 def skyline() -> Shape:
     """One square metre facing the camera, scaled to a block on the horizon."""
-    return shape_of([Part(upright(rectangle(-0.5, 0.0, 0.5, 1.0)), "far_wall", paint=1, thin=True)])
+    return shape_of([Face(upright(rectangle(-0.5, 0.0, 0.5, 1.0)), "far_wall", paint=1, thin=True)])
 
 
 @cache
@@ -171,7 +171,7 @@ def far_trees() -> Shape:
     """A line of trees on the horizon, 10 m by 1 m, scaled to size."""
     generator = numpy_generator(0, "synth/far_trees")
     blobs = [_blob(generator, x, 0.40, 0.95) for x in np.linspace(-4.6, 4.6, 7).tolist()]
-    parts = [Part(upright(rectangle(-5.4, 0.0, 5.4, 0.65)), "leaf_dark", thin=True)]
+    parts = [Face(upright(rectangle(-5.4, 0.0, 5.4, 0.65)), "leaf_dark", thin=True)]
     return shape_of(
-        [*parts, *(Part(upright(blob, -0.01), "leaf_dark", thin=True) for blob in blobs)]
+        [*parts, *(Face(upright(blob, -0.01), "leaf_dark", thin=True) for blob in blobs)]
     )

@@ -1,6 +1,6 @@
 """Pinhole camera above the ground plane: projection, rays, and the motion between two frames.
 
-World: X right, Y up, Z ahead, metres, ground at Y = 0. Camera: x right, y down, z ahead.
+World: X right, Y up, Z ahead, metres, ground at Y = 0. SynthCamera: x right, y down, z ahead.
 Pixels: the centre of the top-left pixel is (0, 0).
 """
 
@@ -29,7 +29,7 @@ NEAR_M = 0.3
 
 
 @dataclass(frozen=True)
-class Camera:
+class SynthCamera:
     """Where the camera stands and how it looks.
 
     Attributes:
@@ -96,7 +96,7 @@ class Camera:
         depth = np.reciprocal(np.maximum(inverse_depth_HW, np.float32(1e-4)))
         return self.turned(rays_3HW) * depth + floats(self.position)[:, None, None]
 
-    def moved(self, motion: EgoMotion) -> Camera:
+    def moved(self, motion: EgoMotion) -> SynthCamera:
         """The camera after `motion`."""
         yaw = self.yaw + float(np.deg2rad(motion.yaw_deg))
         x, y, z = self.position
@@ -108,10 +108,10 @@ class Camera:
         )
 
 
-def camera_of(factors: SceneFactors) -> Camera:
+def camera_of(factors: SceneFactors) -> SynthCamera:
     """The camera that the factors describe, above the origin, looking along Z."""
     half_angle = np.deg2rad(factors.field_of_view_deg) / 2
-    return Camera(
+    return SynthCamera(
         height=factors.height,
         width=factors.width,
         focal=float(factors.width / 2 / np.tan(half_angle)),
@@ -120,7 +120,7 @@ def camera_of(factors: SceneFactors) -> Camera:
     )
 
 
-def flow_between(depth_HW: Floats, source: Camera, target: Camera) -> Floats:
+def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> Floats:
     """Where each pixel of `source` lies in `target`, for a scene in which nothing else moves.
 
         p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
@@ -151,7 +151,7 @@ def flow_between(depth_HW: Floats, source: Camera, target: Camera) -> Floats:
     return np.asarray(np.stack([rows, columns], axis=2) * np.float32(focal), np.float32)
 
 
-def ground_homography(source: Camera, target: Camera) -> NDArray[np.float64]:
+def ground_homography(source: SynthCamera, target: SynthCamera) -> NDArray[np.float64]:
     """Homography that maps ground pixels of `source` to `target`.
 
         H = K' (R' R^T + R' (C - C') n^T / d) K^-1
@@ -169,6 +169,6 @@ def ground_homography(source: Camera, target: Camera) -> NDArray[np.float64]:
     return np.asarray(homography / homography[2, 2])
 
 
-def _intrinsics(camera: Camera) -> NDArray[np.float64]:
+def _intrinsics(camera: SynthCamera) -> NDArray[np.float64]:
     column, row = camera.centre
     return np.array([[camera.focal, 0, column], [0, camera.focal, row], [0, 0, 1.0]])

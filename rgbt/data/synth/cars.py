@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from rgbt.data.synth.shapes import (
     CAR,
-    Part,
+    Face,
     Shape,
     disc,
     flat,
@@ -53,19 +53,19 @@ def car(kind: int) -> Shape:
     return shape_of(parts)
 
 
-def _underside(body: _Body, half: float) -> list[Part]:
+def _underside(body: _Body, half: float) -> list[Face]:
     tail, front = -body.length / 2 + 0.1, body.length / 2 - 0.1
     sill = rectangle(tail, 0.10, front, 0.36)
     ends = rectangle(-half + 0.06, 0.12, half - 0.06, 0.36)
     return [
-        Part(sideways(sill, -half + 0.03), "underside", CAR),
-        Part(sideways(sill, half - 0.03), "underside", CAR),
-        Part(upright(ends, tail), "underside", CAR),
-        Part(upright(ends, front), "underside", CAR),
+        Face(sideways(sill, -half + 0.03), "underside", CAR),
+        Face(sideways(sill, half - 0.03), "underside", CAR),
+        Face(upright(ends, tail), "underside", CAR),
+        Face(upright(ends, front), "underside", CAR),
     ]
 
 
-def _shell(body: _Body, half: float) -> list[Part]:
+def _shell(body: _Body, half: float) -> list[Face]:
     tail, front, belt = -body.length / 2, body.length / 2, body.belt
     side = [(tail + 0.06, 0.30), (front - 0.06, 0.30), (front, 0.52), (front - 0.08, 0.74)]
     side += [(body.hood_z, belt), (body.trunk_z, belt), (tail + 0.05, belt - 0.05), (tail, 0.52)]
@@ -82,16 +82,16 @@ def _shell(body: _Body, half: float) -> list[Part]:
     rear = [(-half, 0.30, tail), (half, 0.30, tail), (half, belt - 0.05, tail + 0.05)]
     rear += [(-half, belt - 0.05, tail + 0.05)]
     return [
-        Part(sideways(side, -half), "paint", CAR, 1),
-        Part(sideways(side, half), "paint", CAR, 1),
-        Part(hood, "hood", CAR, 1, thin=True),
-        Part(trunk, "paint", CAR, 1, thin=True),
-        Part(nose, "hood", CAR, 1),
-        Part(rear, "paint", CAR, 1),
+        Face(sideways(side, -half), "paint", CAR, 1),
+        Face(sideways(side, half), "paint", CAR, 1),
+        Face(hood, "hood", CAR, 1, thin=True),
+        Face(trunk, "paint", CAR, 1, thin=True),
+        Face(nose, "hood", CAR, 1),
+        Face(rear, "paint", CAR, 1),
     ]
 
 
-def _cabin(body: _Body, half: float) -> list[Part]:
+def _cabin(body: _Body, half: float) -> list[Face]:
     belt, roof, (z0, z1) = body.belt, body.roof, body.roof_z
     front, back = body.hood_z, body.trunk_z
     side = [(back, belt), (front, belt), (z1, roof), (z0, roof)]
@@ -110,10 +110,10 @@ def _cabin(body: _Body, half: float) -> list[Part]:
     ]
     parts = []
     for x in (-half, half):
-        parts.append(Part(sideways(side, x), "paint", CAR, 1))
+        parts.append(Face(sideways(side, x), "paint", CAR, 1))
         outside = x * 1.01
         parts += [
-            Part(sideways(glass, outside), "glass", CAR) for glass in (glass_back, glass_front)
+            Face(sideways(glass, outside), "glass", CAR) for glass in (glass_back, glass_front)
         ]
     for low_z, high_z in ((back, z0), (front, z1)):
         frame = [
@@ -122,9 +122,9 @@ def _cabin(body: _Body, half: float) -> list[Part]:
             (half, roof, high_z),
             (-half, roof, high_z),
         ]
-        parts.append(Part(frame, "paint", CAR, 1))
-        parts.append(Part(_inset(frame, 0.10), "glass", CAR))
-    parts.append(Part(flat(rectangle(-half, z0, half, z1), roof), "paint", CAR, 1))
+        parts.append(Face(frame, "paint", CAR, 1))
+        parts.append(Face(_inset(frame, 0.10), "glass", CAR))
+    parts.append(Face(flat(rectangle(-half, z0, half, z1), roof), "paint", CAR, 1))
     return parts
 
 
@@ -137,29 +137,29 @@ def _inset(
     return [(x, y, z) for x, y, z in moved]
 
 
-def _ends(body: _Body, half: float) -> list[Part]:
+def _ends(body: _Body, half: float) -> list[Face]:
     tail, front = -body.length / 2 - 0.01, body.length / 2 + 0.01
     bumper = rectangle(-half, 0.30, half, 0.42)
     plate = rectangle(-0.24, 0.46, 0.24, 0.58)
     parts = [
-        Part(upright(bumper, tail), "trim", CAR),
-        Part(upright(bumper, front), "trim", CAR),
-        Part(upright(rectangle(-0.45, 0.44, 0.45, 0.62), front), "trim", CAR),
-        Part(upright(plate, tail - 0.01), "plate", CAR),
-        Part(upright(plate, front + 0.01), "plate", CAR),
+        Face(upright(bumper, tail), "trim", CAR),
+        Face(upright(bumper, front), "trim", CAR),
+        Face(upright(rectangle(-0.45, 0.44, 0.45, 0.62), front), "trim", CAR),
+        Face(upright(plate, tail - 0.01), "plate", CAR),
+        Face(upright(plate, front + 0.01), "plate", CAR),
     ]
     for side in (-1, 1):
         lamp = rectangle(side * (half - 0.32), 0.60, side * (half - 0.02), 0.76)
-        parts.append(Part(upright(lamp, tail - 0.01), "tail_lamp", CAR))
+        parts.append(Face(upright(lamp, tail - 0.01), "tail_lamp", CAR))
         lamp = rectangle(side * (half - 0.36), 0.54, side * (half - 0.03), 0.70)
-        parts.append(Part(upright(lamp, front + 0.01), "headlamp", CAR))
+        parts.append(Face(upright(lamp, front + 0.01), "headlamp", CAR))
     return parts
 
 
-def _wheels(body: _Body, half: float) -> list[Part]:
+def _wheels(body: _Body, half: float) -> list[Face]:
     parts = []
     for x in (-half - 0.01, half + 0.01):
         for z in (-body.length * 0.3, body.length * 0.32):
-            parts.append(Part(sideways(disc(z, 0.31, 0.32), x), "tyre", CAR))
-            parts.append(Part(sideways(disc(z, 0.31, 0.19), x * 1.01), "rim", CAR))
+            parts.append(Face(sideways(disc(z, 0.31, 0.32), x), "tyre", CAR))
+            parts.append(Face(sideways(disc(z, 0.31, 0.19), x * 1.01), "rim", CAR))
     return parts

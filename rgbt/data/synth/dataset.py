@@ -16,7 +16,7 @@ from rgbt.data.synth.factors import (
     YawDegrees,
     with_factors,
 )
-from rgbt.data.synth.writer import Plan, write
+from rgbt.data.synth.writer import SynthPlan, write
 from rgbt.ranges import Seed, Text
 
 VERSION = 2
@@ -36,7 +36,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     ego_forward_m: ForwardMetres | None = None,
     ego_yaw_deg: YawDegrees = 0.0,
 ) -> MFNet:
-    """The synthetic data set with these factors, generated if no earlier call has done so.
+    """The synthetic data set with these factors, generated on first use.
 
     Args:
         cache_dir: folder that holds written data sets; None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt.
@@ -59,11 +59,11 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     """
     if ego_forward_m is None and ego_yaw_deg != 0:
         raise InputError(
-            f"dataset.ego_yaw_deg is {ego_yaw_deg:g} but no second frame is asked for; "
+            f"dataset.ego_yaw_deg is {ego_yaw_deg:g} but no second frame is requested; "
             "set dataset.ego_forward_m too (0 to turn on the spot)."
         )
     motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
-    plan = Plan(
+    plan = SynthPlan(
         seed=seed,
         num_train=num_train,
         num_val=num_val,
@@ -74,7 +74,7 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     return MFNet(str(cached(plan, cache_of(cache_dir))), name="synth", num_classes=num_classes)
 
 
-def cached(plan: Plan, cache: Path) -> Path:
+def cached(plan: SynthPlan, cache: Path) -> Path:
     """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
 
     Raises:
@@ -84,10 +84,10 @@ def cached(plan: Plan, cache: Path) -> Path:
     return written_once(folder, _described(plan), lambda made: write(plan, made))
 
 
-def plan_key(plan: Plan) -> str:
+def plan_key(plan: SynthPlan) -> str:
     """12 hexadecimal digits that name the plan: a hash of all its numbers and `VERSION`."""
     return key_of(_described(plan))
 
 
-def _described(plan: Plan) -> str:
+def _described(plan: SynthPlan) -> str:
     return described({"version": VERSION}, plan)

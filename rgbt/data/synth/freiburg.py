@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.data.freiburg import THERMAL_RANGE, Counts, Crop, Freiburg
+from rgbt.data.freiburg import THERMAL_RANGE, CountRange, Crop, Freiburg
 from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
@@ -25,7 +25,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     num_classes: Literal[14] = 14,
     unscored: Names = ("background", "ignore"),
     crop: Crop | None = (1, 97, 48, 240),
-    thermal_range: Counts = THERMAL_RANGE,
+    thermal_range: CountRange = THERMAL_RANGE,
     ignored_test: Names = ("ignore",),
     seed: Seed = 0,
     num_train_day: NumScenes = 300,
@@ -34,7 +34,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     num_test: Annotated[int, Interval(ge=2, le=30_000)] = 60,
     factors: SceneFactors,
 ) -> Freiburg:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     Labels are exact, those for training too, which in the real data set a network has predicted.
     "ignore" is in test labels alone: what the thermal camera does not see.

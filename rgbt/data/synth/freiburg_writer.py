@@ -66,7 +66,7 @@ class FreiburgPlan:
     num_test: int
     factors: SceneFactors
 
-    def shots(self) -> tuple[Shot, ...]:
+    def shots(self) -> tuple[FrameToWrite, ...]:
         """Every frame, numbered over all splits: no scene is in two of them."""
         parts: list[tuple[str, bool]] = [
             *_in_sequences("day", self.num_train_day, _DAY_SEQUENCES),
@@ -75,10 +75,10 @@ class FreiburgPlan:
             *(("test/day", False) for _ in range(self.num_test - self.num_test // 2)),
             *(("test/night", True) for _ in range(self.num_test // 2)),
         ]
-        return tuple(Shot(index, part, night) for index, (part, night) in enumerate(parts))
+        return tuple(FrameToWrite(index, part, night) for index, (part, night) in enumerate(parts))
 
 
-class Shot(NamedTuple):
+class FrameToWrite(NamedTuple):
     """One frame to be written: number of its scene, its folder, whether it is night."""
 
     scene: int
@@ -108,7 +108,9 @@ def write(plan: FreiburgPlan, folder: Path) -> None:
     write_each(partial(_write_numbered, plan, shots, folder), len(shots))
 
 
-def _write_numbered(plan: FreiburgPlan, shots: tuple[Shot, ...], folder: Path, number: int) -> None:
+def _write_numbered(
+    plan: FreiburgPlan, shots: tuple[FrameToWrite, ...], folder: Path, number: int
+) -> None:
     cv2.setNumThreads(1)
     shot = shots[number]
     factors = replace(plan.factors, night_share=float(shot.night))
@@ -121,7 +123,11 @@ def _write_numbered(plan: FreiburgPlan, shots: tuple[Shot, ...], folder: Path, n
 
 
 def _write_training(
-    shot: Shot, piece: Path, scene: Scene, ids: NDArray[np.uint8], counts: NDArray[np.uint16]
+    shot: FrameToWrite,
+    piece: Path,
+    scene: Scene,
+    ids: NDArray[np.uint8],
+    counts: NDArray[np.uint16],
 ) -> None:
     _write(piece / RGB / f"{RGB}_{shot.stamp}.png", _bgr(scene))
     _write(piece / THERMAL / f"{THERMAL}_{shot.stamp}.png", counts)
@@ -133,7 +139,7 @@ def _write_training(
 
 
 def _write_test(
-    shot: Shot, part: Path, scene: Scene, ids: NDArray[np.uint8], counts: NDArray[np.uint16]
+    shot: FrameToWrite, part: Path, scene: Scene, ids: NDArray[np.uint8], counts: NDArray[np.uint16]
 ) -> None:
     rgb, thermal = _TEST_FOLDERS[shot.night]
     of_thermal = shot.stamp if shot.night else shot.stamp.removesuffix("0")

@@ -9,7 +9,7 @@ from rgbt.data.synth.shapes import (
     CAR_STOP,
     COLOR_CONE,
     GUARDRAIL,
-    Part,
+    Face,
     Point,
     Shape,
     box,
@@ -40,14 +40,14 @@ def _cone_half(y: float) -> float:
 
 def _wedge(
     halves: tuple[float, float], heights: tuple[float, float], material: str, label: int
-) -> list[Part]:
+) -> list[Face]:
     """Left and right half of a round post, meeting in an edge towards the camera."""
     (low_half, high_half), (low, high) = halves, heights
     parts = []
     for side in (-1, 1):
         outline: list[Point] = [(0.0, low, -low_half), (side * low_half, low, 0.0)]
         outline += [(side * high_half, high, 0.0), (0.0, high, -high_half)]
-        parts.append(Part(outline, material, label, thin=True))
+        parts.append(Face(outline, material, label, thin=True))
     return parts
 
 
@@ -68,8 +68,8 @@ def car_stop(kind: int) -> Shape:
     parts = box((-half, 0.0, -depth), (half, height, depth), "yellow", CAR_STOP)
     for x in (-half * 0.55, half * 0.55):
         band = rectangle(x - half * 0.14, 0.0, x + half * 0.14, height)
-        parts.append(Part(upright(band, -depth - 0.01), "black_band", CAR_STOP))
-        parts.append(Part(upright(band, depth + 0.01), "black_band", CAR_STOP))
+        parts.append(Face(upright(band, -depth - 0.01), "black_band", CAR_STOP))
+        parts.append(Face(upright(band, depth + 0.01), "black_band", CAR_STOP))
     return shape_of(parts)
 
 
@@ -97,11 +97,11 @@ def guardrail() -> Shape:
         (0.70, 0.86, "rail_light"),
     )
     parts = [
-        Part(sideways(rectangle(ends[0], low, ends[1], high)), material, GUARDRAIL, thin=True)
+        Face(sideways(rectangle(ends[0], low, ends[1], high)), material, GUARDRAIL, thin=True)
         for low, high, material in strips
     ]
     parts.append(
-        Part(
+        Face(
             sideways(rectangle(ends[0], 0.0, ends[0] + 0.14, 0.92)),
             "rail_dark",
             GUARDRAIL,
@@ -109,7 +109,7 @@ def guardrail() -> Shape:
         )
     )
     parts.append(
-        Part(
+        Face(
             upright(rectangle(-0.07, 0.0, 0.07, 0.92), ends[0]), "rail_light", GUARDRAIL, thin=True
         )
     )
@@ -128,8 +128,8 @@ def bump() -> Shape:
             x0, x1 = (number / NUM_STRIPES - 0.5, (number + 1) / NUM_STRIPES - 0.5)
             material = "black_band" if number % 2 else "yellow"
             corners: list[Point] = [(x0, 0.0, z), (x1, 0.0, z), (x1, 0.08, peak), (x0, 0.08, peak)]
-            parts.append(Part(corners, material, BUMP, thin=True))
+            parts.append(Face(corners, material, BUMP, thin=True))
     top = [(-0.5, 0.08, -0.12), (0.5, 0.08, -0.12), (0.5, 0.08, 0.12), (-0.5, 0.08, 0.12)]
     return shape_of(
-        [*parts[:NUM_STRIPES], Part(top, "yellow", BUMP, thin=True), *parts[NUM_STRIPES:]]
+        [*parts[:NUM_STRIPES], Face(top, "yellow", BUMP, thin=True), *parts[NUM_STRIPES:]]
     )

@@ -10,7 +10,7 @@ from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.kp_writer import write
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 from rgbt.ranges import Seed, Text
 
 VERSION = 1
@@ -28,7 +28,7 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> KP:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     Five of the 19 classes are in no scene (see `rgbt.data.synth.kp_classes`): where absent classes
     count as 0, as in the published tables, no network scores more than 14 / 19 = 73.7 %.
@@ -48,12 +48,14 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     Raises:
         InputError: a factor out of range, a cache that cannot be written.
     """
-    plan = Plan(seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors)
+    plan = SynthPlan(
+        seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors
+    )
     folder = cached(plan, cache_of(cache_dir))
     return KP(str(folder), name="synth_kp", num_classes=num_classes)
 
 
-def cached(plan: Plan, cache: Path) -> Path:
+def cached(plan: SynthPlan, cache: Path) -> Path:
     """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
 
     Raises:

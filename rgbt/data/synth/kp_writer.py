@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.kp import is_night as is_night_name
-from rgbt.data.kp import sets_of
+from rgbt.data.kp_layout import is_night as is_night_name
+from rgbt.data.kp_layout import sets_of
 from rgbt.data.synth.kp_classes import class_ids
 from rgbt.data.synth.light import is_night
 from rgbt.data.synth.scene import render_scene
-from rgbt.data.synth.writer import Plan, write_each, write_png
+from rgbt.data.synth.writer import SynthPlan, write_each, write_png
 
 _FRAMES_PER_VIDEO = 40
 
 
-def write(plan: Plan, folder: Path) -> None:
+def write(plan: SynthPlan, folder: Path) -> None:
     """Write the whole data set into `folder`, which exists.
 
     Raises:
@@ -40,7 +40,7 @@ def write(plan: Plan, folder: Path) -> None:
     _write_lists(by_split, folder)
 
 
-def names_of(plan: Plan) -> dict[str, list[str]]:
+def names_of(plan: SynthPlan) -> dict[str, list[str]]:
     """Split -> names of its scenes, which are numbered over all splits.
 
     The recordings are those that the CRM release gives to a split, by day and at night.
@@ -77,7 +77,7 @@ def _images(folder: Path, name: str) -> tuple[Path, Path]:
     return place / "visible" / f"{frame}.jpg", place / "lwir" / f"{frame}.jpg"
 
 
-def _write_numbered(plan: Plan, names: list[str], folder: Path, number: int) -> None:
+def _write_numbered(plan: SynthPlan, names: list[str], folder: Path, number: int) -> None:
     cv2.setNumThreads(1)
     scene = render_scene(plan.seed, number, plan.factors)
     visible, lwir = _images(folder, names[number])

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from rgbt.data.synth import backdrop, cars
-from rgbt.data.synth.camera import Camera, Floats, floats
+from rgbt.data.synth.camera import Floats, SynthCamera, floats
 from rgbt.data.synth.light import Light
 from rgbt.data.synth.placement import Placed
 
@@ -40,7 +40,7 @@ def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
     return np.asarray(colours @ (1.0 / (nearness * nearness)), np.float32).reshape(world_3HW.shape)
 
 
-def headlight(world_3HW: Floats, camera: Camera) -> Floats:
+def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
     """(H, W) light of the own low beams at each world point: a pool ahead, cut off at the waist."""
     dx, dz = world_3HW[0] - camera.position[0], world_3HW[2] - camera.position[2]
     sin, cos = np.float32(np.sin(camera.yaw)), np.float32(np.cos(camera.yaw))

@@ -10,7 +10,7 @@ from rgbt.data.synth.cache import cache_of, described, key_of, written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.pst900_writer import VAL_BAG, write
-from rgbt.data.synth.writer import Plan
+from rgbt.data.synth.writer import SynthPlan
 from rgbt.ranges import Seed, Text
 
 VERSION = 1
@@ -29,7 +29,7 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> PST900:
-    """The data set with these factors, generated if no earlier call has done so.
+    """The data set with these factors, generated on first use.
 
     These are streets and no tunnels. They stand in for the files and for how rare the four objects
     are (about 1 % of the pixels each, as backpack and survivor are there; the other two are rarer):
@@ -53,12 +53,14 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     Raises:
         InputError: a factor out of range, a bag that is not there, a cache that cannot be written.
     """
-    plan = Plan(seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors)
+    plan = SynthPlan(
+        seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors
+    )
     folder = cached(plan, cache_of(cache_dir))
     return PST900(str(folder), name="synth_pst900", num_classes=num_classes, val_bags=val_bags)
 
 
-def cached(plan: Plan, cache: Path) -> Path:
+def cached(plan: SynthPlan, cache: Path) -> Path:
     """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
 
     Raises:

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from rgbt.data.pst900 import CLASSES, FOLDERS, PARTS
+from rgbt.data.pst900 import CLASSES
+from rgbt.data.pst900_layout import FOLDERS, PARTS
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.shapes import BUMP, CAR_STOP, COLOR_CONE, PERSON
-from rgbt.data.synth.writer import Plan, write_each, write_png
+from rgbt.data.synth.writer import SynthPlan, write_each, write_png
 
 VAL_BAG = 20
 """The recording of the training part that scenes for validation lie in."""
@@ -40,7 +41,7 @@ CLASS_OF = np.array(
 )
 
 
-class Shot(NamedTuple):
+class ImageToWrite(NamedTuple):
     """One picture to be written: number of its scene, its part, the recording that it is of."""
 
     scene: int
@@ -53,7 +54,7 @@ class Shot(NamedTuple):
         return f"{self.scene}_bag{self.bag:02d}_rect_rgb_frame{self.scene * _FRAME_STEP:010d}"
 
 
-def shots_of(plan: Plan) -> tuple[Shot, ...]:
+def shots_of(plan: SynthPlan) -> tuple[ImageToWrite, ...]:
     """Every picture, numbered over all splits: no scene is in two of them."""
     train, test = PARTS
     parts = [
@@ -61,14 +62,14 @@ def shots_of(plan: Plan) -> tuple[Shot, ...]:
         *((train, VAL_BAG) for _ in range(plan.num_val)),
         *((test, bag) for bag in _spread(plan.num_test, _TEST_BAGS)),
     ]
-    return tuple(Shot(scene, part, bag) for scene, (part, bag) in enumerate(parts))
+    return tuple(ImageToWrite(scene, part, bag) for scene, (part, bag) in enumerate(parts))
 
 
 def _spread(num: int, bags: tuple[int, ...]) -> Iterator[int]:
     return (bags[number * len(bags) // num] for number in range(num))
 
 
-def write(plan: Plan, folder: Path) -> None:
+def write(plan: SynthPlan, folder: Path) -> None:
     """Write the whole data set into `folder`, which exists.
 
     Raises:
@@ -81,7 +82,9 @@ def write(plan: Plan, folder: Path) -> None:
     write_each(partial(_write_numbered, plan, shots, folder), len(shots))
 
 
-def _write_numbered(plan: Plan, shots: tuple[Shot, ...], folder: Path, number: int) -> None:
+def _write_numbered(
+    plan: SynthPlan, shots: tuple[ImageToWrite, ...], folder: Path, number: int
+) -> None:
     cv2.setNumThreads(1)
     shot = shots[number]
     scene = render_scene(plan.seed, shot.scene, plan.factors)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth.camera import NEAR_M, Camera, Floats
+from rgbt.data.synth.camera import NEAR_M, Floats, SynthCamera
 from rgbt.data.synth.facets import Facets
 
 SCALE = 2
@@ -51,7 +51,7 @@ class Drawing:
         return np.clip(total, np.take(low, self.ids), np.take(high, self.ids))
 
 
-def draw(facets: Facets, camera: Camera) -> Drawing:
+def draw(facets: Facets, camera: SynthCamera) -> Drawing:
     """Facets in their order, later ones over earlier ones."""
     corners = camera.to_camera(facets.corners)
     # In double precision: the terrain is a plane through corners kilometres away.
@@ -101,7 +101,7 @@ def average(values_N4: NDArray[np.uint8], drawing: Drawing) -> NDArray[np.uint8]
 
 
 def _paint(
-    corners: Floats, num_corners: NDArray[np.intp], seen: NDArray[np.bool_], camera: Camera
+    corners: Floats, num_corners: NDArray[np.intp], seen: NDArray[np.bool_], camera: SynthCamera
 ) -> NDArray[np.uint16]:
     numbers = np.flatnonzero(seen)
     # Corners first: the reductions over them are several times faster along the first axis.
@@ -130,7 +130,7 @@ def _fixed_point(columns_rows: Floats) -> NDArray[np.int32]:
     return np.clip(np.rint(columns_rows * (SCALE << _SHIFT)), -limit, limit).astype(np.int32)
 
 
-def _clipped(polygon: list[list[float]], camera: Camera) -> NDArray[np.int32]:
+def _clipped(polygon: list[list[float]], camera: SynthCamera) -> NDArray[np.int32]:
     """The part of a polygon beyond the near plane (Sutherland-Hodgman), in fixed point."""
     kept = []
     for start, end in zip(polygon, polygon[1:] + polygon[:1], strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.data.synth import materials
-from rgbt.data.synth.camera import Camera, Floats, floats
+from rgbt.data.synth.camera import Floats, SynthCamera, floats
 from rgbt.data.synth.facets import Facets
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.lamps import Lamp, headlight, lamplight
@@ -129,7 +129,7 @@ def _bloom(shining: Floats) -> Floats:
     return halo
 
 
-def _sky(rays: Floats, light: Light, camera: Camera, seed: int) -> Floats:
+def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
     """(3, H, W) colour of the sky in the direction of each pixel."""
     x, y, z = camera.turned(rays)
     up = np.maximum(y / np.sqrt(x * x + y * y + z * z), 0)

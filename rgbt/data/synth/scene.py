@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.data.synth import rgb, thermal
-from rgbt.data.synth.camera import Camera, Floats, camera_of, flow_between
+from rgbt.data.synth.camera import Floats, SynthCamera, camera_of, flow_between
 from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.lamps import Lamp, lamps_of
@@ -49,7 +49,7 @@ class Scene:
     owner: NDArray[np.intp]
     placed: tuple[Placed, ...]
     is_night: bool
-    camera: Camera
+    camera: SynthCamera
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def _world(seed: int, index: int, factors: SceneFactors) -> _World:
 
 
 def _frame(
-    world: _World, camera: Camera, factors: SceneFactors, key: tuple[int, int, int]
+    world: _World, camera: SynthCamera, factors: SceneFactors, key: tuple[int, int, int]
 ) -> Scene:
     seed, index, frame = key
     facets, light = world.facets, world.light
@@ -160,7 +160,7 @@ def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
     return np.asarray(inside & agrees)
 
 
-def _depth_in(camera: Camera, scene: Scene) -> Floats:
+def _depth_in(camera: SynthCamera, scene: Scene) -> Floats:
     """Depth along the axis of `camera` of each pixel of `scene`."""
     inverse = 1.0 / scene.depth
     points = scene.camera.to_world(scene.camera.rays(), inverse)

@@ -25,7 +25,7 @@ MAX_CORNERS = 8
 Point = tuple[float, float, float]
 
 
-class Part(NamedTuple):
+class Face(NamedTuple):
     """A flat convex polygon.
 
     Attributes:
@@ -64,7 +64,7 @@ class Shape:
     height: float
 
 
-def shape_of(parts: Sequence[Part]) -> Shape:
+def shape_of(parts: Sequence[Face]) -> Shape:
     """Parts, in drawing order, as a Shape."""
     corners = np.array(
         [
@@ -132,7 +132,7 @@ def box(
     materials: str | tuple[str, str, str],
     label: int = UNLABELED,
     paint: int = 0,
-) -> list[Part]:
+) -> list[Face]:
     """Five faces of a box without its bottom.
 
     Args:
@@ -140,7 +140,7 @@ def box(
         high: largest x, y, z.
         materials: one name, or names for the ends (z), the sides (x) and the top.
         label: class id.
-        paint: see `Part`.
+        paint: see `Face`.
     """
     ends, sides, top = (materials,) * 3 if isinstance(materials, str) else materials
     (x0, y0, z0), (x1, y1, z1) = low, high
@@ -151,4 +151,4 @@ def box(
         (sideways(rectangle(z0, y0, z1, y1), x1), sides),
         (flat(rectangle(x0, z0, x1, z1), y1), top),
     ]
-    return [Part(corners, material, label, paint) for corners, material in faces]
+    return [Face(corners, material, label, paint) for corners, material in faces]

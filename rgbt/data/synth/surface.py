@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.data.synth import materials
-from rgbt.data.synth.camera import NEAR_M, Camera, Floats, floats
+from rgbt.data.synth.camera import NEAR_M, Floats, SynthCamera, floats
 from rgbt.data.synth.facets import Facets
 from rgbt.data.synth.light import Light
 from rgbt.data.synth.placement import Placed
@@ -45,7 +45,7 @@ class Surface:
     """
 
     facets: Facets
-    camera: Camera
+    camera: SynthCamera
     drawing: Drawing
     rays: Floats
     world: Floats
@@ -61,7 +61,11 @@ class Surface:
 
 
 def surface_of(
-    drawing: Drawing, facets: Facets, camera: Camera, shadow: Floats, texture_key: tuple[int, int]
+    drawing: Drawing,
+    facets: Facets,
+    camera: SynthCamera,
+    shadow: Floats,
+    texture_key: tuple[int, int],
 ) -> Surface:
     """Surface maps of one frame.
 
@@ -137,7 +141,7 @@ def _windows(
     material: NDArray[np.intp],
     drawing: Drawing,
     facets: Facets,
-    camera: Camera,
+    camera: SynthCamera,
 ) -> tuple[Floats, Floats]:
     """Cover of windows, smooth at their edges, and a number in 0..1 per window."""
     cover, lit = np.zeros(material.size, np.float32), np.ones(material.size, np.float32)
@@ -164,7 +168,7 @@ def _band(position: Floats, half: Floats | float, blur: Floats) -> Floats:
     return np.asarray(np.clip((half - distance) / np.maximum(blur, 0.02) + 0.5, 0, 1), np.float32)
 
 
-def shadow_map(placed: Sequence[Placed], camera: Camera, light: Light) -> Floats:
+def shadow_map(placed: Sequence[Placed], camera: SynthCamera, light: Light) -> Floats:
     """(H, W) float32: how much of the light an object takes from each ground point, 0..1.
 
     A dark spot below each object, and by day the shadow of its box along the sun's direction.

@@ -2,7 +2,7 @@
 
 images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
 train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
-next/               the same names after the ego-motion, with flow/NAME.npy, where asked for
+next/               the same names after the ego-motion, with flow/NAME.npy, if requested
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class SynthPlan:
     """What a written data set consists of; equal plans give equal files.
 
     Attributes:
@@ -68,7 +68,7 @@ class Plan:
         return f"{index:05d}{'N' if night else 'D'}"
 
 
-def write(plan: Plan, folder: Path) -> None:
+def write(plan: SynthPlan, folder: Path) -> None:
     """Write the whole data set into `folder`, which exists.
 
     Args:
@@ -87,7 +87,7 @@ def write(plan: Plan, folder: Path) -> None:
         _write_lists(plan, root)
 
 
-def _write_lists(plan: Plan, root: Path) -> None:
+def _write_lists(plan: SynthPlan, root: Path) -> None:
     names = [plan.name(index) for index in range(plan.num_scenes)]
     test = names[plan.num_train + plan.num_val :]
     lists = {
@@ -101,7 +101,7 @@ def _write_lists(plan: Plan, root: Path) -> None:
         (root / f"{split}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
-def write_index(plan: Plan, folder: Path, index: int) -> None:
+def write_index(plan: SynthPlan, folder: Path, index: int) -> None:
     """Render and write one scene, with its second frame where the plan has a motion."""
     cv2.setNumThreads(1)
     name = plan.name(index)

@@ -1,0 +1,90 @@
+"""Where configuration files are found, and what they choose by the scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.compose import available, compose, groups, searching
+from rgbt.spec.upstream import parse_reference, upstream_config
+
+OWN = """# @package _global_
+defaults:
+  - sh_source
+  - override /model: ${by_scale:{demo:mfnet_tiny,paper:mfnet}}
+  - _self_
+name: own_stage
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of configurations with one experiment and one scale."""
+    monkeypatch.delenv("RGBT_CONF", raising=False)
+    for name in ("experiment", "scale"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "experiment" / "own_stage.yaml").write_text(OWN)
+    (tmp_path / "scale" / "middle.yaml").write_text("defaults: [demo]\n")
+    return tmp_path
+
+
+def word(folder: Path) -> str:
+    return f"hydra.searchpath=[file://{folder}]"
+
+
+@pytest.mark.parametrize(
+    ("words", "width"), [([], 16), (["scale=paper"], 32), (["scale=paper", "model=mfnet_tiny"], 16)]
+)
+def test_by_scale_chooses_the_file_of_the_scale(words: list[str], width: int) -> None:
+    assert compose(["+experiment=mfnet", *words]).model.decoder_width == width
+
+
+def test_by_scale_unknown_scale_says_to_choose(own: Path) -> None:
+    words = ["+experiment=mfnet", "scale=middle", word(own)]
+    with pytest.raises(InputError) as caught, composing(words):
+        compose(words)
+    assert "names files for these scales alone: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
+
+
+def test_available_lists_the_search_path_of_the_command(own: Path) -> None:
+    assert "own_stage" not in available("experiment")
+    assert {"own_stage", "grbm"} <= set(available("experiment", [word(own)]))
+    with searching([word(own), "+experiment=own_stage"]):
+        assert {"own_stage", "grbm"} <= set(available("experiment"))
+        assert "model" in groups()
+        assert compose(["+experiment=own_stage"]).name == "own_stage"
+    assert "own_stage" not in available("experiment")
+
+
+def test_compose_reads_folders_of_the_environment(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RGBT_CONF", f"{own},{own / 'scale'}")
+    assert "own_stage" in available("experiment")
+    assert compose(["+experiment=own_stage"]).name == "own_stage"
+
+
+def test_upstream_run_is_found_on_the_search_path(own: Path) -> None:
+    with searching([word(own)]):
+        config = compose(["+experiment=sh_adversarial"])
+        value = "experiment:own_stage/last.pt"
+        assert parse_reference("model.weights", value) == ("own_stage", "last.pt")
+        upstream = upstream_config(config, "domains.target.labels", "own_stage")
+    assert (upstream.name, upstream.model.decoder_width) == ("own_stage", 16)
+    with pytest.raises(InputError, match=r"no experiment 'own_stage'.*hydra\.searchpath="):
+        parse_reference("model.weights", value)
+
+
+def test_unknown_file_mentions_the_search_path(own: Path) -> None:
+    with pytest.raises(InputError) as caught, composing(["dataset=mine"]):
+        compose(["dataset=mine"])
+    assert str(caught.value).startswith("there is no dataset 'mine'; ")
+    assert "'hydra.searchpath=[file:///my/conf]', or set RGBT_CONF=/my/conf." in str(caught.value)
+    words = ["dataset=mine", word(own)]
+    with pytest.raises(InputError) as caught, composing(words):
+        compose(words)
+    assert "RGBT_CONF" not in str(caught.value)
