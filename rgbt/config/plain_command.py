@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.commands import typed_as
-from rgbt.config.compose import searching
 from rgbt.config.options import help_text, parse
 from rgbt.config.reporting import exit_code
 from rgbt.runtime.signals import answered
@@ -55,6 +54,8 @@ class PlainCommand(Generic[T]):
 
     def code(self, words: Sequence[str]) -> int:
         """The exit code of the command with these words; a mistake is one sentence on stderr."""
+        from rgbt.config.compose import searching
+
         with answered(), searching(words):
             return exit_code(lambda: self.run(words))
 

@@ -42,9 +42,9 @@ def progress_bars() -> Iterator[OnProgress]:
 class Options:
     """Of the cache."""
 
-    cache: Annotated[str, Help("auto, or the folder where caches lie")] = "auto"
+    cache: Annotated[str, Help("auto, or the folder that holds caches")] = "auto"
     remove: Annotated[
-        bool, Help("true: remove the cache, and those of earlier states of the same folder")
+        bool, Help("true: remove the cache, and those of former states of the same data set")
     ] = False
 
 
