@@ -69,14 +69,16 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         if settings.points:
             raise InputError("points and a search cannot be combined; give each its own command.")
         identity = (sorted(shared), parameters, settings.objectives, settings.replicates)
-        name = settings.study or _name(config, [p.key for p in parameters], identity)
+        name = settings.study or _name(config.name, [p.key for p in parameters], identity)
         search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
         return
     _refuse_search_settings(settings)
     points = _points(settings, fixed, swept)
     if len(points) == 1:
         tell("no list of values was given (such as seed=0,1,2): this is one point.")
-    name = settings.study or _name(config, list(points[0].params), [p.overrides for p in points])
+    name = settings.study or _name(
+        config.name, list(points[0].params), [p.overrides for p in points]
+    )
     kind = "list" if settings.points else "grid"
     _grid(_point_list(name, kind, points, runs, base), settings)
 
@@ -192,12 +194,12 @@ def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> Grid:
     return Grid(points.title, ("point", *metrics, "run", "state"), tuple(rows))
 
 
-def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:
+def _name(experiment: str, keys: Sequence[str], identity: Any) -> str:
     """A reproducible name: the method, the varied keys, a hash of everything."""
     text = json.dumps(_plain(identity), sort_keys=True, default=vars)
     digest = hashlib.sha256(text.encode()).hexdigest()[:6]
     varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
-    return f"{config.name}-{varied[:60]}-{digest}" if varied else f"{config.name}-{digest}"
+    return f"{experiment}-{varied[:60]}-{digest}" if varied else f"{experiment}-{digest}"
 
 
 def _plain(value: Any) -> Any:
