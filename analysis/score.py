@@ -29,7 +29,7 @@ from rgbt.metrics.regions import MAX_REGIONS, Partition
 if TYPE_CHECKING:
     from analysis.predictions.scoring import Options, Scored
     from analysis.predictions.table import Cell, ScoreTable
-    from analysis.results import Stored
+    from analysis.results import NamedCounts
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
 
@@ -249,16 +249,16 @@ def _stored(arguments: dict[str, str], overrides: list[str]) -> list[tuple[str, 
         "stored counts hold one partition and no map by pixel; for the others write predictions "
         "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
     )
-    labels = [stored.label for stored in found]
+    labels = [each.label for each in found]
     return [
-        (stored.label if labels.count(stored.label) == 1 else _told_apart(stored), stored.counts)
-        for stored in found
+        (each.label if labels.count(each.label) == 1 else _distinct_label(each), each.counts)
+        for each in found
     ]
 
 
-def _told_apart(stored: Stored) -> str:
+def _distinct_label(named: NamedCounts) -> str:
     """A label of its own for one of several of one name."""
-    return str(stored.path) if stored.seed is None else f"{stored.label} seed {stored.seed}"
+    return str(named.path) if named.seed is None else f"{named.label} seed {named.seed}"
 
 
 def _resampling(arguments: dict[str, str]) -> Resampling | None:

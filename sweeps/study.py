@@ -20,8 +20,8 @@ from sweeps.worker.storage import JOURNAL, load_study, open_storage, study_names
 if TYPE_CHECKING:
     import optuna
 
-    from rgbt.tracking.mlflow_store import Link, Tracking
     from rgbt.tracking.tables import Grid
+    from rgbt.tracking.tracker import Link, Tracking
     from sweeps.report.data import Importances, StudyData
     from sweeps.report.figures import Picture
 

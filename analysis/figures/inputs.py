@@ -259,8 +259,8 @@ class Given:
         found: dict[str, list[Counts]] = {}
         for word in split_list(self.need("runs", what), what):
             label, colon, place = word.partition(":")
-            for stored in open_counts(place if colon else label, runs_dir, split, frames):
-                found.setdefault(label if colon else stored.label, []).append(stored.counts)
+            for named in open_counts(place if colon else label, runs_dir, split, frames):
+                found.setdefault(label if colon else named.label, []).append(named.counts)
         check_same_images(found)
         return found
 

@@ -14,8 +14,9 @@ from urllib.parse import unquote, urlparse
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.files.budgets import TEXT, read_bytes
 from rgbt.tracking.mlflow_client import ENVIRONMENT
-from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.tracker import Tracking
 
 PAGE = 500
 """Runs asked for at a time."""

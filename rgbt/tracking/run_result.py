@@ -49,8 +49,8 @@ class RunResult:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run has its result."""
-        return (self.folder / "result.json").exists()
+        """Whether the run has its result; InputError where that is damaged."""
+        return read_result(self.folder) is not None
 
     @property
     def result(self) -> dict[str, Any]:

@@ -39,7 +39,6 @@ from rgbt.runtime.signals import deferred
 from rgbt.spec.naming import describe, group_of
 from rgbt.spec.run_key import own_code, run_key
 from rgbt.tracking.folder import Description, RunFolder
-from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
@@ -47,6 +46,7 @@ from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
+from rgbt.tracking.tracker import Tracking
 from rgbt.training.overview import announce_training
 from rgbt.transforms.view_sets import ViewSets
 

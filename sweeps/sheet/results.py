@@ -22,7 +22,7 @@ from sweeps.table.sizes import parameter_cells
 from sweeps.worker.lists import Outcome, other_code_line
 
 if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_store import Tracking
+    from rgbt.tracking.tracker import Tracking
 
 
 def finish(wanted: Wanted, outcomes: Sequence[Outcome], out: Path, tracking: Tracking) -> int:

@@ -14,12 +14,13 @@ from rgbt.config.schema import build
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.formats import ADVICE, read_provenance, read_result
-from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.terminal import tell
+from rgbt.tracking.tracker import Tracking
 from sweeps.points import Evaluation
 
 FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
