@@ -12,7 +12,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from rgbt.training.train import pipeline as earlier
+from rgbt.training import pipeline as earlier
 from rgbt.build import training_setup as prepared_module
 from rgbt.checks import InputError
 from rgbt.config.compose import compose

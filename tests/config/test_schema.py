@@ -204,7 +204,7 @@ def test_flatten_gives_dotted_keys() -> None:
 
 
 def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
-    assert conf_dir() == Path(__file__).resolve().parents[1] / "conf"
+    assert conf_dir() == Path(__file__).resolve().parents[2] / "conf"
 
 
 def test_paths_are_read_as_they_are_typed() -> None:

@@ -22,7 +22,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from rgbt.config import schema as config
+from rgbt.config import compose as config
 from rgbt.config.schema import build
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))

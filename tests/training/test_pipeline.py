@@ -26,8 +26,8 @@ from rgbt.spec import run_key as identity
 from rgbt.spec.naming import TAGS
 from rgbt.spec.run_key import run_key
 from rgbt.tracking.folder import RunFolder
+from rgbt.training import pipeline as earlier
 from rgbt.training.pipeline import earlier_runs, finish_earlier, labels_folder, warn_of_other_code
-from rgbt.training.train import pipeline as earlier
 from tests.commands import Call, Trained, short
 from tests.composed import composed as configuration
 
@@ -541,7 +541,7 @@ def test_a_file_that_nothing_reads_is_told(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str
 ) -> None:
     from rgbt import run
-    from rgbt.training.train import train as training
+    from rgbt.training import train as training
 
     done: list[str] = []
     monkeypatch.setattr(training, "is_finished", lambda config: True)
