@@ -11,8 +11,8 @@ from pathlib import Path
 from analysis.report.data import ReportData
 from analysis.report.differences import difference_entries
 from analysis.report.masks import mask_pictures
-from analysis.report.runs import Run, open_run
-from analysis.report.store import StoredRun, read_store
+from analysis.report.runs import ReportRun, open_run
+from analysis.report.store import MlflowRun, read_store
 from analysis.report.studies import study_entries
 from analysis.report.tables import table_entries
 from analysis.report.tables_intervals import Track
@@ -86,9 +86,9 @@ def collect(asked: Asked, track: Track) -> ReportData:
     )
 
 
-def _open_all(stored: Sequence[StoredRun], track: Track, remarks: list[str]) -> list[Run]:
+def _open_all(stored: Sequence[MlflowRun], track: Track, remarks: list[str]) -> list[ReportRun]:
     """The runs, newest first; one that the store has twice is taken once."""
-    runs: dict[str, Run] = {}
+    runs: dict[str, ReportRun] = {}
     for each in track([one for one in stored if one.kind == "run"], "runs"):
         key = each.tags.get("rgbt.key", each.run_id)
         known = runs.get(key)

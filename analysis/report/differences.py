@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.report.data import DifferenceEntry
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.report.tables_intervals import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
 from rgbt.checks import InputError
@@ -59,8 +59,8 @@ class Choice:
 class Pair:
     """Runs that differ by one choice and their seeds alone."""
 
-    paper: tuple[Run, ...]
-    released: tuple[Run, ...]
+    paper: tuple[ReportRun, ...]
+    released: tuple[ReportRun, ...]
 
 
 def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
@@ -78,7 +78,7 @@ def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
 
 
 def difference_entries(
-    runs: Iterable[Run], resamples: int, track: Track
+    runs: Iterable[ReportRun], resamples: int, track: Track
 ) -> tuple[DifferenceEntry, ...]:
     """Every difference with its effect.
 
@@ -95,10 +95,10 @@ def difference_entries(
     )
 
 
-def find_pairs(choice: Choice, runs: Iterable[Run]) -> list[Pair]:
+def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[Pair]:
     """Runs that differ by `choice` alone, those with the most seeds first."""
     keys = {*choice.paper.values, *choice.released.values}
-    groups: dict[str, tuple[list[Run], list[Run]]] = {}
+    groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
     for run in runs:
         sides = [_is_side(run.config, side) for side in (choice.paper, choice.released)]
         if any(sides):
@@ -118,7 +118,7 @@ def _is_side(config: Mapping[str, Any], side: Side) -> bool:
     )
 
 
-def _rest(run: Run, keys: set[str]) -> str:
+def _rest(run: ReportRun, keys: set[str]) -> str:
     """All else that makes the run what it is: configuration and images."""
     assert run.counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
@@ -136,7 +136,7 @@ def _number(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def _by_seed(runs: Sequence[Run]) -> tuple[Run, ...]:
+def _by_seed(runs: Sequence[ReportRun]) -> tuple[ReportRun, ...]:
     return tuple(sorted(runs, key=lambda run: (run.entry.seed is None, run.entry.seed or 0)))
 
 
@@ -168,7 +168,7 @@ def _effect(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> str:
     return sentence(best, compared) + more
 
 
-def _counts(runs: Sequence[Run]) -> list[Any]:
+def _counts(runs: Sequence[ReportRun]) -> list[Any]:
     return [run.counts for run in runs]
 
 

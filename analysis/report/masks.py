@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.report.data import Picture
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.report.tables_intervals import Track
 from rgbt.checks import InputError
 from rgbt.config.stored_config import check_targets
@@ -52,7 +52,7 @@ class Masked:
 
 
 def mask_pictures(
-    runs: Iterable[Run], track: Track, remarks: list[str], trust: Collection[str] = ()
+    runs: Iterable[ReportRun], track: Track, remarks: list[str], trust: Collection[str] = ()
 ) -> tuple[Picture, ...]:
     """One picture per masker that hides anything, those of the most runs first.
 
@@ -74,9 +74,9 @@ def mask_pictures(
     return tuple(pictures)
 
 
-def maskers_in_use(runs: Iterable[Run]) -> list[Masked]:
+def maskers_in_use(runs: Iterable[ReportRun]) -> list[Masked]:
     """Distinct maskers, those of the most runs first."""
-    found: dict[str, list[tuple[Run, Mapping[str, Any], Mapping[str, Any]]]] = {}
+    found: dict[str, list[tuple[ReportRun, Mapping[str, Any], Mapping[str, Any]]]] = {}
     for run in runs:
         masker, dataset = (_node(run.config, name) for name in ("masker", "dataset"))
         if masker and dataset and masker.get("sampler") != "none":

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.report.data import CellEntry, TableEntry
-from analysis.report.runs import Run
-from analysis.report.store import StoredRun
+from analysis.report.runs import ReportRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import as_recorded, cell_of, printed_cell
 from analysis.report.tables_files import (
     DEFAULT_SEEDS,
@@ -26,8 +26,8 @@ from sweeps.table.table import Table, load_table, table_names
 
 
 def table_entries(
-    records: Sequence[StoredRun],
-    runs: Mapping[str, Run],
+    records: Sequence[MlflowRun],
+    runs: Mapping[str, ReportRun],
     resamples: int,
     track: Track,
     remarks: list[str],
@@ -73,11 +73,11 @@ def _load_all(track: Track, remarks: list[str]) -> dict[str, Table]:
     return files
 
 
-def _read_all(records: Sequence[StoredRun], remarks: list[str]) -> list[Recorded]:
+def _read_all(records: Sequence[MlflowRun], remarks: list[str]) -> list[Recorded]:
     found = []
-    for stored in records:
+    for record in records:
         try:
-            found.append(read_recorded(stored))
+            found.append(read_recorded(record))
         except InputError as error:
             remarks.append(str(error))
     return sorted(found, key=lambda each: (each.name, each.scale, each.extra))

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from rgbt.checks import InputError
 from rgbt.tracking.csv_files import read_csv
 
@@ -75,23 +75,23 @@ class Recorded:
         return tuple(dict.fromkeys(keys))
 
 
-def read_recorded(stored: StoredRun) -> Recorded:
+def read_recorded(record: MlflowRun) -> Recorded:
     """Read the record of a table.
 
     Raises:
         InputError: its CSV is missing or damaged.
     """
-    text = stored.files.text(CSV_FILE)
+    text = record.files.text(CSV_FILE)
     if text is None:
-        raise InputError(f"table '{stored.name}' has no {CSV_FILE} in the store; run it again.")
-    below = _remarks(stored.files.text(MARKDOWN_FILE) or "")
+        raise InputError(f"table '{record.name}' has no {CSV_FILE} in the store; run it again.")
+    below = _remarks(record.files.text(MARKDOWN_FILE) or "")
     extra = [found.group(1) for line in below if (found := EXTRA.fullmatch(line))]
-    orders = {n.removeprefix("order/"): v for n, v in stored.metrics.items() if "order/" in n}
+    orders = {n.removeprefix("order/"): v for n, v in record.metrics.items() if "order/" in n}
     return Recorded(
-        name=stored.tags.get("rgbt.table", stored.name),
-        scale=stored.tags.get("rgbt.scale", ""),
-        seeds=tuple(int(seed) for seed in re.findall(r"\d+", stored.tags.get("rgbt.seeds", ""))),
-        lines=_lines(text, stored.name),
+        name=record.tags.get("rgbt.table", record.name),
+        scale=record.tags.get("rgbt.scale", ""),
+        seeds=tuple(int(seed) for seed in re.findall(r"\d+", record.tags.get("rgbt.seeds", ""))),
+        lines=_lines(text, record.name),
         remarks=tuple(below),
         extra=extra[0] if extra else "",
         orders=orders,

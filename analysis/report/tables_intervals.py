@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.report.data import Uncertainty
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -55,7 +55,7 @@ class Intervals:
         found: the intervals by source and metric, after `compute`.
     """
 
-    runs: Mapping[str, Run]
+    runs: Mapping[str, ReportRun]
     asked: dict[Source, dict[str, None]] = field(default_factory=dict)
     found: dict[tuple[Source, str], Found] = field(default_factory=dict)
 
@@ -84,7 +84,7 @@ class Intervals:
         return [counts_of(self.runs[key], path) for key in keys]
 
 
-def counts_of(run: Run, path: str) -> Counts:
+def counts_of(run: ReportRun, path: str) -> Counts:
     """Counts of one evaluation of a run.
 
     Raises:

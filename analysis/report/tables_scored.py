@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.report.tables_files import NOTHING, Recorded
 from analysis.report.tables_intervals import OWN, Source, counts_of
 from rgbt.checks import InputError
@@ -35,7 +35,7 @@ class _Opened:
 
     key: str
     commit: str | None
-    run: Run
+    run: ReportRun
 
     def counts(self, evaluation: Evaluation | None = None) -> Counts:
         """Counts of an evaluation."""
@@ -59,7 +59,7 @@ class Draft:
     scored: Scored
 
 
-def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> Scored:
+def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun]) -> Scored:
     """Means, ranks and orders from the counts of the runs that the record names.
 
     Args:
@@ -91,7 +91,7 @@ def _sizes(recorded: Recorded, table: Table) -> dict[Place, Cell]:
 
 
 def _by_seed(
-    keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, Run]
+    keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, ReportRun]
 ) -> dict[int, _Outcome]:
     """What became of every seed of a row; a run that is not here stands for a seed without one."""
     outcomes = {seed: _Outcome("failed", "not finished") for seed in seeds}
@@ -101,7 +101,7 @@ def _by_seed(
     return outcomes | {seed: _outcome(key, runs.get(key)) for seed, key in [*here.items(), *gone]}
 
 
-def _outcome(key: str, run: Run | None) -> _Outcome:
+def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     if run is None:
         return _Outcome("missing", f"run {key} is not in the store")
     return _Outcome("finished", found=(_Opened(key, run.entry.commit or None, run),))
@@ -125,7 +125,7 @@ def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | Non
 
 
 def values_of(
-    draft: Draft, row: Row, column: Column, runs: Mapping[str, Run]
+    draft: Draft, row: Row, column: Column, runs: Mapping[str, ReportRun]
 ) -> tuple[float | None, ...]:
     """The score of each run of a cell, in the order of its keys; None: it has none."""
     keys = draft.recorded.lines.get((row.label, column.name), NOTHING).keys
@@ -134,7 +134,7 @@ def values_of(
     return tuple(_value(draft.scored.table, row, column, runs.get(key)) for key in keys)
 
 
-def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | None:
+def _value(table: Table, row: Row, column: Column, run: ReportRun | None) -> float | None:
     if run is None:
         return None
     if column.sources:

@@ -13,7 +13,7 @@ import pytest
 from analysis.report import collect
 from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import cell_of
 from analysis.report.tables_files import Line, Recorded
 from analysis.report.tables_intervals import OWN, Intervals, Source
@@ -186,10 +186,10 @@ def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> No
 def test_of_a_run_that_is_there_twice_the_finished_one_is_shown(
     order: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one: StoredRun = stored(files_of(tmp_path), rgbt__key="k0")
+    one: MlflowRun = stored(files_of(tmp_path), rgbt__key="k0")
     both = [replace(one, status="FAILED", run_id="failed"), replace(one, run_id="finished")]
 
-    def opened(each: StoredRun, remarks: list[str]) -> Any:
+    def opened(each: MlflowRun, remarks: list[str]) -> Any:
         del remarks
         run = run_of({}, 0)
         return replace(run, entry=replace(run.entry, status=each.status, run_id=each.run_id))

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from analysis.report import collect as collecting
-from analysis.report.store import Files, StoredRun, read_store
+from analysis.report.store import MlflowRun, RunFiles, read_store
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from sweeps.worker.found import Found
 from tests.analysis.report.stores import RGB, RGB_FILE
 
 
-def read(runs_dir: Path, uri: str | None = None) -> list[StoredRun]:
+def read(runs_dir: Path, uri: str | None = None) -> list[MlflowRun]:
     given: dict[str, Any] = {"artifact_uri": None, "experiment": "rgbt", "runs_dir": str(runs_dir)}
     return read_store(MlflowTracking(uri, **given), runs_dir, runs_dir)
 
@@ -49,10 +49,10 @@ def test_evaluations_lie_where_sweeps_puts_them(tmp_path: Path) -> None:
 
 
 def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stored(run_id: str, **tags: str) -> StoredRun:
+    def stored(run_id: str, **tags: str) -> MlflowRun:
         known = {"run_id": run_id, "name": run_id, "status": "RUNNING", "started": ""}
-        return StoredRun(
-            **known, seconds=None, tags=tags, params={}, metrics={}, files=Files((), None)
+        return MlflowRun(
+            **known, seconds=None, tags=tags, params={}, metrics={}, files=RunFiles((), None)
         )
 
     both = [stored("new"), stored("old", **{"rgbt.replaced": "true"})]

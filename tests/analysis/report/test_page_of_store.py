@@ -12,7 +12,7 @@ import pytest
 from analysis.report import page, tables
 from analysis.report.collect import Asked, collect
 from analysis.report.data import ReportData
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_files import CSV_FILE, HEADER
 from rgbt.tracking.mlflow_store import MlflowTracking
 from tests.analysis.report.stores import files_of, record_search, write_run
@@ -77,7 +77,7 @@ def test_overrides_of_a_table_stand_beside_its_name(
         "short": "- Every row of ours was run with trainer.max_steps=9 loss.spatial.alpha=1.\n",
     }
     records = [
-        StoredRun(
+        MlflowRun(
             run_id=variant,
             name=f"{name} demo",
             status="FINISHED",
