@@ -6,64 +6,90 @@ One table and one sentence: the differences with intervals and p-values, over im
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from analysis.arguments import MOST, blocks_of, decimal, out_folder, refuse_others, whole
-from rgbt.checks import InputError, check_choice, split_list
-from rgbt.config.command import plain_command
+from annotated_types import Interval as Bounds
+
+from analysis.arguments import Blocks, Level, Resamples, check_out
+from rgbt.checks import InputError, split_list
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from analysis.results import Frames, NamedCounts
+    from analysis.results import NamedCounts
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent
     from rgbt.tracking.tables import Grid
 
-OWN = {
-    "a": "",
-    "b": "",
-    "metrics": "auto",
-    "split": "",
-    "frames": "",
-    "degradation": "",
-    "severity": "",
-    "missing": "refuse",
-    "level": "0.95",
-    "resamples": "10000",
-    "method": "auto",
-    "blocks": "auto",
-    "absent": "as counted",
-    "seed": "0",
-    "runs_dir": "runs",
-    "out": "",
-}
-MISSING = ("refuse", "leave_out")
+
+@dataclass(frozen=True)
+class Options:
+    """What is compared, and how."""
+
+    a: Annotated[
+        str,
+        Help(
+            "a run (folder, config key or MLflow run id), a file of counts (.npz, of rgbt evaluate "
+            'or rgbt score), a group of runs ("grbm sigma_div=2": all its seeds), or several of '
+            "these with commas: seeds of one method"
+        ),
+    ] = ""
+    b: Annotated[str, Help("the same of the other method")] = ""
+    metrics: Annotated[
+        str,
+        Help(
+            "mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night; "
+            "of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA"
+        ),
+    ] = "auto"
+    split: Annotated[str, Help("of runs; default: test")] = ""
+    frames: Annotated[
+        Literal["", "aligned", "released", "next"],
+        Help(
+            "of runs, counts of pairs of frames (rgbt consistency run=...): aligned or released "
+            "(virtual views), next (consecutive frames); default: of single frames"
+        ),
+    ] = ""
+    degradation: Annotated[
+        str,
+        Help(
+            "of runs, counts of corrupted images (rgbt robustness run=...): degradation=noise "
+            "severity=16"
+        ),
+    ] = ""
+    severity: Annotated[str, Help("of the degradation")] = ""
+    missing: Annotated[
+        Literal["refuse", "leave_out"],
+        Help("refuse, or leave_out: compare the images that both hold"),
+    ] = "refuse"
+    level: Level = 0.95
+    resamples: Resamples = 10_000
+    method: Annotated[
+        Literal["auto", "percentile", "bca"],
+        Help(
+            "how intervals over images are taken from the resamples: percentile or bca; auto: "
+            "percentile, for the variance of one method without its bias"
+        ),
+    ] = "auto"
+    blocks: Blocks = "auto"
+    absent: Annotated[
+        Literal["as counted", "released", "exclude"],
+        Help(
+            "released: a class without a pixel scores 0; exclude: it is left out of means; as "
+            "counted: by the convention of the data set"
+        ),
+    ] = "as counted"
+    seed: Annotated[int, Bounds(ge=0, le=2**31), Help("of the draws")] = 0
+    runs_dir: RunsDir = Path("runs")
+    out: Annotated[Path | None, Help("folder for comparison.md and comparison.csv")] = None
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Compare two methods on the same images.
-
-    a, b      each a run (folder, config key or MLflow run id), a file of counts (.npz, of
-              rgbt.evaluate or analysis.score), a group of runs ("grbm sigma_div=2": all its seeds),
-              or several of these with commas: seeds of one method
-    metrics   mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night;
-              of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA
-    frames    of runs, counts of pairs of frames (python -m rgbt.consistency run=...): aligned or
-              released (virtual views), next (consecutive frames); default: of single frames
-    degradation, severity  of runs, counts of failing images (python -m rgbt.robustness run=...):
-              degradation=noise severity=16
-    missing   refuse, or leave_out: compare the images that both hold
-    level     of the intervals;  resamples: their number;  seed: of the draws
-    method    how intervals over images are taken from the resamples: percentile or bca; auto:
-              percentile, for the variance of one method without its bias
-    blocks    images drawn together: auto, none, sequence, or a number of neighbouring frames
-    absent    released: a class without a pixel scores 0; exclude: it is left out of means;
-              default: as counted, by the convention of the data set
-    split     of runs; default: test
-    out       folder for comparison.md and comparison.csv
-    """
+def main(options: Options, overrides: list[str]) -> int:
+    """Compare two methods on the same images."""
     from rich.markup import escape
 
     from analysis.results import open_counts
@@ -72,22 +98,20 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from analysis.uncertainty.sentence import sentence
     from rgbt.tracking.terminal import rich_table, show
 
-    refuse_others(overrides, (), list(OWN))
-    check_choice("missing", arguments["missing"], MISSING)
-    frames = _frames(arguments["frames"])
-    degradation, severity = arguments["degradation"], arguments["severity"]
+    del overrides  # none is heeded
+    frames, degradation, severity = options.frames, options.degradation, options.severity
     _check_failing(degradation, severity, frames)
-    out = out_folder(arguments["out"])
-    _check_given(arguments)
+    check_out(options.out)
+    _check_given(options)
     opened = [
-        open_counts(arguments[side], arguments["runs_dir"], arguments["split"], frames)
-        for side in "ab"
+        open_counts(side, options.runs_dir, options.split, frames)
+        for side in (options.a, options.b)
     ]
     if degradation:
         opened = [under(each, degradation, severity) for each in opened]
-    a, b = _counts(opened, arguments["missing"])
-    settings = settings_of(arguments)
-    metrics = metrics_of(arguments["metrics"], [*a, *b], settings)
+    a, b = _counts(opened, options.missing)
+    settings = settings_of(options)
+    metrics = metrics_of(options.metrics, [*a, *b], settings)
     comparison = compare(a, b, metrics, settings)
     failing = " ".join(word for word in (degradation, severity) if word)
     labels = [f"{label} ({failing})" if failing else label for label in _labels(opened)]
@@ -97,28 +121,26 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     show(rich_table(grid))
     below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
     show(escape("\n".join(filter(None, below))))
-    if out is not None:
-        _write(out, grid, said, comparison)
+    if options.out is not None:
+        _write(options.out, grid, said, comparison)
     return 0
 
 
-def settings_of(arguments: dict[str, str]) -> Resampling:
-    """The settings of the resampling that a command was given as text.
+def settings_of(options: Options) -> Resampling:
+    """The settings of the resampling.
 
     Raises:
-        InputError: a value that is no number, or out of range.
+        InputError: a value out of range.
     """
-    from analysis.uncertainty.settings import Method, Resampling
-    from rgbt.metrics.metric import Absent
+    from analysis.uncertainty.settings import Resampling
 
-    absent = arguments["absent"]
     return Resampling(
-        resamples=whole("resamples", arguments["resamples"], 100, MOST),
-        level=decimal("level", arguments["level"], "0.95"),
-        method=cast(Method, arguments["method"]),
-        blocks=blocks_of(arguments["blocks"]),
-        seed=whole("seed", arguments["seed"], 0, 2**31),
-        absent=None if absent == OWN["absent"] else cast(Absent, absent),
+        resamples=options.resamples,
+        level=options.level,
+        method=options.method,
+        blocks=options.blocks,
+        seed=options.seed,
+        absent=None if options.absent == "as counted" else options.absent,
     )
 
 
@@ -239,14 +261,6 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _frames(text: str) -> Frames:
-    from rgbt.metrics.pairs import PROTOCOLS
-
-    if text:
-        check_choice("frames", text, PROTOCOLS)
-    return cast("Frames", text)
-
-
 def _check_failing(degradation: str, severity: str, frames: str) -> None:
     if severity and not degradation:
         raise InputError("'severity' has no effect without degradation=..., for example noise.")
@@ -254,15 +268,15 @@ def _check_failing(degradation: str, severity: str, frames: str) -> None:
         raise InputError(f"degradation={degradation} is of single frames; leave frames= out.")
 
 
-def _check_given(arguments: dict[str, str]) -> None:
+def _check_given(options: Options) -> None:
     from analysis.results import groups_in
 
-    for key in ("a", "b"):
-        if not arguments[key]:
-            groups = ", ".join(groups_in(arguments["runs_dir"])) or "none"
+    for key, given in (("a", options.a), ("b", options.b)):
+        if not given:
+            groups = ", ".join(groups_in(options.runs_dir)) or "none"
             raise InputError(
                 f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
-                f"in {arguments['runs_dir']}: {groups}."
+                f"in {options.runs_dir}: {groups}."
             )
 
 
@@ -323,5 +337,7 @@ def comparison_csv(comparison: Comparison) -> str:
     return csv_text(rows)
 
 
+entry = PlainCommand(Options, main, heeds=())
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

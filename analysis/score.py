@@ -6,56 +6,35 @@ From a folder of predicted label images, or from the counts that a run has store
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from analysis.arguments import (
-    MOST,
-    blocks_of,
-    dataset_of,
-    decimal,
-    out_folder,
-    refuse_others,
-    whole,
-)
+from annotated_types import Interval
+
+from analysis.arguments import MOST, Blocks, Level, check_out, dataset_of
 from analysis.bar import progress
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import built, plain_command
+from rgbt.checks import InputError
+from rgbt.config.command import built
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
-    from analysis.predictions.scoring import Options, Scored
+    from analysis.predictions.scoring import Options as Counting
+    from analysis.predictions.scoring import Scored
     from analysis.predictions.table import Cell, ScoreTable
     from analysis.results import NamedCounts
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
 
-OF_A_FOLDER = {
-    "partition": "all",
-    "regions": "5",
-    "format": "auto",
-    "missing": "refuse",
-    "resize": "refuse",
-    "suffix": "",
-    "name": "",
-    "threads": "0",
-}
-"""Keys that say how a folder is counted; stored counts have been counted already."""
+OF_A_FOLDER = (
+    *("partition", "regions", "format", "missing", "resize", "suffix", "name", "threads"),
+)
+"""Options that say how a folder is counted; counts of runs have been counted already."""
 
-OWN = {
-    "predictions": "",
-    "counts": "",
-    "split": "",
-    "out": "",
-    "runs_dir": "runs",
-    "resamples": "10000",
-    "level": "0.95",
-    "blocks": "auto",
-    **OF_A_FOLDER,
-}
 MAX_THREADS = 256
 SOURCE = "source.txt"
 """File of a folder of scores that says what was scored."""
@@ -66,47 +45,99 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 """Part of the images -> its mIoU."""
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+@dataclass(frozen=True)
+class Options:
+    """What is scored, and how."""
+
+    predictions: Annotated[
+        str,
+        Help(
+            "folder with NAME.png for every image of the split: class indices (8 bit, one "
+            "channel), a palette PNG, or RGB in the colours of dataset.palette"
+        ),
+    ] = ""
+    counts: Annotated[
+        str,
+        Help(
+            "instead: counts of runs; run folder, config key, MLflow run id, file, or several with "
+            "commas"
+        ),
+    ] = ""
+    split: Annotated[str, Help("split of the data set; default: test")] = ""
+    out: Annotated[
+        Path | None,
+        Help(
+            "folder for counts_<partition>.npz, maps.npz, scores.md and scores.csv; without one, "
+            "the tables are only shown"
+        ),
+    ] = None
+    runs_dir: Annotated[Path, Help("folder of runs, for counts=")] = Path("runs")
+    resamples: Annotated[
+        int,
+        Interval(ge=0, le=MOST),
+        Help("of the intervals over images; 0: no intervals"),
+    ] = 10_000
+    level: Level = 0.95
+    blocks: Blocks = "auto"
+    partition: Annotated[
+        Literal["all", "ring", "vertical", "horizontal"], Help("of a folder: how images are cut")
+    ] = "all"
+    regions: Annotated[
+        int, Interval(ge=1, le=MAX_REGIONS), Help("of a folder: number of regions of equal area")
+    ] = 5
+    format: Annotated[
+        Literal["auto", "index", "colour"],
+        Help("of a folder: auto; index: the stored numbers; colour: the colours shown"),
+    ] = "auto"
+    missing: Annotated[
+        Literal["refuse", "leave_out"],
+        Help("of a folder: refuse, or leave_out: count only the images that have a file"),
+    ] = "refuse"
+    resize: Annotated[
+        Literal["refuse", "nearest"],
+        Help("of a folder: refuse, or nearest: predictions of another size than their label"),
+    ] = "refuse"
+    suffix: Annotated[str, Help("of a folder: of the names, NAME<suffix>.png, e.g. _pred")] = ""
+    name: Annotated[
+        str, Help("of a folder: of the method, for tables; default: the folder's name")
+    ] = ""
+    threads: Annotated[
+        int,
+        Interval(ge=0, le=MAX_THREADS),
+        Help("of a folder: threads that read and count; 0: one per core"),
+    ] = 0
+
+    @property
+    def source(self) -> str:
+        """What is scored, as it is noted in the folder."""
+        if self.counts:
+            return f"counts={self.counts}"
+        folder = Path(self.predictions).resolve()
+        return f"predictions={folder} split={self.split or 'test'}"
+
+
+def main(options: Options, overrides: list[str]) -> int:
     """Score predictions of any method by region, class, day and night, with intervals.
 
-    predictions  folder with NAME.png for every image of the split: class indices (8 bit, one
-                 channel), a palette PNG, or RGB in the colours of dataset.palette
-    counts       instead: counts of runs; run folder, config key, MLflow run id, file, or several
-                 with commas
-    split        split of the data set; default: test
-    out          folder for counts_<partition>.npz, maps.npz, scores.md and scores.csv; without
-                 one, the tables are shown only
-    runs_dir     folder of runs, for counts=
-    resamples    of the intervals over images; 0: no intervals
-    level        share of intervals that shall hold the true value
-    blocks       what is drawn together: auto, none, sequence, or a number of neighbouring images
-    For predictions=:
-    partition    all, ring, vertical or horizontal
-    regions      number of regions of equal area
-    format       auto; index: the stored numbers; colour: the colours shown
-    missing      refuse, or leave_out: count only the images that have a file
-    resize       refuse, or nearest: predictions of another size than their label
-    suffix       of the names: NAME<suffix>.png, e.g. _pred
-    name         of the method, for tables; default: the folder's name
-    threads      that read and count; 0: one per core
-    overrides of the data set, such as dataset=mfnet dataset.root=/data/MFNet
+    Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """
     from analysis.predictions.text import remarks_on
     from rgbt.files.atomic import write_atomic
 
-    given = [key for key in ("predictions", "counts") if arguments[key]]
+    given = [key for key in ("predictions", "counts") if getattr(options, key)]
     if len(given) != 1:
         raise InputError(
             "expected one of predictions=folder and counts=run, got "
             f"{' and '.join(given) or 'neither'}."
         )
-    out = out_folder(arguments["out"])
-    _check_same_source(out, _source_of(arguments))
-    settings = _resampling(arguments)
+    out = options.out
+    check_out(out)
+    _check_same_source(out, options.source)
+    settings = _resampling(options)
     if given == ["counts"]:
-        counted, remarks = _stored(arguments, overrides), []
+        counted, remarks = _stored(options, overrides), []
     else:
-        scored = _scored(arguments, overrides)
+        scored = _scored(options, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
         remarks = remarks_on(scored)
         if out is not None:
@@ -114,7 +145,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     tables = score_tables(counted, settings)
     _show(tables, remarks, out)
     if out is not None:
-        write_atomic(out / SOURCE, f"{_source_of(arguments)}\n".encode())
+        write_atomic(out / SOURCE, f"{options.source}\n".encode())
     return 0
 
 
@@ -172,14 +203,6 @@ def _check_same_source(out: Path | None, source: str) -> None:
         raise InputError(f"out={out} holds the scores of {earlier}; give {source} its own folder.")
 
 
-def _source_of(arguments: dict[str, str]) -> str:
-    """What is scored, as it is noted in the folder."""
-    if arguments["counts"]:
-        return f"counts={arguments['counts']}"
-    folder = Path(arguments["predictions"]).resolve()
-    return f"predictions={folder} split={arguments['split'] or 'test'}"
-
-
 def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) -> None:
     """Write the tables as Markdown and CSV where a folder is given, and print them."""
     from rich.console import Group
@@ -207,44 +230,45 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
         show(place_lines(places))
 
 
-def _scored(arguments: dict[str, str], overrides: list[str]) -> Scored:
+def _scored(options: Options, overrides: list[str]) -> Scored:
     from analysis.predictions.scoring import score_folder
 
-    refuse_others(overrides, ("dataset",), list(OWN))
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
-    options = replace(_options(arguments), absent=absent)
-    folder, split = Path(arguments["predictions"]), arguments["split"] or "test"
+    counting = replace(_counting(options), absent=absent)
+    folder, split = Path(options.predictions), options.split or "test"
     with progress("counting", len(dataset.names(split))) as advance:
-        return score_folder(folder, dataset, split, options, advance)
+        return score_folder(folder, dataset, split, counting, advance)
 
 
-def _options(arguments: dict[str, str]) -> Options:
-    from analysis.predictions.scoring import PARTITIONS, Options
+def _counting(options: Options) -> Counting:
+    from analysis.predictions.scoring import PARTITIONS
+    from analysis.predictions.scoring import Options as Counting
 
-    partition = arguments["partition"]
-    check_choice("partition", partition, ("all", *PARTITIONS))
-    words: dict[str, Any] = {key: arguments[key] for key in ("missing", "resize", "suffix", "name")}
-    return Options(
-        partitions=tuple(each for each in PARTITIONS if partition in ("all", each)),
-        regions=whole("regions", arguments["regions"], 1, MAX_REGIONS),
-        form=cast(Any, arguments["format"]),  # Options refuses other words
-        threads=whole("threads", arguments["threads"], 0, MAX_THREADS),
-        **words,
+    return Counting(
+        partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
+        regions=options.regions,
+        form=options.format,
+        missing=options.missing,
+        resize=options.resize,
+        suffix=options.suffix,
+        name=options.name,
+        threads=options.threads,
     )
 
 
-def _stored(arguments: dict[str, str], overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import tell
 
-    without_effect = [key for key, default in OF_A_FOLDER.items() if arguments[key] != default]
+    default = Options()
+    without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]
     without_effect += [word.partition("=")[0] for word in overrides]
     if without_effect:
         raise InputError(
             f"'{without_effect[0]}' has no effect on stored counts, which are counted already; "
             "leave it out, or give a folder with predictions=..."
         )
-    found = open_counts(arguments["counts"], Path(arguments["runs_dir"]), arguments["split"])
+    found = open_counts(options.counts, options.runs_dir, options.split)
     tell(
         "stored counts hold one partition and no map by pixel; for the others write predictions "
         "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
@@ -261,14 +285,12 @@ def _distinct_label(named: NamedCounts) -> str:
     return str(named.path) if named.seed is None else f"{named.label} seed {named.seed}"
 
 
-def _resampling(arguments: dict[str, str]) -> Resampling | None:
+def _resampling(options: Options) -> Resampling | None:
     from analysis.uncertainty import Resampling
 
-    resamples = whole("resamples", arguments["resamples"], 0, MOST)
-    if resamples == 0:
+    if options.resamples == 0:
         return None
-    level = decimal("level", arguments["level"], "0.95")
-    return Resampling(resamples=resamples, level=level, blocks=blocks_of(arguments["blocks"]))
+    return Resampling(resamples=options.resamples, level=options.level, blocks=options.blocks)
 
 
 def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> ScoreTable:
@@ -307,5 +329,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     return with_intervals(table, found, said)
 
 
+entry = PlainCommand(Options, main, heeds=("dataset",))
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

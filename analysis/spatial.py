@@ -5,13 +5,19 @@ python -m analysis.spatial dataset=mfnet dataset.root=... split=train out=folder
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from analysis.arguments import MOST, dataset_of, decimal, out_folder, refuse_others, whole
+from annotated_types import Interval
+
+from analysis.arguments import MOST, Level, check_out, dataset_of
 from analysis.bar import progress
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import built, plain_command
+from rgbt.checks import InputError
+from rgbt.config.command import built
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.regions import MAX_REGIONS
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.collect import DataSet, Settings
@@ -19,102 +25,100 @@ if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.judging import Claim
     from rgbt.metrics.metric import Regions
 
-OWN: dict[str, str | None] = {
-    "split": "train",
-    "partition": "ring",
-    "regions": "9",
-    "aspect": "image",
-    "kernel": "four",
-    "estimator": "immerkaer",
-    "average": "pooled",
-    "blocks": "10",
-    "resamples": "2000",
-    "level": "0.95",
-    "seed": "0",
-    "workers": "0",
-    "out": "",
-}
-OVERRIDES = ("dataset", "data.on_error")
-"""What of the configuration counts here; another key is refused."""
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and how."""
+
+    split: Annotated[str, Help("whose images")] = "train"
+    partition: Annotated[Literal["ring", "vertical", "horizontal"], Help("how images are cut")] = (
+        "ring"
+    )
+    regions: Annotated[
+        int, Interval(ge=1, le=MAX_REGIONS), Help("number of regions of equal area")
+    ] = 9
+    aspect: Annotated[Literal["image", "released_3_4"], Help("of rings")] = "image"
+    kernel: Annotated[
+        Literal["four", "eight"], Help("of the Laplacian: four or eight neighbours")
+    ] = "four"
+    estimator: Annotated[
+        Literal["immerkaer", "wavelet_mad", "std"], Help("of the noise in the tables")
+    ] = "immerkaer"
+    average: Annotated[
+        Literal["pooled", "images"],
+        Help(
+            "of signal to noise over images: pooled (mean signal over mean noise) or images (mean "
+            "of each image's ratio)"
+        ),
+    ] = "pooled"
+    blocks: Annotated[
+        int, Interval(ge=0, le=MOST), Help("neighbouring images that are resampled together")
+    ] = 10
+    resamples: Annotated[int, Interval(ge=0, le=MOST), Help("of the images")] = 2000
+    level: Level = 0.95
+    seed: Annotated[int, Interval(ge=0, le=MOST), Help("of the resamples")] = 0
+    workers: Annotated[int, Interval(ge=0, le=1024), Help("threads; 0: one per core")] = 0
+    out: Annotated[
+        Path | None,
+        Help(
+            "folder for statistics.npz (what rgbt figures draws), regions.csv and statistics.md; "
+            "without one, the tables are only shown"
+        ),
+    ] = None
 
 
-def main(values: dict[str, str], overrides: list[str]) -> None:
+def main(options: Options, overrides: list[str]) -> int:
     """Measure a data set by region and print what it shows.
 
-    python -m analysis.spatial dataset=mfnet dataset.root=/data/MFNet split=train out=folder
-
-    dataset=synth or mfnet, dataset.*=...   as in python -m rgbt.run; data.on_error=skip leaves out
-                        files that cannot be read
-    split               whose images
-    partition, regions  ring, vertical or horizontal; 1 to 255 regions of equal area
-    aspect              of rings: image or released_3_4
-    kernel              of the Laplacian: four (default) or eight neighbours
-    estimator           of the noise in the tables: immerkaer (default), wavelet_mad, std
-    average             of signal to noise over images: pooled (mean signal over mean noise, the
-                        default) or images (mean of each image's ratio)
-    blocks              neighbouring images that are resampled together
-    resamples, level, seed  of the intervals
-    workers             threads; 0: one per core
-    out                 folder for statistics.npz (what analysis.figures draws), regions.csv and
-                        statistics.md; without one, the tables are shown only
+    Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet or dataset=synth;
+    data.on_error=skip leaves out files that cannot be read.
 
     All estimators and averages are measured; the last table shows what depends on them.
     """
     from analysis.statistics.claims import check_resampling, claims
     from rgbt.tracking.terminal import place_lines, show
 
-    _check_words(values)
-    out = out_folder(values["out"])
-    numbers = {key: whole(key, values[key], 0, MOST) for key in ("blocks", "resamples", "seed")}
-    level = decimal("level", values["level"], "0.95")
-    check_resampling(numbers["blocks"], numbers["resamples"], level)
-    settings, dataset = _settings(values, overrides)
-    dataset.names(values["split"])  # a split that is not there is told before anything is read
-    stats = _collect(dataset, values["split"], settings)
-    found = claims(stats, level=level, **numbers)
-    _print(stats, found, (values["estimator"], values["average"]), level)
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        show(place_lines(_write(stats, found, values, out)))
+    check_out(options.out)
+    check_resampling(options.blocks, options.resamples, options.level)
+    settings, dataset = _settings(options, overrides)
+    dataset.names(options.split)  # a missing split is reported before anything is read
+    stats = _collect(dataset, options.split, settings)
+    found = claims(
+        stats,
+        level=options.level,
+        blocks=options.blocks,
+        resamples=options.resamples,
+        seed=options.seed,
+    )
+    _print(stats, found, (options.estimator, options.average), options.level)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        show(place_lines(_write(stats, found, options, options.out)))
+    return 0
 
 
-def _check_words(values: dict[str, str]) -> None:
-    """Refuse what cannot be understood before anything is read."""
-    from analysis.statistics.derive import AVERAGES
-    from analysis.statistics.measure import ESTIMATORS, KERNELS
-
-    check_choice("partition", values["partition"], ("ring", "vertical", "horizontal"))
-    check_choice("aspect", values["aspect"], ("image", "released_3_4"))
-    check_choice("kernel", values["kernel"], KERNELS)
-    check_choice("estimator", values["estimator"], ESTIMATORS)
-    check_choice("average", values["average"], AVERAGES)
-
-
-def _settings(values: dict[str, str], overrides: list[str]) -> tuple[Settings, DataSet]:
+def _settings(options: Options, overrides: list[str]) -> tuple[Settings, DataSet]:
     from analysis.statistics.collect import Settings
 
-    refuse_others(overrides, OVERRIDES, list(OWN))
     settings = Settings(
-        regions=_regions(values),
-        kernel=values["kernel"],
-        workers=whole("workers", values["workers"], 0, 1024),
+        regions=_regions(options),
+        kernel=options.kernel,
+        workers=options.workers,
         skip_unreadable=built("data", overrides).on_error == "skip",
     )
     return settings, dataset_of(overrides)
 
 
-def _regions(values: dict[str, str]) -> Regions:
+def _regions(options: Options) -> Regions:
     from rgbt.metrics.metric import Regions
-    from rgbt.metrics.regions import MAX_REGIONS
 
-    partition, aspect = values["partition"], values["aspect"]
+    partition, aspect = options.partition, options.aspect
     if partition != "ring" and aspect != "image":
         raise InputError(f"aspect={aspect} is one of rings; leave it out with {partition} strips.")
-    regions = whole("regions", values["regions"], 1, MAX_REGIONS)
     return Regions(
-        partition=partition,  # type: ignore[arg-type]  # checked in `_check_words`
-        regions=regions,
-        aspect=aspect if partition == "ring" else None,  # type: ignore[arg-type]  # as above
+        partition=partition,
+        regions=options.regions,
+        aspect=aspect if partition == "ring" else None,
         absent="released",
     )
 
@@ -152,15 +156,15 @@ def _print(
 
 
 def _write(
-    stats: SpatialStatistics, found: tuple[Claim, ...], values: dict[str, str], folder: Path
+    stats: SpatialStatistics, found: tuple[Claim, ...], options: Options, folder: Path
 ) -> list[tuple[str, str]]:
     """The files of `folder`, as (what, path)."""
     from analysis.statistics import tables
     from rgbt.files.atomic import write_atomic
 
-    chosen = values["estimator"], values["average"]
+    chosen = options.estimator, options.average
     ways = sorted({_way(claim) for claim in found if claim.estimator}, key=lambda w: w != chosen)
-    text = tables.markdown(stats, found, ways, decimal("level", values["level"], "0.95"))
+    text = tables.markdown(stats, found, ways, options.level)
     stats.save(folder / "statistics.npz")
     write_atomic(folder / "regions.csv", tables.to_csv(stats).encode())
     write_atomic(folder / "statistics.md", text.encode())
@@ -172,7 +176,7 @@ def _way(claim: Claim) -> tuple[str, str]:
     return claim.estimator, claim.average
 
 
-entry = plain_command(OWN, main)
+entry = PlainCommand(Options, main, heeds=("dataset", "data.on_error"))
 
 if __name__ == "__main__":
     entry()

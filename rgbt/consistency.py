@@ -5,11 +5,14 @@ TC says how far the predictions of two frames of a scene agree, CA how far both 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import plain_command
+from rgbt.checks import InputError
+from rgbt.config.common_options import Checkpoint, Modality, RunsDir, Split, Trained, Trust
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.build.session import Session
@@ -18,43 +21,47 @@ if TYPE_CHECKING:
     from rgbt.tracking.folder import RunFolder
     from rgbt.tracking.tables import ConsistencyTable
 
-OWN = {
-    "run": "",
-    "runs_dir": "runs",
-    "frames": "virtual",
-    "split": "test",
-    "modality": "default",
-    "checkpoint": "best",
-    "trust": "",
-    "out": "",
-}
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and on which pairs of frames."""
+
+    run: Trained = ""
+    runs_dir: RunsDir = Path("runs")
+    frames: Annotated[
+        Literal["virtual", "next"],
+        Help(
+            "virtual: virtual views of every image, by three published sets of angles; written as "
+            '"aligned" (the first prediction is brought into the second frame, as in the paper) '
+            'and "released" (it is not). next: true second frames with known motion (dataset=synth '
+            "dataset.ego_forward_m=0.5, or a data set with a folder next/)"
+        ),
+    ] = "virtual"
+    split: Split = "test"
+    modality: Modality = "default"
+    checkpoint: Checkpoint = "best"
+    trust: Trust = ""
+    out: Annotated[
+        Path | None,
+        Help(
+            "folder of the counts and of a picture; default: evaluations/ in the run folder, where "
+            "counts on other images or other views than the published ones say so in their names, "
+            "and those on second frames of one motion are not replaced by those of another"
+        ),
+    ] = None
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+def main(options: Options, overrides: list[str]) -> int:
     """Measure TC and CA of a run, or of a network with weights from a file.
 
-    run       run folder, config key or MLflow run id; without one, name a network and its weights:
-              model=cmx_b2 model.weights=model_H.pth dataset.root=/data/MFNet (scale=paper)
-    frames    virtual: virtual views of every image, by three published sets of angles; written as
-              "aligned" (the first prediction is brought into the second frame, as in the paper)
-              and "released" (it is not). next: true second frames with known motion
-              (dataset=synth dataset.ego_forward_m=0.5, or a data set with a folder next/)
-    split     split of the data set
-    modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
-    checkpoint  best (by validation mIoU) or last
-    trust     modules of yours that the run was made with: trust=my_lab; their code is run
-    out       folder of the counts and of a picture; default: evaluations/ in the run folder, where
-              counts on other images or other views than the published ones say so in their names,
-              and those on second frames of one motion are not replaced by those of another
-    overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
-              they do not name is as in conf/consistency/views.yaml, whatever the run measured
+    Overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
+    they do not name is as in conf/consistency/views.yaml, whatever the run measured
     """
     from rgbt.build.load_run import open_trained
     from rgbt.build.session import panel_names, view_of
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.temporal_consistency import (
         PROTOCOLS,
-        Frames,
         consistency_table,
         count_pairs,
     )
@@ -62,22 +69,19 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
-    check_choice("frames", arguments["frames"], PROTOCOLS)
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
-    _check_comparable(arguments, overrides)
-    runs_dir = Path(arguments["runs_dir"])
-    run, trust = arguments["run"], parse_trust(arguments["trust"])
-    stored = open_trained(run, runs_dir, overrides, arguments["checkpoint"], trust=trust)
-    session, split = stored.session, arguments["split"]
-    view = view_of(session, arguments["modality"])
-    frames = cast(Frames, arguments["frames"])
-    folder = Path(arguments["out"] or stored.folder)
-    beside = [arguments["modality"]] if arguments["modality"] != "default" else []
-    beside += [] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]]
+    _check_comparable(options, overrides)
+    trust, checkpoint = parse_trust(options.trust), options.checkpoint
+    stored = open_trained(options.run, options.runs_dir, overrides, checkpoint, trust=trust)
+    session, split, frames = stored.session, options.split, options.frames
+    view = view_of(session, options.modality)
+    folder = options.out or stored.folder
+    beside = [options.modality] if options.modality != "default" else []
+    beside += [] if checkpoint == "best" else [checkpoint]
     if frames == "next":
         _keep_other_motions(session, folder / _name("next", session, split, beside))
-    elif not arguments["out"]:
+    elif options.out is None:
         beside += _other_images(stored.folder, session)
     keep = panel_names(session.dataset, split)
     found = count_pairs(session, session.model, split, frames, view=view, keep=keep)
@@ -87,7 +91,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     title = f"Consistency of {stored.label} ({session.dataset.name}, {split}; {frames}: {what})"
     show(rich_table(consistency_grid(table, title)))
     show(place_lines(_write(found, session, folder, beside)))
-    if frames == "virtual" and arguments["run"] and not (arguments["out"] or beside):
+    if frames == "virtual" and options.run and not (options.out or beside):
         _add_to_result(RunFolder(stored.folder.parent), session, split, table)
     return 0
 
@@ -96,10 +100,10 @@ CHANGES = ("transform", "trainer.precision", "metric")
 """Settings by which the same run gives other counts, or other scores of them."""
 
 
-def _check_comparable(arguments: dict[str, str], overrides: list[str]) -> None:
+def _check_comparable(options: Options, overrides: list[str]) -> None:
     """Refuse to put counts made in another way beside, or in place of, those of the run."""
     changed = [word for word in overrides if word.lstrip("+").startswith(CHANGES)]
-    if arguments["run"] and changed and not arguments["out"]:
+    if options.run and changed and options.out is None:
         raise InputError(
             f"{changed[0]} changes how the run is measured; name a folder for these counts with "
             "out=..."
@@ -135,6 +139,7 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
 
     from rgbt.evaluation.temporal_consistency import consistency_values
     from rgbt.tracking.mlflow_fill import read_sent
+    from rgbt.tracking.sync import Options as SyncOptions
     from rgbt.tracking.sync import status_of, tracking_of
     from rgbt.tracking.tables import without_nan
     from rgbt.tracking.terminal import tell
@@ -151,10 +156,10 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
     if read_sent(run) is None:
         return
     try:
-        tracking_of(run, {}).sync(run, status_of(run))
+        tracking_of(run, SyncOptions(run=run.path)).sync(run, status_of(run))
     except Exception as error:  # any store may fail in its own way; the folder has everything
         reason = (str(error).splitlines() or [""])[0]
-        tell(f"MLflow was not told ({reason}); python -m rgbt.tracking.sync run={run.path} does.")
+        tell(f"MLflow was not told ({reason}); rgbt sync run={run.path} does.")
 
 
 def _name(protocol: Protocol, session: Session, split: str, beside: list[str]) -> str:
@@ -190,5 +195,7 @@ def _other_images(folder: Path, session: Session) -> list[str]:
     return [f"{session.dataset.name}-{found[:8]}"]
 
 
+entry = PlainCommand(Options, main)
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

@@ -6,47 +6,59 @@ Counts are written, and the tables that follow from them are shown.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING, Annotated
 
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import plain_command
-from rgbt.data.domains import TestedHead
+from rgbt.checks import InputError
+from rgbt.config.common_options import (
+    AS_TRAINED,
+    Checkpoint,
+    Head,
+    Modality,
+    RegionsFile,
+    RunsDir,
+    Split,
+    Trained,
+    Trust,
+)
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.evaluation.corrupted import Failure
 
-OWN = {
-    "run": "",
-    "runs_dir": "runs",
-    "split": "test",
-    "modality": "default",
-    "regions": "as trained",
-    "head": "as trained",
-    "degradation": "none",
-    "severity": "",
-    "checkpoint": "best",
-    "trust": "",
-    "out": "",
-}
+
+@dataclass(frozen=True)
+class Options:
+    """What is evaluated, and on which images."""
+
+    run: Trained = ""
+    runs_dir: RunsDir = Path("runs")
+    split: Split = "test"
+    modality: Modality = "default"
+    regions: RegionsFile = "as trained"
+    head: Head = "as trained"
+    degradation: Annotated[
+        str,
+        Help(
+            "of the images: a file of conf/degradation such as thermal_removed or noise, with a "
+            "severity: degradation=noise severity=16; rgbt robustness takes all of them"
+        ),
+    ] = "none"
+    severity: Annotated[str, Help("of the degradation")] = ""
+    checkpoint: Checkpoint = "best"
+    trust: Trust = ""
+    out: Annotated[
+        Path | None, Help("file of the counts; default: evaluations/ in the run folder")
+    ] = None
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+def main(options: Options, overrides: list[str]) -> int:
     """Evaluate a run, on its own data set or another one, or a network with weights from a file.
 
-    run       run folder, config key or MLflow run id; without one, name a network and its weights:
-              model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)
-    split     split of the data set
-    modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
-    regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
-    head      of a network with a head per domain: own, source or target
-    degradation  of the images: a file of conf/degradation such as thermal_removed or noise, with a
-              severity: degradation=noise severity=16; python -m rgbt.robustness takes all of them
-    checkpoint  best (by validation mIoU) or last
-    trust     modules of yours that the run was made with: trust=my_lab; their code is run
-    out       file of the counts; default: evaluations/ in the run folder
-    overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
-              degradation: degradation.block=16 degradation.seed=1
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
+    degradation: degradation.block=16 degradation.seed=1
     """
     from rgbt.build.load_run import open_trained
     from rgbt.build.session import evaluate, result_tables, view_of
@@ -55,31 +67,30 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.terminal import result_view, show
     from rgbt.training.overview import announce_stored
 
-    if Path(arguments["out"] or "x").is_dir():
-        raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
+    if options.out is not None and options.out.is_dir():
+        raise InputError(f"out={options.out} is a folder; name the file of the counts, x.npz.")
     words, overrides = own_words(overrides)
-    trust = parse_trust(arguments["trust"])
-    failure = _failure(arguments, words, trust)
-    if arguments["regions"] != OWN["regions"]:
-        overrides = [*overrides, f"metric={arguments['regions']}"]
-    runs_dir = Path(arguments["runs_dir"])
-    run, checkpoint = arguments["run"], arguments["checkpoint"]
+    trust = parse_trust(options.trust)
+    failure = _failure(options, words, trust)
+    if options.regions != AS_TRAINED:
+        overrides = [*overrides, f"metric={options.regions}"]
+    run, runs_dir, checkpoint = options.run, options.runs_dir, options.checkpoint
     stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
     announce_stored(stored)
     session = stored.session
-    view = view_of(session, arguments["modality"])
-    head = _head(arguments["head"])
+    view = view_of(session, options.modality)
+    head = None if options.head == AS_TRAINED else options.head
     if failure is not None:
-        session = failure.applied(session, arguments["split"])
-    found = evaluate(session, session.model, arguments["split"], view=view, head=head)
+        session = failure.applied(session, options.split)
+    found = evaluate(session, session.model, options.split, view=view, head=head)
     counts = found.counts
     stem = "_".join(
         [session.dataset.name, counts.split, view, counts.partition]
         + ([] if head is None else [f"{head}-head"])
         + ([] if failure is None else [failure.mark])
-        + ([] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]])
+        + ([] if checkpoint == "best" else [checkpoint])
     )
-    path = Path(arguments["out"] or stored.folder / f"{stem}.npz")
+    path = options.out or stored.folder / f"{stem}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     counts.save(path)
     label = f"{stored.label} {session.dataset.name} {view}{f' {head} head' if head else ''}"
@@ -93,25 +104,20 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     return 0
 
 
-def _head(asked: str) -> TestedHead | None:
-    if asked == OWN["head"]:
-        return None
-    check_choice("head", asked, get_args(TestedHead))
-    return cast(TestedHead, asked)
-
-
-def _failure(arguments: dict[str, str], words: list[str], trust: Collection[str]) -> Failure | None:
+def _failure(options: Options, words: list[str], trust: Collection[str]) -> Failure | None:
     """The degradation and its severity; None where none is asked for."""
     from rgbt.evaluation.corrupted import choose
 
-    if arguments["degradation"] != OWN["degradation"]:
-        return choose(arguments["degradation"], words, trust).at(arguments["severity"])
-    idle = [*(["severity"] if arguments["severity"] else []), *words]
+    if options.degradation != "none":
+        return choose(options.degradation, words, trust).at(options.severity)
+    idle = [*(["severity"] if options.severity else []), *words]
     if idle:
         key = idle[0].partition("=")[0]
         raise InputError(f"'{key}' has no effect without degradation=..., for example noise.")
     return None
 
 
+entry = PlainCommand(Options, main)
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

@@ -8,11 +8,22 @@ labels and confidences of a split instead, to train other networks on
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING, Annotated
 
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import plain_command
+from rgbt.checks import InputError
+from rgbt.config.common_options import (
+    AS_TRAINED,
+    Checkpoint,
+    Head,
+    Modality,
+    RunsDir,
+    Trained,
+    Trust,
+)
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,110 +36,110 @@ if TYPE_CHECKING:
     from rgbt.data.to_predict import ToPredict
     from rgbt.types import Sample, View
 
-OWN = {
-    "run": "",
-    "input": "",
-    "rgb": "",
-    "thermal": "",
-    "out": None,
-    "runs_dir": "runs",
-    "modality": "default",
-    "head": "as trained",
-    "checkpoint": "best",
-    "trust": "",
-    "label_map": "none",
-    "pseudo_labels": "false",
-    "threshold": "0",
-}
+
+@dataclass(frozen=True)
+class Options:
+    """What is predicted, and how it is written."""
+
+    out: Annotated[Path, Help("folder, created if it is missing")]
+    run: Trained = ""
+    input: Annotated[
+        str,
+        Help(
+            "a folder of new images, laid out as the data set of the run, or with folders rgb and "
+            "thermal of equal names; PNG of four channels (R, G, B, thermal), one or a folder of "
+            "such; or a split of the data set. Labels are not needed"
+        ),
+    ] = ""
+    rgb: Annotated[str, Help("instead of input, with thermal: the RGB file of one pair")] = ""
+    thermal: Annotated[str, Help("the thermal file of that pair")] = ""
+    runs_dir: RunsDir = Path("runs")
+    modality: Modality = "default"
+    head: Head = "as trained"
+    checkpoint: Checkpoint = "best"
+    trust: Trust = ""
+    label_map: Annotated[
+        str,
+        Help(
+            "a file of conf/label_map, for a network that knows other classes than the data set: "
+            "vistas_to_freiburg (of 66 classes), cityscapes_to_freiburg, freiburg_to_mfnet"
+        ),
+    ] = "none"
+    pseudo_labels: Annotated[
+        bool,
+        Help(
+            "true: of a split, write labels/NAME.png (class indices, 255 where not sure), "
+            "confidence/NAME.png (16 bit) and pseudo_labels.json; the same command resumes"
+        ),
+    ] = False
+    threshold: Annotated[
+        float,
+        Help("smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one"),
+    ] = 0.0
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+def main(options: Options, overrides: list[str]) -> int:
     """Write NAME_overlay.png and NAME.png (class indices, 0..K-1) for every input image.
 
-    run       run folder, config key or MLflow run id; without one, name a network and its weights:
-              model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)
-    input     a folder of new images, laid out as the data set of the run, or with folders rgb and
-              thermal of equal names; PNG of four channels (R, G, B, thermal), one or a folder of
-              such; or a split of the data set. Labels are not needed
-    rgb, thermal  instead: the two files of one pair
-    out       folder, made where it is missing
-    modality  rgbt, rgb or thermal: what is predicted from; default: what the network is made for
-    head      of a network with a head per domain: own, source or target
-    checkpoint  best (by validation mIoU) or last, of a run
-    trust     modules of yours that the run was made with: trust=my_lab; their code is run
-    label_map a file of conf/label_map, for a network that knows other classes than the data set:
-              vistas_to_freiburg (of 66 classes), cityscapes_to_freiburg, freiburg_to_mfnet
-    pseudo_labels  true: of a split, write labels/NAME.png (class indices, 255 where not sure),
-              confidence/NAME.png (16 bit) and pseudo_labels.json; called again it goes on
-    threshold smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one
-    overrides such as dataset=mfnet dataset.root=/data/MFNet
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
     from rgbt.build.load_run import open_trained
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.pseudo_labels import label_map_of
     from rgbt.training.overview import announce_stored
 
-    check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
-    as_labels = arguments["pseudo_labels"] == "true"
-    if not as_labels and arguments["threshold"] != OWN["threshold"]:
+    if not options.pseudo_labels and options.threshold:
         raise InputError(
-            f"threshold={arguments['threshold']} is for pseudo_labels=true; class maps and "
+            f"threshold={options.threshold} is for pseudo_labels=true; class maps and "
             "overlays show every pixel."
         )
-    label_map = label_map_of(arguments["label_map"])
-    runs_dir = Path(arguments["runs_dir"])
-    run, checkpoint = arguments["run"], arguments["checkpoint"]
-    trust = parse_trust(arguments["trust"])
+    label_map = label_map_of(options.label_map)
+    run, runs_dir, checkpoint = options.run, options.runs_dir, options.checkpoint
+    trust = parse_trust(options.trust)
     stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
     announce_stored(stored)
-    if as_labels:
-        _pseudo_labels(arguments, stored, label_map)
+    if options.pseudo_labels:
+        _pseudo_labels(options, stored, label_map)
     else:
-        _pictures(arguments, stored.session, label_map)
+        _pictures(options, stored.session, label_map)
     return 0
 
 
-def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMap | None) -> None:
+def _pseudo_labels(options: Options, stored: Stored, label_map: LabelMap | None) -> None:
     from rgbt.build.session import view_of
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
-    session, split = stored.session, arguments["input"]
-    if split not in session.dataset.splits or arguments["rgb"] or arguments["thermal"]:
+    session, split = stored.session, options.input
+    if split not in session.dataset.splits or options.rgb or options.thermal:
         raise InputError(
             f"input={split}: pseudo-labels are written of a split of {session.dataset.name}; "
             f"name one of {', '.join(session.dataset.splits)}."
         )
-    try:
-        threshold = float(arguments["threshold"])
-    except ValueError as error:
-        raise InputError(
-            f"threshold={arguments['threshold']}: expected a number from 0 to 1."
-        ) from error
-    key_or_file = stored.folder.parent.name if arguments["run"] else stored.label
+    key_or_file = stored.folder.parent.name if options.run else stored.label
     found = write_pseudo_labels(
         session,
         teacher_of(key_or_file, session.model),
         split,
-        view_of(session, arguments["modality"]),
-        Path(arguments["out"]),
-        threshold,
+        view_of(session, options.modality),
+        options.out,
+        options.threshold,
         label_map,
-        _head(arguments["head"]),
+        _head(options),
     )
     show(rich_table(summary(found)))
     show(place_lines([("pseudo-labels", str(found.folder.resolve()))]))
 
 
-def _pictures(arguments: dict[str, str], session: Session, label_map: LabelMap | None) -> None:
+def _pictures(options: Options, session: Session, label_map: LabelMap | None) -> None:
     import numpy as np
 
     from rgbt.build.session import view_of
     from rgbt.engine.progress import progress
     from rgbt.tracking.pictures import overlay
 
-    view, head = view_of(session, arguments["modality"]), _head(arguments["head"])
-    images, out = _chosen(arguments, session), Path(arguments["out"])
+    view, head = view_of(session, options.modality), _head(options)
+    images, out = _chosen(options, session), options.out
     images.check_out(out)
     out.mkdir(parents=True, exist_ok=True)
     palette = np.array(session.dataset.palette, np.uint8)
@@ -155,16 +166,19 @@ def _tell_what_was_left_out(images: ToPredict) -> None:
         tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
 
 
-def _chosen(arguments: dict[str, str], session: Session) -> ToPredict:
+def _chosen(options: Options, session: Session) -> ToPredict:
     """The images that `input`, or `rgb` and `thermal`, name."""
     from rgbt.data.to_predict import of_files, of_path, of_split
 
-    source, rgb, thermal = (arguments[key] for key in ("input", "rgb", "thermal"))
+    source, rgb, thermal = options.input, options.rgb, options.thermal
     if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
         raise InputError(
             "expected either input=FOLDER (or a split, or a file of four channels) or rgb=FILE "
             "thermal=FILE, got "
-            + (" and ".join(key for key in ("input", "rgb", "thermal") if arguments[key]) or "none")
+            + (
+                " and ".join(key for key in ("input", "rgb", "thermal") if getattr(options, key))
+                or "none"
+            )
             + " of input, rgb and thermal."
         )
     dataset = session.dataset
@@ -175,13 +189,8 @@ def _chosen(arguments: dict[str, str], session: Session) -> ToPredict:
     return of_path(dataset, source, session.loading.on_error)
 
 
-def _head(asked: str) -> TestedHead | None:
-    from rgbt.data.domains import TestedHead
-
-    if asked == OWN["head"]:
-        return None
-    check_choice("head", asked, get_args(TestedHead))
-    return cast("TestedHead", asked)
+def _head(options: Options) -> TestedHead | None:
+    return None if options.head == AS_TRAINED else options.head
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
@@ -209,5 +218,7 @@ def _classes(
             yield sample, found.classes[0].numpy()
 
 
+entry = PlainCommand(Options, main)
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

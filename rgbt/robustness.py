@@ -7,11 +7,21 @@ file that says what it was made of. What is there already is not made again.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from rgbt.checks import InputError, split_list
-from rgbt.config.command import plain_command
+from rgbt.config.common_options import (
+    AS_TRAINED,
+    Checkpoint,
+    RegionsFile,
+    RunsDir,
+    Split,
+    Trust,
+)
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.build.load_run import Stored
@@ -19,37 +29,47 @@ if TYPE_CHECKING:
     from rgbt.evaluation.robustness import Measured
     from rgbt.tracking.tables import Grid
 
-OWN = {
-    "run": "",
-    "runs_dir": "runs",
-    "split": "test",
-    "degradations": "all",
-    "regions": "as trained",
-    "checkpoint": "best",
-    "trust": "",
-    "out": "",
-}
 FOLDER = "robustness"
 """Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and under which corruptions."""
+
+    run: Annotated[
+        str,
+        Help(
+            "run folders, config keys or MLflow run ids, with commas; without one, name a network "
+            "and its weights: model=mfnet model.weights=final.pth dataset.root=/data/MFNet"
+        ),
+    ] = ""
+    runs_dir: RunsDir = Path("runs")
+    split: Split = "test"
+    degradations: Annotated[
+        str,
+        Help(
+            "files of conf/degradation with commas, or all; the clean images and, of networks that "
+            "can decode one branch alone, both branches are always measured beside them"
+        ),
+    ] = "all"
+    regions: RegionsFile = "as trained"
+    checkpoint: Checkpoint = "best"
+    trust: Trust = ""
+    out: Annotated[
+        Path | None,
+        Help("folder of the counts of one run; default: evaluations/robustness/ in the run folder"),
+    ] = None
+
+
+def main(options: Options, overrides: list[str]) -> int:
     """Evaluate runs under every severity of every degradation; one table per run.
 
-    run       run folders, config keys or MLflow run ids, with commas; without one, name a network
-              and its weights: model=mfnet model.weights=final.pth dataset.root=/data/MFNet
-    split     split of the data set
-    degradations  files of conf/degradation with commas, or all; the clean images and, of networks
-              that can decode one branch alone, both branches are always measured beside them
-    regions   a file of conf/metric: ring5, ring9, vertical5, horizontal5
-    checkpoint  best (by validation mIoU) or last
-    trust     modules of yours that the runs were made with: trust=my_lab; their code is run
-    out       folder of the counts of one run; default: evaluations/robustness/ in the run folder
-    overrides such as dataset=mfnet dataset.root=/data/MFNet, degradation.seed=1 (of what is drawn),
-              and of a single degradation any key: degradations=noise degradation.severities=[4,12]
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet, degradation.seed=1 (of what is drawn),
+    and of a single degradation any key: degradations=noise degradation.severities=[4,12]
 
-    Stopped and given again, it goes on; what is there is made again only where the data, the
-    weights or the degradation differ. python -m analysis.figures figure=robustness draws it.
+    The same command resumes; what exists is made again only where the data, the weights or the
+    degradation differ. rgbt figures figure=robustness draws it.
     """
     from rgbt.build.load_run import open_trained
     from rgbt.config.stored_config import parse_trust
@@ -59,22 +79,21 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.terminal import place_lines, rich_table, show
 
     words, overrides = own_words(overrides)
-    trust = parse_trust(arguments["trust"])
-    chosen = chosen_of(arguments["degradations"], words, trust)
-    runs = split_list(arguments["run"], "runs") if arguments["run"] else [""]
-    _check_comparable(arguments, overrides, runs)
+    trust = parse_trust(options.trust)
+    chosen = chosen_of(options.degradations, words, trust)
+    runs = split_list(options.run, "runs") if options.run else [""]
+    _check_comparable(options, overrides, runs)
     for run in filter(None, runs):  # before the first of them is measured
-        find_run(run, Path(arguments["runs_dir"]))
-    if arguments["regions"] != OWN["regions"]:
-        overrides = [*overrides, f"metric={arguments['regions']}"]
+        find_run(run, options.runs_dir)
+    if options.regions != AS_TRAINED:
+        overrides = [*overrides, f"metric={options.regions}"]
     for run in runs:
-        runs_dir, checkpoint = Path(arguments["runs_dir"]), arguments["checkpoint"]
-        stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
-        folder = Path(arguments["out"] or stored.folder / FOLDER / _place(stored, arguments))
-        measured = measure(stored.session, arguments["split"], chosen, folder)
-        grid = robustness_grid(measured, _title(stored, arguments["split"]))
+        stored = open_trained(run, options.runs_dir, overrides, options.checkpoint, trust=trust)
+        folder = options.out or stored.folder / FOLDER / _place(stored, options)
+        measured = measure(stored.session, options.split, chosen, folder)
+        grid = robustness_grid(measured, _title(stored, options.split))
         # A table of some failures does not take the place of that of all.
-        some = [] if arguments["degradations"] == OWN["degradations"] else chosen
+        some = [] if options.degradations == "all" else chosen
         stem = "_".join(["robustness", *(each.row for each in some)])
         _write_tables(measured, grid, folder / stem)
         show(rich_table(grid))
@@ -116,32 +135,30 @@ CHANGES = ("transform", "trainer.precision", "metric")
 """Settings by which the same run gives other counts, or other scores of them."""
 
 
-def _check_comparable(
-    arguments: dict[str, str], overrides: Sequence[str], runs: Sequence[str]
-) -> None:
+def _check_comparable(options: Options, overrides: Sequence[str], runs: Sequence[str]) -> None:
     """Refuse counts made in another way among those of the run, and several runs in one folder."""
     changed = [word for word in overrides if word.lstrip("+").startswith(CHANGES)]
-    if changed and arguments["run"] and not arguments["out"]:
+    if changed and options.run and options.out is None:
         raise InputError(
             f"{changed[0]} changes how the run is measured; name a folder for these counts with "
             "out=..."
         )
-    if arguments["out"] and len(runs) > 1:
+    if options.out is not None and len(runs) > 1:
         raise InputError(f"out= is the folder of one run, but run= names {len(runs)}; leave it.")
 
 
-def _place(stored: Stored, arguments: dict[str, str]) -> str:
+def _place(stored: Stored, options: Options) -> str:
     """Folder of a split's counts: plain where the run is measured as its own evaluation is."""
     from rgbt.evaluation.robustness import read_json
 
     session = stored.session
-    regions = [session.regions.name] if arguments["regions"] != OWN["regions"] else []
-    last = [] if arguments["checkpoint"] == "best" else [arguments["checkpoint"]]
+    regions = [session.regions.name] if options.regions != AS_TRAINED else []
+    last = [] if options.checkpoint == "best" else [options.checkpoint]
     own = read_json(stored.folder.parent / "dataset.json") or {}
     found = session.dataset.fingerprint()
     is_other = own.get("files", found) != found
     others = [f"{session.dataset.name}-{found[:8]}"] if is_other else []
-    return "_".join([arguments["split"], *regions, *last, *others])
+    return "_".join([options.split, *regions, *last, *others])
 
 
 def _title(stored: Stored, split: str) -> str:
@@ -197,5 +214,7 @@ def _write_tables(measured: Sequence[Measured], grid: Grid, place: Path) -> None
     write_atomic(place.with_name(f"{place.name}.md"), grid.to_markdown().encode())
 
 
+entry = PlainCommand(Options, main)
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

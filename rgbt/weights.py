@@ -1,7 +1,7 @@
 """Look at files of weights, and write those of a run.
 
-    python -m rgbt.weights inspect FILE [model=...]
-    python -m rgbt.weights export run=runs/KEY format=safetensors out=FILE
+    rgbt weights inspect FILE [model=...]
+    rgbt weights export run=runs/KEY format=safetensors out=FILE
 
 Nothing in a file is executed. Exit code 0: done, 1: the file does not fit the network, 2: wrong
 input.
@@ -11,32 +11,41 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checkpoints.layout import Facts
 from rgbt.checkpoints.read import Contents
-from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config.command import plain_command
+from rgbt.checks import InputError
+from rgbt.config.common_options import RunsDir
 from rgbt.config.compose import compose, conf_dir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.config.schema import build
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
 
-INSPECT = {"file": None, "trust": ""}
-EXPORT = {"run": None, "format": None, "out": None, "checkpoint": "best", "runs_dir": "runs"}
-CHECKPOINTS = ("best", "last")
 NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
 
 
-def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
+@dataclass(frozen=True)
+class InspectOptions:
+    """Of `inspect`."""
+
+    file: Annotated[Path, Help("of weights, ours or a released one")]
+    trust: Annotated[
+        str,
+        Help("modules of yours with the network of its run: trust=my_lab; their code is run"),
+    ] = ""
+
+
+def inspect(options: InspectOptions, overrides: list[str]) -> int:
     """Say what a file is and what it would do to a network.
 
-    FILE      of weights, ours or a released one
-    overrides the network, such as model=mask2former_tiny model.fresh=[sem_seg_head]; without, the
-              one that fits, or the one of the run that the file belongs to
-    trust     modules of yours with the network of that run: trust=my_lab; their code is run
+    Overrides choose the network, model=mask2former_tiny model.fresh=[sem_seg_head]; without, it is
+    the one that fits, or the one of the run that the file belongs to
     """
     from rich.text import Text
 
@@ -47,10 +56,10 @@ def inspect(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.tables import Grid
     from rgbt.tracking.terminal import rich_table, show
 
-    contents = read(Path(arguments["file"]))
+    contents = read(options.file)
     facts = recognise(contents)
     show(facts_view(contents, facts))
-    found = _network(contents, facts, overrides, parse_trust(arguments["trust"]))
+    found = _network(contents, facts, overrides, parse_trust(options.trust))
     if found is None:
         return 0
     node, name = found
@@ -97,15 +106,27 @@ def _built(node: DictConfig) -> Any:
         return build(node)
 
 
-def export(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Write the weights of a run.
+@dataclass(frozen=True)
+class ExportOptions:
+    """Of `export`."""
 
-    run         run folder, config key or MLflow run id
-    format      safetensors (names of this project), released (as the authors' code loads them),
-                released_temporal (CMX as the temporal paper's code loads it)
-    out         the new file; one that exists is left alone
-    checkpoint  best (by the selection split) or last
-    """
+    run: Annotated[str, Help("run folder, config key or MLflow run id")]
+    format: Annotated[
+        str,
+        Help(
+            "safetensors (names of this project), released (as the authors' code loads them), "
+            "released_temporal (CMX as the temporal paper's code loads it)"
+        ),
+    ]
+    out: Annotated[Path, Help("the new file; one that exists is left alone")]
+    checkpoint: Annotated[
+        Literal["best", "last"], Help("best (by the selection split) or last")
+    ] = "best"
+    runs_dir: RunsDir = Path("runs")
+
+
+def export(options: ExportOptions, overrides: list[str]) -> int:
+    """Write the weights of a run."""
     from rgbt.build.initial_weights import differences
     from rgbt.checkpoints.layout import family_named
     from rgbt.checkpoints.read import read
@@ -113,15 +134,10 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.tracking.folder import find_run
     from rgbt.tracking.terminal import tell
 
-    for word in overrides:
-        raise InputError(
-            f"'{word}': expected one of the keys of this command; "
-            f"{nearest(word.partition('=')[0], EXPORT)}."
-        )
-    check_choice("checkpoint", arguments["checkpoint"], CHECKPOINTS)
-    folder = find_run(arguments["run"], Path(arguments["runs_dir"]))
+    del overrides  # none is heeded
+    folder = find_run(options.run, options.runs_dir)
     model = _model(folder / "config.yaml")
-    contents = read(folder / f"{arguments['checkpoint']}.pt")
+    contents = read(folder / f"{options.checkpoint}.pt")
     family = family_named(model._target_)
     plain: Any = OmegaConf.to_container(model, resolve=True)
     settings = {key: value for key, value in plain.items() if key not in NOT_SETTINGS}
@@ -131,12 +147,12 @@ def export(arguments: dict[str, str], overrides: list[str]) -> int:
         "inputs": json.dumps(plain.get("inputs")),
         "settings": json.dumps(settings),
         "run": folder.name,
-        "checkpoint": arguments["checkpoint"],
+        "checkpoint": options.checkpoint,
         "step": str(contents.settings.get("step", 0)),
     }
-    out = Path(arguments["out"])
-    remark = save(out, arguments["format"], family, contents.tensors, note)
-    others = differences(model, CONVENTIONS.get((arguments["format"], family), ()))
+    out = options.out
+    remark = save(out, options.format, family, contents.tensors, note)
+    others = differences(model, CONVENTIONS.get((options.format, family), ()))
     if others:
         tell(
             f"the authors' code does {' '.join(others)}, this run did something else; there its "
@@ -157,24 +173,13 @@ def _model(path: Path) -> DictConfig:
     return config
 
 
-def main() -> None:
-    """Run the command that the first word names."""
-    commands = {"inspect": plain_command(INSPECT, inspect), "export": plain_command(EXPORT, export)}
-    name, *words = sys.argv[1:] or [""]
-    if name in ("-h", "--help"):
-        sys.stdout.write(f"{(__doc__ or '').strip()}\n")
-        sys.exit(0)
-    if name not in commands:
-        sys.stderr.write(
-            f"rgbt: expected a command, got '{name}'; {nearest(name, commands)}, such as "
-            "python -m rgbt.weights inspect FILE.\n"
-        )
-        sys.exit(2)
-    if name == "inspect" and words and not words[0].startswith(("file=", "-")):
-        words[0] = f"file={words[0]}"
-    sys.argv[1:] = words
-    commands[name]()
-
+entry = CommandGroup(
+    __doc__,
+    {
+        "inspect": PlainCommand(InspectOptions, inspect, name="rgbt weights inspect", first="file"),
+        "export": PlainCommand(ExportOptions, export, heeds=(), name="rgbt weights export"),
+    },
+)
 
 if __name__ == "__main__":
-    main()
+    entry()

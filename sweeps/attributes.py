@@ -15,7 +15,7 @@ LABEL = "rgbt.label"
 OWNER = "rgbt.owner"
 """Who works on the trial: host, process, start of the process, see `sweeps.worker.owner`."""
 
-BEAT = "rgbt.beat"
+HEARTBEAT = "rgbt.beat"
 """Seconds since 1970 at which the owner last said that it is alive."""
 
 TOKEN = "rgbt.token"

@@ -12,20 +12,20 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
-from sweeps.points import Point
-from sweeps.settings import Settings
+from sweeps.point import Point
+from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
-from sweeps.study import dashboard_command, report, show_places, study_folder
+from sweeps.study import dashboard_command, report, show_links, study_folder
 from sweeps.worker.driver import Driver
-from sweeps.worker.found import Runs
-from sweeps.worker.lists import make_executor
-from sweeps.worker.live import View
 from sweeps.worker.owner import Owner
-from sweeps.worker.plan import Plan, Planner
-from sweeps.worker.sources import SearchSource
-from sweeps.worker.storage import begin_study, existing_study, open_storage
-from sweeps.worker.trial_store import Ledger, counted
+from sweeps.worker.planner import PlannedPoint, Planner
+from sweeps.worker.point_list import make_executor
+from sweeps.worker.progress import ProgressView
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.trial_source import SamplerSource
+from sweeps.worker.trial_store import TrialStore, counted
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Search:
     study: str
     fixed: tuple[str, ...]
     parameters: tuple[Parameter, ...]
-    runs: Runs
+    runs: RunStore
     identity: Sequence[Any]
 
 
-def search(wanted: Search, settings: Settings) -> None:
+def search(wanted: Search, settings: SweepSettings) -> None:
     """Run trials until the budget is spent, then show what was found.
 
     Raises:
@@ -80,19 +80,19 @@ def search(wanted: Search, settings: Settings) -> None:
             [*wanted.identity, probe.runs[0].dataset],
         ),
     }
-    study = begin_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
+    study = open_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
-    ledger = Ledger(study, storage, Owner.me())
+    store = TrialStore(study, storage, Owner.me())
     tell(f"study {wanted.study}: the same command on other machines takes part in it.")
-    _drive(wanted, settings, ledger)
-    _check_end(ledger, wanted.study)
+    _drive(wanted, settings, store)
+    _check_end(store, wanted.study)
     runs_dir = wanted.runs.runs_dir
     links = report(study, study_folder(runs_dir, wanted.study), wanted.runs.tracking)
-    show_places([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
+    show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
 
 
-def _probe(wanted: Search) -> Plan:
+def _probe(wanted: Search) -> PlannedPoint:
     """The lowest point of the space, checked with the highest one before the first trial.
 
     Raises:
@@ -115,7 +115,7 @@ def _end_of(parameters: tuple[Parameter, ...], end: Literal["low", "high"]) -> l
     return list(as_overrides(suggest(FixedTrial(values), parameters)))
 
 
-def _check_consistency(probe: Plan, settings: Settings) -> None:
+def _check_consistency(probe: PlannedPoint, settings: SweepSettings) -> None:
     """Refuse an objective of two frames that the runs would not measure.
 
     Raises:
@@ -132,16 +132,16 @@ def _check_consistency(probe: Plan, settings: Settings) -> None:
             )
 
 
-def _drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
+def _drive(wanted: Search, settings: SweepSettings, store: TrialStore) -> None:
     def done() -> int:
-        return sum(trial.state.is_finished() for trial in ledger.trials())
+        return sum(trial.state.is_finished() for trial in store.trials())
 
-    view = View(wanted.study, settings.trials, settings.workers, done)
-    source = SearchSource(
-        wanted.fixed, wanted.parameters, ledger, Planner(), settings, view.refused
+    view = ProgressView(wanted.study, settings.trials, settings.workers, done)
+    source = SamplerSource(
+        wanted.fixed, wanted.parameters, store, Planner(), settings, view.refused
     )
     driver = Driver(
-        ledger=ledger,
+        store=store,
         source=source,
         runs=wanted.runs,
         executor=make_executor(settings, wanted.runs.runs_dir),
@@ -153,7 +153,7 @@ def _drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
         driver.run()
 
 
-def _sampler_and_pruner(settings: Settings) -> tuple[Any, Any]:
+def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
     count = len(settings.objectives)
     kind, seed, options = _chosen(settings.sampler, "sampler")
     sampler = build_sampler(kind, seed, options, count)
@@ -178,9 +178,9 @@ def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any
     return str(node["kind"]), seed, options
 
 
-def _preview(wanted: Search, settings: Settings) -> None:
+def _preview(wanted: Search, settings: SweepSettings) -> None:
     """Say what would be searched, and what there is; write nothing."""
-    study = existing_study(wanted.study, settings.storage, wanted.runs.runs_dir)
+    study = find_study(wanted.study, settings.storage, wanted.runs.runs_dir)
     trials = [] if study is None else counted(study)
     states = Counter(trial.state.name.lower() for trial in trials)
     sys.stdout.write(f"study {wanted.study}: {dict(states) or 'not begun'}\n")
@@ -194,8 +194,8 @@ def _preview(wanted: Search, settings: Settings) -> None:
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
 
 
-def _check_end(ledger: Ledger, name: str) -> None:
-    trials = ledger.trials()
+def _check_end(store: TrialStore, name: str) -> None:
+    trials = store.trials()
     states = Counter(trial.state.name for trial in trials)
     failed = [trial for trial in trials if trial.state.name == "FAIL"]
     for trial in failed[:5]:

@@ -70,7 +70,7 @@ NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class SweepSettings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
 
     storage: Text | None
@@ -118,13 +118,13 @@ AS_WRITTEN: dict[str, type] = {"space": dict, "params": dict, "points": list}
 """Keys whose interpolations (``${px:64}``) are for the runs and not for the sweep to resolve."""
 
 
-def read_settings(node: DictConfig) -> Settings:
+def read_settings(node: DictConfig) -> SweepSettings:
     """Settings from the node ``hydra.sweeper``.
 
     Raises:
         InputError: an unknown key, a missing one, a wrong type or value.
     """
-    known = Settings.__dataclass_fields__
+    known = SweepSettings.__dataclass_fields__
     raw = OmegaConf.to_container(node, resolve=False)
     assert isinstance(raw, dict), "the node of a sweeper is a mapping"
     for key in raw:
@@ -142,8 +142,8 @@ def read_settings(node: DictConfig) -> Settings:
             raise InputError(f"'hydra.sweeper.{key!s}' must be a {what}, got {raw[key]!r}.")
     values = {key: node[key] for key in known if key not in AS_WRITTEN}
     empty = {key: kind() for key, kind in AS_WRITTEN.items()}
-    own = {"_target_": "sweeps.settings.Settings", **values, **empty}
-    settings: Settings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
+    own = {"_target_": "sweeps.settings.SweepSettings", **values, **empty}
+    settings: SweepSettings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
     for point in raw["points"]:
         if not isinstance(point, list):
             raise InputError(

@@ -9,11 +9,16 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.command import built, plain_command, readable_paths
+from rgbt.config.command import built
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
+from rgbt.config.words import readable_paths
 from rgbt.tracking.provenance import without_passwords
 from sweeps.worker.storage import JOURNAL, load_study, open_storage, study_names
 
@@ -22,37 +27,50 @@ if TYPE_CHECKING:
 
     from rgbt.tracking.tables import Grid
     from rgbt.tracking.tracker import Link, Tracking
-    from sweeps.report.data import Importances, StudyData
-    from sweeps.report.figures import Picture
+    from sweeps.report.figures import StudyFigure
+    from sweeps.report.study_data import Importances, StudyData
 
-OWN = {"name": "", "storage": "", "runs_dir": "runs", "out": ""}
+
+@dataclass(frozen=True)
+class Options:
+    """Which study, and where its report goes."""
+
+    name: Annotated[str, Help("of the study; without one, those of the storage are listed")] = ""
+    storage: Annotated[
+        str,
+        Help(
+            "file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME; default: studies.journal "
+            "in the folder of runs"
+        ),
+    ] = ""
+    runs_dir: RunsDir = Path("runs")
+    out: Annotated[
+        Path | None,
+        Help("folder for Markdown, CSV and PNGs; default: studies/<name> in the folder of runs"),
+    ] = None
+
 
 NAME_LENGTH = 80
 """Characters of a folder name; longer study names are cut and told apart by their hash."""
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
-    """Show what a study has found: best trials, failures, importances, figures.
+def main(options: Options, overrides: list[str]) -> int:
+    """Show the results of a study: best trials, failures, importances, figures.
 
-    name      of the study; without one, those of the storage are listed
-    storage   file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME;
-              default: studies.journal in the folder of runs
-    runs_dir  folder of runs
-    out       folder for Markdown, CSV and PNGs; default: studies/<name> in the folder of runs
-    overrides of the tracker, such as tracking=none or tracking.uri=http://host:5000
+    Overrides are of the tracker: tracking=none or tracking.uri=http://host:5000
     """
-    runs_dir = Path(arguments["runs_dir"])
-    place = arguments["storage"] or None
+    runs_dir = options.runs_dir
+    place = options.storage or None
     _check_exists(place, runs_dir)
     storage = open_storage(place, runs_dir)
-    if not arguments["name"]:
+    if not options.name:
         known = ", ".join(study_names(storage)) or "none"
         raise InputError(f"give the study with name=...; the storage holds: {known}.")
-    study = load_study(arguments["name"], storage)
+    study = load_study(options.name, storage)
     tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
-    out = Path(arguments["out"] or study_folder(runs_dir, study.study_name))
+    out = options.out or study_folder(runs_dir, study.study_name)
     links = report(study, out, tracking)
-    show_places([*links, ("dashboard", dashboard_command(place, runs_dir))])
+    show_links([*links, ("dashboard", dashboard_command(place, runs_dir))])
     return 0
 
 
@@ -72,9 +90,9 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
 
     from rgbt.files.atomic import write_atomic
     from rgbt.tracking.terminal import rich_table, show
-    from sweeps.report.data import importances, read
     from sweeps.report.figures import draw
     from sweeps.report.records import record
+    from sweeps.report.study_data import importances, read
     from sweeps.report.tables import tables, trials_csv
 
     data = read(study)
@@ -113,13 +131,13 @@ def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str
     return "\n".join([head, *map(markdown_table, grids), remarked])
 
 
-def gallery(pictures: Sequence[Picture]) -> str:
+def gallery(pictures: Sequence[StudyFigure]) -> str:
     """The figures in Markdown, by the names of their files."""
     drawn = [picture for picture in pictures if picture.path is not None]
     return "".join(f"\n## {p.title}\n\n![{p.title}]({p.name}.png)\n" for p in drawn)
 
 
-def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
+def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
     """What a person should know: how good the importances are, and which figures there are not."""
     missing: dict[str, list[str]] = {}
     for picture in pictures:
@@ -132,7 +150,7 @@ def remarks(shares: Importances, pictures: Sequence[Picture]) -> list[str]:
 
 def metrics(data: StudyData) -> dict[str, float]:
     """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
-    from sweeps.report.data import pruning
+    from sweeps.report.study_data import pruning
     from sweeps.report.tables import WORDS
 
     found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
@@ -171,12 +189,14 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
         )
 
 
-def show_places(places: Sequence[Link]) -> None:
+def show_links(places: Sequence[Link]) -> None:
     """Print where everything is, one "name  place" pair per line."""
     from rgbt.tracking.terminal import place_lines, show
 
     show(place_lines(places))
 
 
+entry = PlainCommand(Options, main, heeds=("tracking",))
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

@@ -18,24 +18,24 @@ from rgbt.metrics import names
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.tables import ABSENT, Grid, number
 from rgbt.tracking.terminal import rich_table, show, tell
-from sweeps.points import Point
-from sweeps.report.data import short_names
+from sweeps.point import Point
+from sweeps.rendering.seed_groups import group_grid, unfinished_grid
+from sweeps.report.study_data import short_names
 from sweeps.search import Search, search
-from sweeps.settings import Settings, read_settings
-from sweeps.sheet.groups import group_grid, unfinished_grid
-from sweeps.space.grid import GridPoint, Swept, distributions, grid_points, list_points, split
+from sweeps.settings import SweepSettings, read_settings
+from sweeps.space.grid import GridPoint, SweptValues, distributions, grid_points, list_points, split
 from sweeps.space.merge import merge_space
 from sweeps.space.space import as_overrides
-from sweeps.worker.found import Runs, open_runs
-from sweeps.worker.lists import (
+from sweeps.worker.point_list import (
     Outcome,
     PointList,
     estimated_seconds,
     other_code_line,
-    survey,
-    work_off,
+    preview_points,
+    run_points,
 )
-from sweeps.worker.live import duration
+from sweeps.worker.progress import duration
+from sweeps.worker.run_store import RunStore, open_run_store
 
 PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""
@@ -59,7 +59,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     typed = [*_params(settings), *arguments]
     fixed, swept, intervals = split(typed, loader)
     base = tuple(_forwarded(config))
-    runs = open_runs(config)
+    runs = open_run_store(config)
     if settings.space or intervals:
         parameters = merge_space(settings.space, fixed, swept, intervals)
         taken = {parameter.key for parameter in parameters}
@@ -79,14 +79,14 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     _grid(_point_list(name, kind, points, (runs, base)), settings)
 
 
-def _params(settings: Settings) -> list[str]:
+def _params(settings: SweepSettings) -> list[str]:
     """`params` as overrides: text as it would be typed, other values as Hydra reads them."""
     typed = {key: value for key, value in settings.params.items() if isinstance(value, str)}
     others = {key: value for key, value in settings.params.items() if key not in typed}
     return [*(f"{key}={value}" for key, value in typed.items()), *as_overrides(others)]
 
 
-def _refuse_what_is_for_searches(settings: Settings) -> None:
+def _refuse_what_is_for_searches(settings: SweepSettings) -> None:
     given = {
         "trials": settings.trials is not None,
         "hours": settings.hours is not None,
@@ -100,7 +100,7 @@ def _refuse_what_is_for_searches(settings: Settings) -> None:
         )
 
 
-def _points(settings: Settings, fixed: Sequence[str], swept: Swept) -> list[GridPoint]:
+def _points(settings: SweepSettings, fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
     grid = grid_points(fixed, swept)
     if not settings.points:
         return grid
@@ -112,7 +112,7 @@ def _points(settings: Settings, fixed: Sequence[str], swept: Swept) -> list[Grid
 
 
 def _point_list(
-    name: str, kind: str, points: Sequence[GridPoint], place: tuple[Runs, tuple[str, ...]]
+    name: str, kind: str, points: Sequence[GridPoint], place: tuple[RunStore, tuple[str, ...]]
 ) -> PointList:
     runs, base = place
     every = tuple(
@@ -141,9 +141,9 @@ def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
     return shlex.join(words)
 
 
-def _grid(wanted: PointList, settings: Settings) -> None:
+def _grid(wanted: PointList, settings: SweepSettings) -> None:
     if settings.dry_run:
-        outcomes = survey(wanted, settings)
+        outcomes = preview_points(wanted, settings)
         show(rich_table(grid_table(wanted, outcomes)))
         seconds = estimated_seconds(outcomes, settings.workers)
         missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
@@ -151,12 +151,12 @@ def _grid(wanted: PointList, settings: Settings) -> None:
         tell(f"{missing} of {len(outcomes)} points would be run{guess}.")
         _tell_other_code(outcomes)
         return
-    outcomes = survey(wanted, settings)
+    outcomes = preview_points(wanted, settings)
     wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
     if wrong:
         # Nothing was run yet: a typing mistake is told before hours are spent on the other points.
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
-    outcomes = work_off(wanted, settings)
+    outcomes = run_points(wanted, settings)
     show(rich_table(group_grid(wanted.title, outcomes)))
     unfinished = unfinished_grid(outcomes)
     if unfinished.rows:

@@ -63,7 +63,7 @@ ROOMS = {
     "space": set(),
     "report": set(),
     "table": {"worker"},
-    "sheet": {"table", "worker", "report"},
+    "rendering": {"table", "worker", "report"},
 }
 """Folders of sweeps, and which others each of them knows."""
 
@@ -93,7 +93,7 @@ ANALYSIS_ROOMS = {
 }
 """Folders of analysis, and which others each of them knows; its commands join them."""
 
-PUBLISHED = ("sweeps.table", "sweeps.points", "sweeps.report.data")
+PUBLISHED = ("sweeps.table", "sweeps.evaluation", "sweeps.report.study_data")
 """What of the sweeps the report may import: the papers' tables as data, and studies read."""
 
 PARENTS = {"sweeps.report"}

@@ -311,15 +311,15 @@ def read_marker(path: Path) -> Any:
 
 
 def follow(path: Path) -> Any:
-    from sweeps.worker.follow import Follower
+    from sweeps.worker.run_monitor import MetricsReader
 
-    return plain(Follower(path.parent).new_lines())
+    return plain(MetricsReader(path.parent).new_lines())
 
 
 def found(path: Path) -> Any:
-    from sweeps.worker.found import Found
+    from sweeps.worker.run_store import RunResult
 
-    run = Found("key", path.parent)
+    run = RunResult("key", path.parent)
     return plain((run.dataset, run.commit, run.scores()))
 
 
@@ -429,9 +429,9 @@ def journal(folder: Path) -> Path:
 
 
 def read_journal(path: Path) -> Any:
-    from sweeps.worker.storage import existing_study
+    from sweeps.worker.storage import find_study
 
-    study = existing_study("s", None, path.parent)
+    study = find_study("s", None, path.parent)
     if study is None:
         raise InputError("there is no such study.")
     return plain([(trial.number, trial.params, trial.values) for trial in study.get_trials()])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from analysis.figures import method_figures, paper_figures
 from analysis.figures.figure_spec import FigureSpec
@@ -22,13 +22,13 @@ FIGURES = {
 
 
 def make(
-    figure: str, values: dict[str, str], overrides: list[str]
+    figure: str, values: dict[str, Any], overrides: list[str]
 ) -> tuple[Figure, Mapping[str, str]]:
     """The figure called `figure`, and its numbers as text by the ending of their file.
 
     Args:
         figure: a key of `FIGURES`.
-        values: key -> text of the keys that were given.
+        values: key -> value of the options that were given.
         overrides: other ``key=value`` arguments.
 
     Raises:

@@ -6,11 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from analysis.arguments import MOST, decimal, whole
 from analysis.bar import progress
-from rgbt.checks import InputError, check_choice, nearest, split_list
+from rgbt.checks import InputError, nearest, split_list
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent, Regions
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class Given:
@@ -29,18 +30,18 @@ class Given:
 
     Attributes:
         figure: its name.
-        values: key -> text, those alone that were given.
+        values: key -> value, only those that were given.
         overrides: of the configuration: ``dataset=...``, ``metric=...``.
         metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
     """
 
     figure: str
-    values: Mapping[str, str]
+    values: Mapping[str, Any]
     overrides: tuple[str, ...]
     metric: str
 
-    def need(self, key: str, what: str) -> str:
-        """The text of a key.
+    def need(self, key: str, what: str) -> Any:
+        """The value of a key.
 
         Raises:
             InputError: it was not given; `what` says what it would be.
@@ -49,15 +50,9 @@ class Given:
             raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
         return self.values[key]
 
-    def get(self, key: str, default: str) -> str:
-        """The text of a key, or `default`."""
-        return self.values.get(key, default)
-
-    def choice(self, key: str, known: Sequence[str]) -> str:
-        """One of `known`; the first where the key was not given."""
-        value = self.get(key, known[0])
-        check_choice(key, value, known)
-        return value
+    def get(self, key: str, default: T) -> T:
+        """The value of a key, or `default`."""
+        return cast(T, self.values.get(key, default))
 
     def absent(self, every: Iterable[Counts]) -> Absent:
         """The convention for absent classes of ``absent=``; without it that of the counts.
@@ -69,22 +64,7 @@ class Given:
 
         if "absent" not in self.values:
             return convention(every)
-        return cast("Absent", self.choice("absent", ("released", "exclude")))
-
-    def number(self, key: str, default: int) -> int:
-        """A whole number of at least 1 (a seed: at least 0)."""
-        least = 0 if key == "seed" else 1
-        return whole(key, self.get(key, str(default)), least, MOST)
-
-    def fraction(self, key: str, default: float) -> float:
-        """A number such as 0.95."""
-        text = self.get(key, str(default))
-        return decimal(key, text, f"{default:g}")
-
-    def numbers(self, key: str, default: Sequence[int]) -> tuple[int, ...]:
-        """Whole numbers of at least 1, with commas between them."""
-        text = self.get(key, ",".join(map(str, default)))
-        return tuple(whole(key, each, 1, MOST) for each in split_list(text, "numbers"))
+        return cast("Absent", self.values["absent"])
 
     def named(self, key: str, what: str) -> dict[str, str]:
         """Label -> place, of ``label:place,label:place``; without a label the place's last name.

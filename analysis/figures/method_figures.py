@@ -9,7 +9,6 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.arguments import blocks_of
 from analysis.bar import progress
 from analysis.figures.figure_spec import OF_RUNS, RUNS, figure
 from analysis.figures.inputs import Given
@@ -130,12 +129,12 @@ def _profiles(given: Given) -> list[Profile]:
     from analysis.figures.profiles import BANDS, profile
     from analysis.uncertainty import Resampling
 
-    band: Any = given.choice("band", BANDS)
+    band: Any = given.get("band", BANDS[0])
     methods = given.runs()
     settings = Resampling(
-        resamples=given.number("resamples", 10_000),
-        level=given.fraction("level", 0.95),
-        blocks=blocks_of(given.get("blocks", "auto")),
+        resamples=given.get("resamples", 10_000),
+        level=given.get("level", 0.95),
+        blocks=given.get("blocks", "auto"),
         absent=given.absent(counts for seeds in methods.values() for counts in seeds),
     )
     made = []

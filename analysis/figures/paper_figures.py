@@ -48,7 +48,7 @@ def spatialseg_fig1(given: Given) -> Figure:
         )
     if not has_statistics:
         given.refuse(["part"], "statistics=... or dataset=..., whose images it chooses")
-    part = given.choice("part", PARTS)
+    part = given.get("part", PARTS[0])
     if "maps" in given.values:
         pixel_maps = given.maps()
         if not has_statistics:
@@ -74,7 +74,7 @@ def spatialseg_fig2(given: Given) -> Figure:
     from analysis.figures.maps import occupancy_over
     from rgbt.metrics.metric import Regions
 
-    regions = given.number("regions", 5)
+    regions = given.get("regions", 5)
     counts = {each: given.counts("methods", f"{each}{regions}") for each in STRIPS_AND_RINGS}
     absent = given.absent(each for methods in counts.values() for each in methods.values())
     statistics = given.statistics()
@@ -114,7 +114,7 @@ def spatialseg_fig3(given: Given) -> Figure:
         method = next(iter(methods.items()))
         check_one_dataset(statistics, method[1])
     absent = given.absent([method[1]]) if method else "released"
-    made = classes.class_regions(statistics, given.choice("part", PARTS), method, absent)
+    made = classes.class_regions(statistics, given.get("part", PARTS[0]), method, absent)
     return classes.draw(made, splits=(statistics.split, method[1].split if method else ""))
 
 
@@ -188,7 +188,7 @@ def spatialseg_fig6(given: Given) -> Figure:
     from analysis.statistics.measure import ESTIMATORS
     from analysis.statistics.resampling import Blocks
 
-    estimator, average = given.choice("estimator", ESTIMATORS), given.choice("average", AVERAGES)
+    estimator, average = given.get("estimator", ESTIMATORS[0]), given.get("average", AVERAGES[0])
     statistics = given.statistics(by_region=True)
     series = image_quality.snr_series(statistics, Blocks(statistics), estimator, average)
     return image_quality.draw(series)
@@ -208,7 +208,7 @@ def temporal_fig5(given: Given) -> Figure:
     """TC and CA by class."""
     from analysis.figures import consistency
 
-    frames: Any = given.choice("frames", ("aligned", "released", "next"))
+    frames: Any = given.get("frames", "aligned")
     runs = given.runs(frames)
     absent = given.absent(counts for seeds in runs.values() for counts in seeds)
     return consistency.draw(consistency.class_consistency(runs, absent))
@@ -232,12 +232,12 @@ def crm_fig5(given: Given) -> Figure:
     from analysis.figures import masks
     from rgbt.config.command import built
 
-    patches = given.numbers("patches", masks.PATCHES)
+    patches = given.get("patches", masks.PATCHES)
     sample = given.dataset.read(_one_name(given))
     chosen = masks.masker_overrides(patches).items()
     maskers = {title: built("masker", overrides) for title, overrides in chosen}
     multiple = masks.whole_cells(patches)
-    return masks.draw(masks.mask_examples(sample, maskers, multiple, given.number("seed", 0)))
+    return masks.draw(masks.mask_examples(sample, maskers, multiple, given.get("seed", 0)))
 
 
 @figure(

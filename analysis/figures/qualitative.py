@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from analysis.bar import progress
 from analysis.figures.figure_spec import DATASET_AND_METRIC, FigureSpec
@@ -34,24 +34,24 @@ def qualitative(name: str, shows: str) -> FigureSpec:
 def draw_panel(given: Given) -> Figure:
     """Images, ground truth and predictions."""
     from analysis.figures import panels
-    from analysis.predictions.images import Format, Reader
+    from analysis.predictions.images import Reader
     from rgbt.tracking.terminal import tell
 
     folders = {
         label: Path(place).expanduser()
         for label, place in given.named("methods", PREDICTIONS).items()
     }
-    layout = given.choice("layout", panels.LAYOUTS)
-    form: Any = given.choice("format", get_args(Format))
+    layout = given.get("layout", panels.LAYOUTS[0])
+    form: Any = given.get("format", "auto")
     dataset = given.dataset
     reader = Reader(dataset.classes, dataset.palette, form)
-    rule = given.choice("pick", panels.RULES)
+    rule = given.get("pick", panels.RULES[0])
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):
         raise InputError("names= says which images are shown; leave pick= and rows= out.")
     if rule == "largest_difference":
         names = _most_different(given, folders, form)
     else:
-        names = given.names(given.number("rows", 4))
+        names = given.names(given.get("rows", 4))
     suffix = given.get("suffix", "")
     readers = {label: _reading(folder, reader, suffix) for label, folder in folders.items()}
     made = panels.panel(dataset, readers, names, given.regions)
@@ -72,7 +72,7 @@ def _most_different(given: Given, folders: dict[str, Path], form: Any) -> tuple[
         for label, folder in folders.items():
             (counts,) = score_folder(folder, given.dataset, split, options, advance).counts
             mious[label] = image_mious(counts)
-    return most_different(mious, given.dataset.names(split), given.number("rows", 4))
+    return most_different(mious, given.dataset.names(split), given.get("rows", 4))
 
 
 def _reading(folder: Path, reader: Reader, suffix: str) -> ReadPrediction:

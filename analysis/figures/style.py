@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arguments import out_folder
+from analysis.arguments import check_out
 from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
 
@@ -129,7 +129,7 @@ def out_path(out: str) -> Path:
             f"out={out}: expected a name that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
             f", got '{path.suffix}'; for example out=figure.pdf."
         )
-    out_folder(str(path.parent))
+    check_out(path.parent)
     return path
 
 

@@ -8,43 +8,54 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from analysis.arguments import MOST, out_folder, refuse_others, whole
-from rgbt.checks import InputError
-from rgbt.config.command import built, plain_command, readable_paths
+from analysis.arguments import Resamples, check_out
+from rgbt.config.command import built
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
+from rgbt.config.shadowing import check_not_shadowed
 from rgbt.config.stored_config import parse_trust
-
-OWN = {"out": "report", "runs_dir": "runs", "resamples": "2000", "trust": ""}
-
-FEWEST = 100
-"""Resamples."""
+from rgbt.config.words import readable_paths
 
 TOLD = 5
 """Remarks told on stderr; the page has all."""
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+@dataclass(frozen=True)
+class Options:
+    """Where the page goes, and what it is made of."""
+
+    out: Annotated[Path, Help("folder; the page is index.html in it")] = Path("report")
+    runs_dir: Annotated[
+        Path,
+        Help("folder of runs; its mlflow.db is the store unless tracking.uri says another"),
+    ] = Path("runs")
+    resamples: Resamples = 2000
+    trust: Annotated[
+        str,
+        Help(
+            "modules of yours with maskers and data sets to draw: trust=my_lab; their code is run"
+        ),
+    ] = ""
+
+
+def main(options: Options, overrides: list[str]) -> int:
     """Make one page of everything in an MLflow store; it needs no server and no network.
 
-    out        folder; the page is index.html in it
-    runs_dir   folder of runs; its mlflow.db is the store unless tracking.uri says another
-    resamples  of the images, for intervals and p-values
-    trust      modules of yours with maskers and data sets to draw: trust=my_lab; their code is run
-    overrides of the tracker, such as tracking.uri=http://host:5000 or tracking.experiment=mine
+    Overrides are of the tracker: tracking.uri=http://host:5000 or tracking.experiment=mine
 
-    Every score is computed from the counts of its run. What cannot be read is told here and listed
-    on the page.
+    Every score is computed from the counts of its run. What cannot be read is reported here and
+    listed on the page.
     """
-    resamples = whole("resamples", arguments["resamples"], FEWEST, MOST)
-    runs_dir, out = Path(arguments["runs_dir"]).expanduser(), out_folder(arguments["out"])
-    trust = parse_trust(arguments["trust"])
-    if out is None:
-        raise InputError("'out' has no value; give a folder for the page.")
+    check_not_shadowed("sweeps")
+    runs_dir, out = options.runs_dir, options.out
+    check_out(out)
+    trust = parse_trust(options.trust)
     # Read by Hydra; the tracker resolves the folder like that of a run.
     place = readable_paths([f"runs_dir={os.fspath(runs_dir)}"])
-    refuse_others(overrides, ("tracking",), list(OWN))
     tracking = built("tracking", [*place, *overrides])
 
     from rich.console import Console
@@ -61,7 +72,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
         def track(items: Sequence[Any], what: str) -> Any:
             return progress.track(items, description=what)
 
-        data = collect(Asked(tracking, runs_dir, resamples, typed, trust), track)
+        data = collect(Asked(tracking, runs_dir, options.resamples, typed, trust), track)
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
     for remark in data.remarks[:TOLD]:
@@ -78,5 +89,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     return 0
 
 
+entry = PlainCommand(Options, main, heeds=("tracking",))
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

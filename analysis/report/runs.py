@@ -29,7 +29,7 @@ from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
 from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
-from sweeps.table.cell_points import DEFAULT_SCALE, TAG
+from sweeps.table.request import DEFAULT_SCALE, TAG
 
 SPLIT = "test"
 STUDY_TAG = "rgbt.study/"

@@ -9,7 +9,7 @@ from analysis.report.data import CellEntry
 from analysis.report.tables_files import NOTHING, Line
 from analysis.report.tables_intervals import Intervals
 from analysis.report.tables_scored import Draft, asked_of, values_of
-from sweeps.table.scoring import Scored, published
+from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
 NOT_HERE = "counts of some runs are not in the store; the value is as recorded, without interval."
@@ -45,7 +45,7 @@ def cell_of(draft: Draft, row: Row, column: Column, intervals: Intervals) -> Cel
     return replace(entry, low=low, high=high, covers=found.covers)
 
 
-def printed_cell(scored: Scored, row: Row, column: Column) -> CellEntry:
+def printed_cell(scored: ScoredTable, row: Row, column: Column) -> CellEntry:
     """What is known of a cell without any run."""
     needs = column.needs or row.needs or scored.table.needs or ""
     if not needs and row.experiment is None:

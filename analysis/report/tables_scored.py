@@ -12,17 +12,17 @@ from analysis.report.tables_intervals import OWN, Source, counts_of
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from sweeps.points import Evaluation
+from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import (
-    Cell,
     Place,
+    TableCell,
     derived,
     evaluation_of,
     is_counted,
     is_of_runs,
     metric_of,
 )
-from sweeps.table.scoring import Scored, score
+from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 
 AGREES = 1e-4
@@ -37,7 +37,7 @@ class _Opened:
     commit: str | None
     run: ReportRun
 
-    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
         """Counts of an evaluation."""
         return counts_of(self.run, OWN if evaluation is None else evaluation.path)
 
@@ -56,10 +56,10 @@ class Draft:
     """A recorded table with its file, scored."""
 
     recorded: Recorded
-    scored: Scored
+    scored: ScoredTable
 
 
-def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun]) -> Scored:
+def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun]) -> ScoredTable:
     """Means, ranks and orders from the counts of the runs that the record names.
 
     Args:
@@ -79,12 +79,12 @@ def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun])
     return score(recorded.name, table, places, scale=recorded.scale, sizes=sizes)
 
 
-def _sizes(recorded: Recorded, table: Table) -> dict[Place, Cell]:
+def _sizes(recorded: Recorded, table: Table) -> dict[Place, TableCell]:
     """Columns of parameters as recorded: a network is not known here."""
     names = {column.name for column in table.columns if column.parameters}
     labels = {row.label for row in table.rows}
     return {
-        place: Cell(math.nan if line.mean is None else line.mean, math.nan, 0, line.reason)
+        place: TableCell(math.nan if line.mean is None else line.mean, math.nan, 0, line.reason)
         for place, line in recorded.lines.items()
         if place[0] in labels and place[1] in names and (line.mean is not None or line.reason)
     }

@@ -38,6 +38,9 @@ class StudySweeper(Sweeper):
             InputError: settings, space or a point that do not fit.
             RunError: points failed; the others were run.
         """
+        from rgbt.config.shadowing import check_not_shadowed
+
+        check_not_shadowed("sweeps")
         from sweeps.sweep import sweep
 
         assert self.hydra_context is not None, "Hydra calls setup() before sweep()"

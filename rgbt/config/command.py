@@ -1,19 +1,16 @@
 """The command line: Hydra overrides in, one sentence and an exit code out.
 
-Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 129, 130 and
-143 stopped by SIGHUP, Ctrl-C and SIGTERM.
+For commands with options of their own see `rgbt.config.plain_command`.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
-from pathlib import Path
 from typing import Any
 
 import hydra
@@ -22,12 +19,13 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from rgbt.checks import InputError, RunError, nearest, without_controls
+from rgbt.checks import InputError
 from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.config.hydra_messages import check_words, hydra_sentence
+from rgbt.config.reporting import exit_code
 from rgbt.config.schema import build, check, check_node
-from rgbt.runtime.resources import reporting_exhaustion
-from rgbt.runtime.signals import Stopped, answered
+from rgbt.config.words import readable_paths
+from rgbt.runtime.signals import answered
 
 Main = Callable[[DictConfig], int | None]
 
@@ -60,34 +58,15 @@ def command(
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
-                codes.append(_report(lambda: _checked(main, config), catch_interrupt=False))
+                codes.append(exit_code(lambda: _checked(main, config), catch_interrupt=False))
 
             with answered():
-                code = max([_report(lambda: _compose(config_name, job, words)), *codes])
+                code = max([exit_code(lambda: _compose(config_name, job, words)), *codes])
             sys.exit(code)
 
         return entry
 
     return decorate
-
-
-PATHS = ("model.weights", "pretrained", "dataset.root", "runs_dir", "out")
-
-
-def readable_paths(words: list[str]) -> list[str]:
-    """Arguments as Hydra reads them: shells keep ~ after "=", and file names hold anything.
-
-    A path with "=", spaces or brackets (epoch=299.ckpt) is put in quotes; a comma still makes a
-    grid. Names of earlier runs (experiment:NAME/last.pt) are read as they are.
-    """
-    found = []
-    for word in words:
-        key, equals, value = re.sub(r"=~(?=/|$)", f"={Path.home()}", word).partition("=")
-        is_path = key in PATHS and not value.startswith("experiment:")
-        if is_path and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
-            value = "'" + value.replace("'", "\\'") + "'"
-        found.append(f"{key}{equals}{value}")
-    return found
 
 
 def task_overrides() -> list[str]:
@@ -108,45 +87,6 @@ def _compose(config_name: str, job: Callable[[DictConfig], None], words: Sequenc
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     register_resolvers()
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
-
-
-def _report(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
-    """Exit code of `work`; a user's mistake is told in one sentence on stderr.
-
-    Args:
-        work: what to do.
-        catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
-    """
-    try:
-        with reporting_exhaustion():
-            return work() or 0
-    except InputError as error:
-        return _say(str(error), 2)
-    except RunError as error:
-        return _say(str(error), 1)
-    except (HydraException, OmegaConfBaseException) as error:
-        words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        return _say(hydra_sentence(error, words), 2)
-    except (FileExistsError, NotADirectoryError) as error:
-        return _say(f"{error.filename}: a file is where a folder is needed; name another path.", 2)
-    except OSError as error:
-        return _say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
-    except Stopped as stop:
-        if not catch_interrupt:
-            raise
-        return _say(str(stop), stop.code)
-    except KeyboardInterrupt:  # a second Ctrl-C
-        if not catch_interrupt:
-            raise
-        return _say("interrupted; rerun the command to resume from its last checkpoint.", 130)
-
-
-def _say(sentence: str, code: int) -> int:
-    with suppress(OSError):  # output may go to a file on a disk that is full
-        sys.stdout.flush()
-    # Names of files and words of damaged files may hold anything.
-    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
-    return code
 
 
 @contextmanager
@@ -172,46 +112,3 @@ def built(node: str, overrides: Sequence[str]) -> Any:
         config = compose(overrides)
         check_node(config[node], node)
         return build(config[node])
-
-
-def plain_command(
-    own: Mapping[str, str | None], main: Callable[[dict[str, str], list[str]], int | None]
-) -> Callable[[], None]:
-    """Make `main` a command on something stored: ``key=value`` arguments, no configuration file.
-
-    Args:
-        own: the command's keys with their defaults; None: must be given.
-        main: gets the values by key, and all other ``key=value`` arguments as Hydra overrides.
-
-    Returns:
-        function without arguments that leaves by ``sys.exit``.
-    """
-
-    def entry() -> None:
-        arguments = sys.argv[1:]
-        if any(item in ("-h", "--help") for item in arguments):
-            usage = " ".join(f"{k}=..." if v is None else f"[{k}={v}]" for k, v in own.items())
-            sys.stdout.write(f"{(main.__doc__ or '').strip()}\n\nusage: {usage} [overrides]\n")
-            sys.exit(0)
-        with answered():
-            code = _report(lambda: main(*_split(own, arguments)))
-        sys.exit(code)
-
-    return entry
-
-
-def _split(own: Mapping[str, str | None], arguments: list[str]) -> tuple[dict[str, str], list[str]]:
-    values = {key: value for key, value in own.items() if value is not None}
-    overrides = []
-    for item in arguments:
-        key, equals, value = item.partition("=")
-        if not equals:
-            raise InputError(f"'{item}': expected key=value; {nearest(key, own)}.")
-        if key in own:
-            values[key] = re.sub(r"^~(?=/|$)", str(Path.home()), value)
-        else:
-            overrides += readable_paths([item])
-    for key in own:
-        if key not in values:
-            raise InputError(f"'{key}' has no value; give one with {key}=...")
-    return values, overrides

@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.compose import compose, conf_dir, flatten
+from rgbt.config.schema import NODES, TOP_LEVEL
 
 ADDED = ("experiment", "search", "debug")
 """Groups of which the configuration holds no file by itself: they are added with a plus."""
@@ -152,6 +153,22 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
     inner = [] if parents else _below(config, last)
     hint = f"did you mean {' or '.join(inner)}?" if inner else f"{nearest(last, known)}."
     return f"'{full_key}' is not a key of the configuration; {hint}"
+
+
+def top_level_keys() -> tuple[str, ...]:
+    """What a word without a dot may name: keys of the configuration, and groups that are added."""
+    return (*NODES, *TOP_LEVEL, *ADDED)
+
+
+def key_hint(key: str, names: Sequence[str]) -> str:
+    """What may be meant by a word that is neither an option nor a key of the configuration.
+
+    Args:
+        key: as typed, without a dot.
+        names: options of the command.
+    """
+    inner = _below(compose([]), key)
+    return f"did you mean {' or '.join(inner)}" if inner else nearest(key, [*names, *NODES])
 
 
 def _leaves(config: DictConfig) -> list[str]:

@@ -12,6 +12,7 @@ import math
 import types
 import typing
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from annotated_types import DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, MultipleOf
@@ -24,7 +25,7 @@ Place = tuple[int | str, ...]
 
 NAMES: dict[Any, str] = {
     **{float: "a number", int: "a whole number", str: "a text", bool: "true or false"},
-    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list"},
+    **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list", Path: "a path"},
     Any: "a finite value",
 }
 

@@ -7,10 +7,13 @@ Safe to repeat: only what a store does not have is sent. ``uri=``, ``artifact_ur
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_client import StoreBusyError
 from rgbt.tracking.mlflow_fill import read_sent
@@ -20,57 +23,57 @@ from rgbt.tracking.provenance import HIDDEN, without_passwords
 from rgbt.tracking.replaced import REPLACED, runs_dir_of
 from rgbt.tracking.tracker import Status
 
-KEYS = ("run", "runs_dir", "uri", "artifact_uri", "experiment")
 EXPERIMENT = "rgbt"
 
 
-def parse(arguments: Sequence[str]) -> dict[str, str]:
-    """``key=value`` words as a dictionary.
+@dataclass(frozen=True)
+class Options:
+    """What is sent, and where."""
 
-    Raises:
-        InputError: a word of another form, an unknown key, both or none of run and runs_dir.
-    """
-    options: dict[str, str] = {}
-    for word in arguments:
-        key, equals, value = word.partition("=")
-        if not equals or not value:
-            raise InputError(f"'{word}': expected key=value; known: {', '.join(KEYS)}.")
-        if key not in KEYS:
-            raise InputError(f"'{key}' is not a key of this command; {nearest(key, KEYS)}.")
-        options[key] = value
-    if ("run" in options) == ("runs_dir" in options):
-        raise InputError("give either run=<run folder> or runs_dir=<folder of runs>.")
-    return options
+    run: Annotated[Path | None, Help("one run folder")] = None
+    runs_dir: Annotated[Path | None, Help("instead: a folder of runs, all of which are sent")] = (
+        None
+    )
+    uri: Annotated[
+        str | None, Help("of the store; default: the one that the run was started with")
+    ] = None
+    artifact_uri: Annotated[str | None, Help("where the files go; default: likewise")] = None
+    experiment: Annotated[str | None, Help("of MLflow; default: likewise")] = None
+
+    def __post_init__(self) -> None:
+        if (self.run is None) == (self.runs_dir is None):
+            raise InputError("give either run=<run folder> or runs_dir=<folder of runs>.")
 
 
-def folders_of(options: dict[str, str]) -> list[RunFolder]:
+def folders_of(options: Options) -> list[RunFolder]:
     """The run folders that are requested.
 
     Raises:
         InputError: the folder is missing or is no run folder.
     """
-    if "runs_dir" in options:
-        replaced = Path(options["runs_dir"]) / REPLACED
-        return [*runs_in(options["runs_dir"]), *(runs_in(replaced) if replaced.is_dir() else ())]
-    path = Path(options["run"])
+    if options.run is None:
+        runs_dir = options.runs_dir or Path()
+        replaced = runs_dir / REPLACED
+        return [*runs_in(runs_dir), *(runs_in(replaced) if replaced.is_dir() else ())]
+    path = options.run
     if not (path / "run.json").exists():
         raise InputError(f"{path} is not a run folder (it has no run.json).")
     return [RunFolder(path)]
 
 
-def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
+def tracking_of(folder: RunFolder, options: Options) -> MlflowTracking:
     """The store of one folder: as requested, else the one it was started with, else the default.
 
     Raises:
         InputError: the store needs a password, which is not kept in the folder.
     """
     sent = read_sent(folder)
-    uri = options.get("uri", sent.uri if sent else None)
+    uri = options.uri or (sent.uri if sent else None)
     artifact_uri = None
     if sent is not None and uri is not None:
         same_store = without_passwords(uri) == without_passwords(sent.uri)
         artifact_uri = sent.artifact_uri if same_store else None
-    artifact_uri = options.get("artifact_uri", artifact_uri)
+    artifact_uri = options.artifact_uri or artifact_uri
     for key, address in (("uri", uri), ("artifact_uri", artifact_uri)):
         if address is not None and HIDDEN in address:
             raise InputError(
@@ -79,7 +82,7 @@ def tracking_of(folder: RunFolder, options: dict[str, str]) -> MlflowTracking:
     return MlflowTracking(
         uri,
         artifact_uri=artifact_uri,
-        experiment=options.get("experiment", sent.experiment if sent else EXPERIMENT),
+        experiment=options.experiment or (sent.experiment if sent else EXPERIMENT),
         runs_dir=str(runs_dir_of(folder)),
     )
 
@@ -91,7 +94,7 @@ def status_of(folder: RunFolder) -> Status:
     return "RUNNING" if folder.is_locked() else "KILLED"
 
 
-def sync_all(options: dict[str, str]) -> int:
+def sync_all(options: Options) -> int:
     """Send every folder; 1 if one of them could not be sent.
 
     Raises:
@@ -101,7 +104,7 @@ def sync_all(options: dict[str, str]) -> int:
     failed = 0
     busy: dict[str, StoreBusyError] = {}
     # What is wrong with one of many folders must not keep the others from being sent.
-    raised: tuple[type[InputError], ...] = (InputError,) if "run" in options else ()
+    raised: tuple[type[InputError], ...] = (InputError,) if options.run else ()
     for folder in folders_of(options):
         try:
             named = tracking_of(folder, options)
@@ -125,14 +128,13 @@ def sync_all(options: dict[str, str]) -> int:
     return 1 if failed else 0
 
 
-def main(arguments: Sequence[str]) -> int:
-    """The exit code: 0 sent, 1 a store failed, 2 the input was wrong."""
-    try:
-        return sync_all(parse(arguments))
-    except InputError as error:
-        sys.stderr.write(f"rgbt: {error}\n")
-        return 2
+def main(options: Options, overrides: list[str]) -> int:
+    """Send run folders to MLflow. Safe to repeat: only what a store does not have is sent."""
+    del overrides  # none is heeded
+    return sync_all(options)
 
+
+entry = PlainCommand(Options, main, heeds=())
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    entry()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweeps.report.data import StudyData, shown
+from sweeps.report.study_data import StudyData, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

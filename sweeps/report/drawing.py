@@ -22,7 +22,7 @@ from sweeps.report.axes import (
     used_parameters,
     vertical_axis,
 )
-from sweeps.report.data import Importances, StudyData, short_names
+from sweeps.report.study_data import Importances, StudyData, short_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from sweeps.report import drawing
 from sweeps.report.axes import used_parameters
-from sweeps.report.data import Importances, StudyData
+from sweeps.report.study_data import Importances, StudyData
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ CONTOUR_STYLE: Any = {
 
 
 @dataclass(frozen=True)
-class Picture:
+class StudyFigure:
     """A figure of a study.
 
     Attributes:
@@ -45,7 +45,7 @@ class Picture:
     reason: str = ""
 
 
-def draw(data: StudyData, shares: Importances, folder: Path) -> list[Picture]:
+def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure]:
     """Write ``<name>.png`` of every figure that suits the study.
 
     A list has points without parameters, hence no figures of a search; a grid has those that do
@@ -63,11 +63,11 @@ def draw(data: StudyData, shares: Importances, folder: Path) -> list[Picture]:
         path = folder / f"{name}.png"
         if isinstance(made, str):
             path.unlink(missing_ok=True)
-            pictures.append(Picture(name, title, None, made))
+            pictures.append(StudyFigure(name, title, None, made))
         else:
             made.suptitle(f"{data.name}: {title}", fontsize=10)
             made.savefig(path)
-            pictures.append(Picture(name, title, path))
+            pictures.append(StudyFigure(name, title, path))
     return pictures
 
 

@@ -9,7 +9,7 @@ from rgbt.metrics import names as metric_names
 from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps import attributes
-from sweeps.report.data import Importances, StudyData, pruning, short_names
+from sweeps.report.study_data import Importances, StudyData, pruning, short_names
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial

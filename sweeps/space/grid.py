@@ -12,12 +12,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, Sweep
 
 from rgbt.checks import InputError, nearest
-from sweeps.points import Value
+from sweeps.point import Value
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
-Swept = dict[str, list[str]]
+SweptValues = dict[str, list[str]]
 """Key -> values of an override, as they may stand after ``=``."""
 
 
@@ -37,7 +37,7 @@ class GridPoint:
 
 def split(
     overrides: Iterable[str], config_loader: ConfigLoader
-) -> tuple[tuple[str, ...], Swept, dict[str, dict[str, Any]]]:
+) -> tuple[tuple[str, ...], SweptValues, dict[str, dict[str, Any]]]:
     """Sort the overrides of ``-m`` by what they say: one value, several, or a range.
 
     As with Hydra's own sweeper a key that comes twice counts where it came first, with what it
@@ -62,7 +62,7 @@ def split(
     return fixed, swept, intervals
 
 
-def grid_points(fixed: Sequence[str], swept: Swept) -> list[GridPoint]:
+def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
     """All combinations, in Hydra's order: the last key changes fastest.
 
     Args:

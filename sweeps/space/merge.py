@@ -7,14 +7,14 @@ from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from sweeps.space.grid import Swept
+from sweeps.space.grid import SweptValues
 from sweeps.space.space import Parameter, parse_space, plain_space
 
 
 def merge_space(
     space: Mapping[str, Any],
     fixed: Sequence[str],
-    swept: Swept,
+    swept: SweptValues,
     intervals: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Parameter, ...]:
     """What is searched, the command line having the last word on every key.

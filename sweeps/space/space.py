@@ -21,7 +21,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from sweeps.space.entry import Choice, Parameter, read_entry
+from sweeps.space.parameter import Choice, Parameter, read_parameter
 
 if TYPE_CHECKING:
     from optuna.trial import BaseTrial
@@ -33,7 +33,7 @@ def parse_space(space: Mapping[str, Any]) -> tuple[Parameter, ...]:
     """The parameters of a space, in the order of the file.
 
     Args:
-        space: key -> entry, see `sweeps.space.entry.read_entry`. Of a node of a configuration the
+        space: key -> entry, see `sweeps.space.parameter.read_parameter`. Of a node of a configuration the
             text of interpolations is kept: ``${px:64}`` is resolved by the run that gets it.
 
     Raises:
@@ -42,7 +42,7 @@ def parse_space(space: Mapping[str, Any]) -> tuple[Parameter, ...]:
     """
     found: dict[str, Parameter] = {}
     for key, entry in plain_space(space).items():
-        found[str(key)] = read_entry(str(key), entry, found)
+        found[str(key)] = read_parameter(str(key), entry, found)
     return tuple(found.values())
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from sweeps.points import Evaluation
+from sweeps.evaluation import ExtraEvaluation
 
 if TYPE_CHECKING:
     from sweeps.table.table import Column, Row, Table
@@ -39,7 +39,7 @@ class ScoredRun(Protocol):
         """Git commit of the code that made it."""
         ...
 
-    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
         """Counts of the test split; InputError where they are missing or not readable."""
         ...
 
@@ -64,7 +64,7 @@ class CellRun(Protocol):
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """Our value of one row and column.
 
     Attributes:
@@ -89,18 +89,18 @@ def metric_of(column: Column, row: Row) -> str:
     return str(column.metric).format_map(row.settings)
 
 
-def evaluation_of(column: Column, table: Table) -> Evaluation | None:
+def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     """What the column is counted from; None: the evaluation that every run makes itself."""
     if column.frames is not None:
-        return Evaluation(frames=column.frames)
-    asked = Evaluation(
+        return ExtraEvaluation(frames=column.frames)
+    asked = ExtraEvaluation(
         column.modality,
         table.regions,
         head=column.head,
         degradation=column.degradation,
         severity=column.severity,
     )
-    return None if asked == Evaluation() else asked
+    return None if asked == ExtraEvaluation() else asked
 
 
 def is_counted(column: Column) -> bool:
@@ -113,7 +113,7 @@ def is_of_runs(column: Column) -> bool:
     return column.needs is None and not column.parameters
 
 
-def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[Place, Cell]:
+def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[Place, TableCell]:
     """The cells of one row; columns that are not computed of runs or left out have none.
 
     Args:
@@ -134,7 +134,7 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[P
 
 def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
     """Every column's value of one run."""
-    counts: dict[Evaluation | None, Counts | str] = {}
+    counts: dict[ExtraEvaluation | None, Counts | str] = {}
     values: dict[str, Value] = {}
     columns = table.columns_of(row)
     for column in filter(is_counted, columns):
@@ -151,7 +151,7 @@ def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
     return values
 
 
-def _counts(outcome: CellRun, evaluation: Evaluation | None) -> Counts | str:
+def _counts(outcome: CellRun, evaluation: ExtraEvaluation | None) -> Counts | str:
     if outcome.state != "finished" or not outcome.found:
         return outcome.reason or outcome.state
     try:
@@ -186,7 +186,7 @@ def _mark(outcome: CellRun, found: Value) -> str:
 
 def over_seeds(
     found: Mapping[int, Value], marks: Mapping[int, str] | None = None, keys: tuple[str, ...] = ()
-) -> Cell:
+) -> TableCell:
     """Mean and spread of the values of several seeds.
 
     Args:
@@ -200,7 +200,7 @@ def over_seeds(
         if isinstance(each, str):
             reasons.setdefault(each, []).append(seed)
     told = [f"{_seeds(seeds)}: {reason}" for reason, seeds in reasons.items()]
-    return Cell(
+    return TableCell(
         mean=statistics.fmean(values) if values else math.nan,
         sd=statistics.stdev(values) if len(values) > 1 else math.nan,
         seeds=len(values),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rgbt.metrics.named import parse
-from sweeps.table.cells import Cell, CellRun, Place, is_counted, metric_of, row_cells
+from sweeps.table.cells import CellRun, Place, TableCell, is_counted, metric_of, row_cells
 
 if TYPE_CHECKING:
     from sweeps.table.table import Column, Row, Table
@@ -36,7 +36,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredTable:
     """A table with our values.
 
     Attributes:
@@ -55,7 +55,7 @@ class Scored:
     table: Table
     scale: str
     seeds: tuple[int, ...]
-    cells: Mapping[Place, Cell]
+    cells: Mapping[Place, TableCell]
     orders: Mapping[str, Order]
     ranks_ours: Mapping[Place, int]
     ranks_published: Mapping[Place, int]
@@ -91,8 +91,8 @@ def score(
     runs: Mapping[tuple[str, int], CellRun],
     *,
     scale: str,
-    sizes: Mapping[Place, Cell] | None = None,
-) -> Scored:
+    sizes: Mapping[Place, TableCell] | None = None,
+) -> ScoredTable:
     """Compute every cell of the rows that were run.
 
     Args:
@@ -100,11 +100,11 @@ def score(
         table: its file.
         runs: (label of the row, seed) -> what became of the run.
         scale: "demo" or "paper".
-        sizes: cells of the columns of parameters, see `sweeps.table.sizes`.
+        sizes: cells of the columns of parameters, see `sweeps.table.parameter_counts`.
     """
     seeds = sorted({seed for _, seed in runs})
     ran = {label for label, _ in runs}
-    cells: dict[Place, Cell] = {}
+    cells: dict[Place, TableCell] = {}
     for row in table.rows:
         if row.label in ran:
             outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
@@ -114,7 +114,7 @@ def score(
     cells |= sizes or {}
     whole |= sizes or {}
     found = {run.key: run.commit for outcome in runs.values() for run in outcome.found}
-    return Scored(
+    return ScoredTable(
         name=name,
         table=table,
         scale=scale,
@@ -151,7 +151,7 @@ def _ranks(table: Table, values: Mapping[Place, float]) -> dict[Place, int]:
     return ranks
 
 
-def _order(table: Table, column: Column, cells: Mapping[Place, Cell]) -> Order:
+def _order(table: Table, column: Column, cells: Mapping[Place, TableCell]) -> Order:
     pairs = []
     for row in table.rows:
         cell, printed = cells.get((row.label, column.name)), published(row, column)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from rgbt.checks import InputError, nearest
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics.pairs import Protocol
-from sweeps.points import Head
+from sweeps.evaluation import Head
 from sweeps.table.checks import check_table
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
@@ -48,7 +48,7 @@ class Column:
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: which two predictions it compares, see
             `rgbt.metrics.pairs`.
-        head: of a network with a head per domain which one predicts, see `sweeps.points.Head`.
+        head: of a network with a head per domain which one predicts, see `sweeps.evaluation.Head`.
         degradation: what fails of the images, a file of ``conf/degradation``; None: they are clean.
         severity: of the degradation; may be left out where it has one alone.
         printed: whether the paper has the column; false: ours alone.

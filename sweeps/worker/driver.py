@@ -22,14 +22,20 @@ from rgbt.checks import RunError
 from rgbt.metrics.names import CA, TC
 from rgbt.spec.naming import TAGS
 from sweeps import attributes as names
-from sweeps.settings import Settings
+from sweeps.settings import SweepSettings
 from sweeps.worker.executors import Executor, Job
-from sweeps.worker.found import Runs
-from sweeps.worker.live import View
-from sweeps.worker.owner import BEAT_S
-from sweeps.worker.sources import Source, Task
-from sweeps.worker.trial_store import Ledger
-from sweeps.worker.work import PointError, Pruned, Surroundings, Work, mean_scores
+from sweeps.worker.owner import HEARTBEAT_S
+from sweeps.worker.progress import ProgressView
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.running_trial import (
+    ExecutionContext,
+    RunningTrial,
+    TrialError,
+    TrialPruned,
+    mean_scores,
+)
+from sweeps.worker.trial_source import ClaimedTrial, TrialSource
+from sweeps.worker.trial_store import TrialStore
 
 POLL_S = 0.2
 AWAY_S = 600.0
@@ -54,14 +60,14 @@ class Driver:
         metrics: names of the study's objectives.
     """
 
-    ledger: Ledger
-    source: Source
-    runs: Runs
+    store: TrialStore
+    source: TrialSource
+    runs: RunStore
     executor: Executor
-    settings: Settings
-    view: View
+    settings: SweepSettings
+    view: ProgressView
     metrics: Sequence[str]
-    works: dict[int, Work] = field(default_factory=dict)
+    works: dict[int, RunningTrial] = field(default_factory=dict)
     failures: int = 0
     _began: float = field(default_factory=time.monotonic)
     _looked: float = -math.inf
@@ -116,15 +122,15 @@ class Driver:
     def _beat(self) -> None:
         """Say now and then that this driver is alive."""
         now = time.monotonic()
-        if now - self._beaten > BEAT_S:
+        if now - self._beaten > HEARTBEAT_S:
             self._beaten = now
-            self.ledger.beat([work.number for work in self.works.values()])
+            self.store.beat([work.number for work in self.works.values()])
 
     def _take_up(self, free: int) -> None:
         """Begin as many points as there are free slots."""
         mine = {work.number for work in self.works.values()}
-        for trial in self.ledger.orphans(mine):
-            self.ledger.release(trial.number, "its driver was gone", again=self.source.again)
+        for trial in self.store.stale_trials(mine):
+            self.store.release(trial.number, "its driver was gone", again=self.source.again)
         while free > 0 and not self._is_over():
             task = self.source.next()
             if task is None:
@@ -146,11 +152,11 @@ class Driver:
         failures = self.failures + self.source.refused
         return spent or (most is not None and failures >= most)
 
-    def _begin(self, task: Task, slot: int) -> Work:
+    def _begin(self, task: ClaimedTrial, slot: int) -> RunningTrial:
         start = partial(self._start, slot=slot, tags=task.plan.point.tags)
         minutes = self.settings.timeout_minutes
-        around = Surroundings(self.runs, start, None if minutes is None else 60 * minutes)
-        work = Work(task.plan, task.number, around, task.report)
+        context = ExecutionContext(self.runs, start, None if minutes is None else 60 * minutes)
+        work = RunningTrial(task.plan, task.number, context, task.report)
         self.view.began(work)
         return work
 
@@ -163,7 +169,7 @@ class Driver:
             environment |= {"CUDA_VISIBLE_DEVICES": str(gpu)}
         return self.executor.start(command, environment, log)
 
-    def _advance(self, work: Work) -> bool:
+    def _advance(self, work: RunningTrial) -> bool:
         """Whether the work is done with, well or badly; the study is told."""
         notes = {names.SECONDS: round(work.seconds, 1)}
         try:
@@ -172,25 +178,25 @@ class Driver:
                 return False
             scores = mean_scores(found)
             values = [_finite(name, scores) for name in self.metrics]
-        except Pruned as reason:
-            self.ledger.prune(work.number, str(reason), notes)
+        except TrialPruned as reason:
+            self.store.prune(work.number, str(reason), notes)
             for run in work.plan.runs:
                 self.runs.stopped(run.key, str(reason))
             self.view.ended(work, "pruned", str(reason))
-        except PointError as error:
+        except TrialError as error:
             self._failed(work, str(error), notes)
         else:
-            self.ledger.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
+            self.store.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
             self.view.ended(work, "finished", "")
         return True
 
-    def _failed(self, work: Work, reason: str, notes: Mapping[str, Any]) -> None:
+    def _failed(self, work: RunningTrial, reason: str, notes: Mapping[str, Any]) -> None:
         """Book a failure; a search tries the same point again while `retries` allow."""
         key = work.plan.key
         if self.source.again and self._tries[key] < self.settings.retries:
-            self.ledger.release(work.number, f"tried again: {reason}", again=True)
+            self.store.release(work.number, f"tried again: {reason}", again=True)
         else:
-            self.ledger.fail(work.number, reason, notes)
+            self.store.fail(work.number, reason, notes)
             self.failures += 1
         self._tries[key] += 1
         self.view.ended(work, "failed", reason)
@@ -206,7 +212,7 @@ class Driver:
         # Where the storage is away they are orphans, which the next driver takes up as well.
         with suppress(StorageInternalError):
             for work in self.works.values():
-                self.ledger.release(work.number, "its driver was stopped", again=self.source.again)
+                self.store.release(work.number, "its driver was stopped", again=self.source.again)
 
 
 def _finite(name: str, scores: Mapping[str, float]) -> float:
@@ -218,5 +224,5 @@ def _finite(name: str, scores: Mapping[str, float]) -> float:
             if rest.startswith((f"{TC}/", f"{CA}/"))
             else ""
         )
-        raise PointError(f"its runs have no {name} that is a number{measure}")
+        raise TrialError(f"its runs have no {name} that is a number{measure}")
     return value

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-BEAT_S = 20.0
+HEARTBEAT_S = 20.0
 """Seconds between two signs of life of a driver."""
 
 STALE_S = 180.0

@@ -139,7 +139,7 @@ def study_names(storage: optuna.storages.BaseStorage) -> list[str]:
     return sorted(optuna.get_all_study_names(storage))
 
 
-def begin_study(
+def open_study(
     name: str,
     storage: optuna.storages.BaseStorage,
     objectives: Sequence[Objective],
@@ -195,7 +195,7 @@ def begin_study(
     return study
 
 
-def existing_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
+def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
     """The study called `name`; None where it does not exist. Nothing is made.
 
     Raises:

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial, Trial
 
-STANDS = ("RUNNING", "COMPLETE", "PRUNED")
+CLAIMING_STATES = ("RUNNING", "COMPLETE", "PRUNED")
 """States of a trial that keep a later one from standing for the same point."""
 
 
 @dataclass(frozen=True)
-class Claim:
+class TrialClaim:
     """What a driver claims.
 
     Attributes:
@@ -63,7 +63,7 @@ def by_key(trials: Iterable[FrozenTrial]) -> dict[str, list[FrozenTrial]]:
     return found
 
 
-class Ledger:
+class TrialStore:
     """One study.
 
     Args:
@@ -86,7 +86,7 @@ class Ledger:
         """See the function `by_key`."""
         return by_key(self.trials())
 
-    def claim(self, wanted: Claim) -> int | None:
+    def claim(self, wanted: TrialClaim) -> int | None:
         """The number of a new running trial of ours; None if an earlier trial stands."""
         from optuna.trial import TrialState, create_trial
 
@@ -112,7 +112,7 @@ class Ledger:
             for trial in same
             if trial.number < number
             and trial.number not in wanted.past
-            and trial.state.name in STANDS
+            and trial.state.name in CLAIMING_STATES
         ]
         if not standing:
             return number
@@ -145,7 +145,7 @@ class Ledger:
             for other in same
             if other.number != trial.number
             and (
-                other.state.name in STANDS
+                other.state.name in CLAIMING_STATES
                 or (other.state.name == "WAITING" and other.number < trial.number)
             )
         ]
@@ -162,7 +162,7 @@ class Ledger:
     def beat(self, numbers: Iterable[int]) -> None:
         """Say that this driver still works on these trials."""
         for number in numbers:
-            self.unless_finished(number, partial(self.note, number, self._sign()))
+            self.update_unfinished(number, partial(self.note, number, self._sign()))
 
     def complete(self, number: int, values: Sequence[float], notes: Mapping[str, Any]) -> None:
         """Finish a trial with its values; without effect if another driver has finished it."""
@@ -200,7 +200,7 @@ class Ledger:
             self.study.enqueue_trial(dict(trial.params), user_attrs=attributes)
         self.drop(number, reason)
 
-    def orphans(self, mine: Collection[int]) -> Iterator[FrozenTrial]:
+    def stale_trials(self, mine: Collection[int]) -> Iterator[FrozenTrial]:
         """Running trials whose driver is gone.
 
         Args:
@@ -215,7 +215,7 @@ class Ledger:
                 yield trial
                 continue
             if owner is not None:
-                alive = Owner.parse(owner).is_alive(trial.user_attrs[names.BEAT])
+                alive = Owner.parse(owner).is_alive(trial.user_attrs[names.HEARTBEAT])
             else:  # of a search: asked for this moment, or by a driver that died between two lines
                 assert trial.datetime_start is not None, "a running trial was started"
                 alive = Owner.unknown().is_alive(trial.datetime_start.timestamp())
@@ -223,7 +223,7 @@ class Ledger:
                 yield trial
 
     def _sign(self) -> dict[str, Any]:
-        return {names.BEAT: round(time.time(), 1), names.OWNER: str(self.me)}
+        return {names.HEARTBEAT: round(time.time(), 1), names.OWNER: str(self.me)}
 
     def _waiting(self) -> list[FrozenTrial]:
         return [trial for trial in self.trials() if trial.state.name == "WAITING"]
@@ -242,9 +242,9 @@ class Ledger:
             told = None if values is None else list(values)
             self.study.tell(number, told, state=TrialState[state])
 
-        self.unless_finished(number, finish)
+        self.update_unfinished(number, finish)
 
-    def unless_finished(self, number: int, work: Callable[[], object]) -> None:
+    def update_unfinished(self, number: int, work: Callable[[], object]) -> None:
         """`work` on a trial, unless another driver has finished it while this machine slept."""
         try:
             work()

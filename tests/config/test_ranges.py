@@ -18,7 +18,7 @@ from rgbt.config.compose import conf_dir
 from rgbt.config.schema import TOP_LEVEL, check_node, setting_types
 from rgbt.config.values import check_value, expected
 from rgbt.ranges import Pixels, Share
-from sweeps.settings import Settings
+from sweeps.settings import SweepSettings
 
 TARGETS = sorted(
     {
@@ -143,7 +143,7 @@ def bounded(annotation: Any) -> bool:
     return bool(re.search(r"from .* to|(above|at least) .* and (at most|below)|of \d+ to", words))
 
 
-@pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.Settings"])
+@pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.SweepSettings"])
 def test_every_number_and_text_has_a_range(target: str) -> None:
     for key, annotation in setting_types(get_object(target)).items():
         for leaf in leaves(annotation):
@@ -247,4 +247,4 @@ def test_nan_and_infinity_are_refused_without_a_declared_range() -> None:
 
 def test_settings_of_a_sweep_are_those_of_its_file() -> None:
     node = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
-    assert set(setting_types(Settings)) == set(node) - {"_target_"}
+    assert set(setting_types(SweepSettings)) == set(node) - {"_target_"}

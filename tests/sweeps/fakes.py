@@ -20,19 +20,19 @@ from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
-from sweeps.points import Point
-from sweeps.settings import Objective, Settings
+from sweeps.point import Point
+from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
-from sweeps.worker import sources
+from sweeps.worker import trial_source
 from sweeps.worker.driver import Driver
-from sweeps.worker.found import Runs
 from sweeps.worker.owner import STALE_S, Owner
-from sweeps.worker.plan import Plan, PlannedRun
-from sweeps.worker.sources import ListSource, SearchSource
-from sweeps.worker.storage import begin_study
-from sweeps.worker.trial_store import Ledger
-from sweeps.worker.work import Work
+from sweeps.worker.planner import PlannedPoint, PlannedRun
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.running_trial import RunningTrial
+from sweeps.worker.storage import open_study
+from sweeps.worker.trial_source import PointListSource, SamplerSource
+from sweeps.worker.trial_store import TrialStore
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
@@ -45,7 +45,7 @@ GONE = Owner(Owner.me().host, 2**22 + 1, "1")
 """A process of this machine that cannot exist: a number above the kernel's largest."""
 
 
-def settings(**changes: Any) -> Settings:
+def settings(**changes: Any) -> SweepSettings:
     """Settings of a sweep, as in study.yaml but for `changes`."""
     plain: dict[str, Any] = {
         "storage": None,
@@ -70,7 +70,7 @@ def settings(**changes: Any) -> Settings:
         "hours": None,
         "replicates": 1,
     }
-    return Settings(**{**plain, **changes})
+    return SweepSettings(**{**plain, **changes})
 
 
 def key_of(overrides: Sequence[str]) -> str:
@@ -78,15 +78,15 @@ def key_of(overrides: Sequence[str]) -> str:
     return hashlib.sha256("\n".join(overrides).encode()).hexdigest()[:12]
 
 
-def plan_of(point: Point, steps: int = 4) -> Plan:
+def plan_of(point: Point, steps: int = 4) -> PlannedPoint:
     """What `Planner.plan` makes, without a configuration."""
     runs = tuple(PlannedRun(key_of(words), DATASET, words, steps) for words in point.runs())
     whole = [word for words in point.runs() for word in words] + [str(point.evaluations)]
     is_one = len(runs) == 1 and not point.evaluations
-    return Plan(point, runs[0].key if is_one else key_of(whole), runs)
+    return PlannedPoint(point, runs[0].key if is_one else key_of(whole), runs)
 
 
-def plans(count: int, **point: Any) -> list[Plan]:
+def plans(count: int, **point: Any) -> list[PlannedPoint]:
     """Plans of that many points: x=0, x=1, ..."""
     return [plan_of(Point(f"x={x}", (f"x={x}",), {"x": x}, **point)) for x in range(count)]
 
@@ -94,14 +94,14 @@ def plans(count: int, **point: Any) -> list[Plan]:
 class FakePlanner:
     """Stands for `Planner`."""
 
-    def plan(self, point: Point) -> Plan:
+    def plan(self, point: Point) -> PlannedPoint:
         return plan_of(point)
 
 
 class PickyPlanner(FakePlanner):
     """Takes no point."""
 
-    def plan(self, point: Point) -> Plan:
+    def plan(self, point: Point) -> PlannedPoint:
         raise InputError("x does not fit.")
 
 
@@ -285,30 +285,30 @@ class FakeView:
         look: called at every update with the works.
     """
 
-    def __init__(self, look: Callable[[Sequence[Work]], None] | None = None) -> None:
+    def __init__(self, look: Callable[[Sequence[RunningTrial]], None] | None = None) -> None:
         self.begun: list[str] = []
         self.ends: list[tuple[str, str, str]] = []
         self.refusals: list[tuple[str, str]] = []
         self._look = look
 
-    def began(self, work: Work) -> None:
+    def began(self, work: RunningTrial) -> None:
         self.begun.append(work.plan.point.label)
 
-    def ended(self, work: Work, how: str, reason: str) -> None:
+    def ended(self, work: RunningTrial, how: str, reason: str) -> None:
         self.ends.append((work.plan.point.label, how, reason))
 
     def refused(self, label: str, reason: str) -> None:
         self.refusals.append((label, reason))
 
-    def update(self, works: Sequence[Work]) -> None:
+    def update(self, works: Sequence[RunningTrial]) -> None:
         if self._look is not None:
             self._look(works)
 
 
-def interrupt_when(condition: Callable[[Sequence[Work]], bool]) -> FakeView:
+def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
     """A view that stands for a person who presses Ctrl-C."""
 
-    def look(works: Sequence[Work]) -> None:
+    def look(works: Sequence[RunningTrial]) -> None:
         if condition(works):
             raise KeyboardInterrupt
 
@@ -325,12 +325,12 @@ class Desk:
     """
 
     driver: Driver
-    ledger: Ledger
+    store: TrialStore
     executor: FakeExecutor
-    runs: Runs
+    runs: RunStore
     view: FakeView
     storage: Any
-    plans: list[Plan] = field(default_factory=list)
+    plans: list[PlannedPoint] = field(default_factory=list)
 
     def run(self) -> Desk:
         self.driver.run()
@@ -339,12 +339,12 @@ class Desk:
     def states(self) -> dict[str, list[str]]:
         """States of trials that count, by label of the point."""
         found: dict[str, list[str]] = {}
-        for trial in self.ledger.trials():
+        for trial in self.store.trials():
             found.setdefault(trial.user_attrs["rgbt.label"], []).append(trial.state.name)
         return found
 
     def numbers(self, state: str) -> list[int]:
-        return [trial.number for trial in self.ledger.trials() if trial.state.name == state]
+        return [trial.number for trial in self.store.trials() if trial.state.name == state]
 
 
 def memory() -> Any:
@@ -354,25 +354,25 @@ def memory() -> Any:
     return optuna.storages.InMemoryStorage()
 
 
-def ledger_on(
-    storage: Any, me: Owner | None = None, wanted: Settings | None = None, **study: Any
-) -> Ledger:
+def store_on(
+    storage: Any, me: Owner | None = None, wanted: SweepSettings | None = None, **study: Any
+) -> TrialStore:
     """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
     wanted = wanted or settings()
-    began = begin_study("study", storage, wanted.objectives, {}, **study)
-    return Ledger(began, storage, me or Owner.me())
+    began = open_study("study", storage, wanted.objectives, {}, **study)
+    return TrialStore(began, storage, me or Owner.me())
 
 
 def silent(storage: Any, number: int, seconds: float = 2 * STALE_S) -> None:
     """The owner of a trial was not heard of for so long."""
     study_id = storage.get_study_id_from_name("study")
     trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
-    storage.set_trial_user_attr(trial_id, names.BEAT, time.time() - seconds)
+    storage.set_trial_user_attr(trial_id, names.HEARTBEAT, time.time() - seconds)
 
 
 def list_desk(
     runs_dir: Path,
-    points: list[Plan],
+    points: list[PlannedPoint],
     behaviour: Behaviour = succeed,
     *,
     storage: Any = None,
@@ -383,10 +383,10 @@ def list_desk(
     """A driver of a list of points."""
     wanted = settings(**changes)
     storage = memory() if storage is None else storage
-    ledger = ledger_on(storage, me, wanted)
-    runs = Runs(runs_dir, NoTracking())
-    source = ListSource(points, ledger, runs, wanted, {})
-    return _desk(ledger, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
+    store = store_on(storage, me, wanted)
+    runs = RunStore(runs_dir, NoTracking())
+    source = PointListSource(points, store, runs, wanted, {})
+    return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
 
 
 def search_desk(
@@ -407,29 +407,29 @@ def search_desk(
     wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
     storage = memory() if storage is None else storage
     sampler = build_sampler("random", 0, {}, len(wanted.objectives))
-    ledger = ledger_on(storage, me, wanted, sampler=sampler, pruner=pruner)
-    runs = Runs(runs_dir, NoTracking())
+    store = store_on(storage, me, wanted, sampler=sampler, pruner=pruner)
+    runs = RunStore(runs_dir, NoTracking())
     parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     view = view or FakeView()
-    source = SearchSource((), parameters, ledger, planner or FakePlanner(), wanted, view.refused)
-    return _desk(ledger, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
+    source = SamplerSource((), parameters, store, planner or FakePlanner(), wanted, view.refused)
+    return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
 
 
 def _desk(
-    ledger: Ledger,
+    store: TrialStore,
     source: Any,
-    runs: Runs,
+    runs: RunStore,
     executor: FakeExecutor,
-    wanted: Settings,
+    wanted: SweepSettings,
     view: FakeView | None,
     storage: Any,
 ) -> Desk:
     view = view or FakeView()
     metrics = [objective.metric for objective in wanted.objectives]
     seen: Any = view
-    driver = Driver(ledger, source, runs, executor, wanted, seen, metrics)
-    of_list = list(source.plans.values()) if isinstance(source, ListSource) else []
-    return Desk(driver, ledger, executor, runs, view, storage, of_list)
+    driver = Driver(store, source, runs, executor, wanted, seen, metrics)
+    of_list = list(source.plans.values()) if isinstance(source, PointListSource) else []
+    return Desk(driver, store, executor, runs, view, storage, of_list)
 
 
 @pytest.fixture
@@ -437,7 +437,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drivers that look again at once."""
     monkeypatch.setattr(drivers, "POLL_S", 0.001)
     monkeypatch.setattr(drivers, "LOOK_S", 0.002)
-    monkeypatch.setattr(sources, "PAUSE_S", 0.002)
+    monkeypatch.setattr(trial_source, "PAUSE_S", 0.002)
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:

@@ -10,10 +10,11 @@ import numpy as np
 
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
-from sweeps.points import Evaluation, Point
-from sweeps.table.scoring import Scored, score
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Point
+from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
-from sweeps.worker.lists import Outcome
+from sweeps.worker.point_list import Outcome
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
@@ -49,24 +50,26 @@ def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
 
 
 @dataclass(frozen=True)
-class FakeFound:
-    """Stands for `sweeps.worker.found.Found`."""
+class FakeResult:
+    """Stands for `sweeps.worker.run_store.RunResult`."""
 
     key: str
-    made: Mapping[Evaluation | None, Counts]
+    made: Mapping[ExtraEvaluation | None, Counts]
     commit: str | None = "aaaaaaaaaa"
     is_of_other_code: bool = False
 
-    def counts(self, evaluation: Evaluation | None = None) -> Counts:
+    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
         return self.made[evaluation]
 
 
 def outcome(
-    key: str, made: Counts | Mapping[Evaluation | None, Counts], commit: str | None = "aaaaaaaaaa"
+    key: str,
+    made: Counts | Mapping[ExtraEvaluation | None, Counts],
+    commit: str | None = "aaaaaaaaaa",
 ) -> Outcome:
     """A finished run."""
     by_evaluation = {None: made} if isinstance(made, Counts) else made
-    found: Any = FakeFound(key, by_evaluation, commit)
+    found: Any = FakeResult(key, by_evaluation, commit)
     return Outcome(Point(key, ()), "finished", found=(found,))
 
 
@@ -96,7 +99,7 @@ class Made:
         )
         return table(rows, **self.others)
 
-    def scored(self) -> Scored:
+    def scored(self) -> ScoredTable:
         runs = {
             (label, seed): outcome(f"{label}{seed}", right(share))
             for label, (shares, _) in self.rows.items()

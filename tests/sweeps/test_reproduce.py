@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sweeps.asked import OF_THE_TABLE, settings_of
+from sweeps.sheet import results as table_results
 
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.asked import OF_THE_TABLE, settings_of
-from sweeps.points import Point
+from sweeps.point import Point
 from sweeps.reproduce import OWN, entry
-from sweeps.settings import EXECUTION, Settings
-from sweeps.sheet import results as table_results
-from sweeps.worker import lists
-from sweeps.worker.lists import Outcome, PointList
+from sweeps.settings import EXECUTION, SweepSettings
+from sweeps.worker import point_list
+from sweeps.worker.point_list import Outcome, PointList
 from tests.commands import Call, assert_one_sentence
-from tests.sweeps.tabled import FakeFound, right
+from tests.sweeps.tabled import FakeResult, right
 
 OWN_TABLE = """\
 paper: my
@@ -32,7 +32,7 @@ rows:
   - {label: later, experiment: grbm, needs: flow, values: {acc: 62.0}}
 """
 
-Asked = list[tuple[PointList, Settings]]
+Asked = list[tuple[PointList, SweepSettings]]
 
 
 @pytest.fixture
@@ -50,20 +50,20 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
     def drive(*states: str) -> Asked:
         asked: Asked = []
 
-        def work(wanted: PointList, settings: Settings) -> Sequence[Outcome]:
+        def work(wanted: PointList, settings: SweepSettings) -> Sequence[Outcome]:
             asked.append((wanted, settings))
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
             return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
 
-        monkeypatch.setattr(lists, "work_off", work)
-        monkeypatch.setattr(lists, "survey", work)
+        monkeypatch.setattr(point_list, "run_points", work)
+        monkeypatch.setattr(point_list, "preview_points", work)
         return asked
 
     return drive
 
 
 def _outcome(point: Point, state: str, index: int) -> Outcome:
-    found: Any = FakeFound(f"k{index}", {None: right(40 + index)})
+    found: Any = FakeResult(f"k{index}", {None: right(40 + index)})
     if state == "finished":
         return Outcome(point, "finished", found=(found,), keys=(f"k{index}",))
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]

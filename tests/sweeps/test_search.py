@@ -13,11 +13,11 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
 from sweeps import attributes as names
 from sweeps.search import Search, _probe, search
-from sweeps.settings import Objective, Settings
+from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
-from sweeps.worker.found import open_runs
+from sweeps.worker.run_store import open_run_store
 from sweeps.worker.storage import load_study, open_storage
-from sweeps.worker.trial_store import Ledger
+from sweeps.worker.trial_store import TrialStore
 from tests.sweeps.fakes import settings as plain_settings
 
 SPACE = {"masker.sigma_div": {"type": "float", "low": 1, "high": 4}}
@@ -33,7 +33,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 def wanted(tmp_path: Path, cache: str) -> Search:
     place = (f"runs_dir={tmp_path}", "tracking=none", cache)
     fixed = ("+experiment=grbm", *SMALL, *place)
-    return Search("s", fixed, parse_space(SPACE), open_runs(compose(place)), [])
+    return Search("s", fixed, parse_space(SPACE), open_run_store(compose(place)), [])
 
 
 @pytest.fixture
@@ -41,23 +41,23 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The states that the driver leaves trials in, instead of running them."""
     states: list[str] = ["COMPLETE"]
 
-    def drive(wanted: Search, settings: Settings, ledger: Ledger) -> None:
+    def drive(wanted: Search, settings: SweepSettings, store: TrialStore) -> None:
         del wanted, settings
         for state in states:
-            trial = ledger.ask(None)
+            trial = store.ask(None)
             assert trial is not None
             trial.suggest_float("masker.sigma_div", 1, 4)
             if state == "COMPLETE":
-                ledger.complete(trial.number, [1.0], {names.RUNS: ["k"]})
+                store.complete(trial.number, [1.0], {names.RUNS: ["k"]})
             else:
-                ledger.fail(trial.number, "no memory", {})
+                store.fail(trial.number, "no memory", {})
 
     monkeypatch.setattr(searching, "_drive", drive)
     monkeypatch.setattr(searching, "report", lambda *_: [("report", "here")])
     return states
 
 
-def settings(**changes: Any) -> Settings:
+def settings(**changes: Any) -> SweepSettings:
     objectives = (Objective("val/mIoU", "maximize"),)
     return plain_settings(**{"trials": 3, "objectives": objectives, **changes})
 

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from sweeps.settings import EXECUTION, Objective, Settings, read_settings
+from sweeps.settings import EXECUTION, Objective, SweepSettings, read_settings
 
 FILE = conf_dir() / "hydra" / "sweeper" / "study.yaml"
 
@@ -29,7 +29,7 @@ def changed(node: DictConfig, **values: Any) -> DictConfig:
 
 def test_the_file_of_the_sweeper_holds_every_setting_and_no_other(composed: DictConfig) -> None:
     keys = set(map(str, composed)) - {"_target_"}
-    assert keys == set(Settings.__dataclass_fields__)
+    assert keys == set(SweepSettings.__dataclass_fields__)
     assert set(EXECUTION) < keys
     settings = read_settings(composed)
     assert settings.objectives == (Objective("val/mIoU", "maximize"),)

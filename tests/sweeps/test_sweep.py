@@ -14,9 +14,9 @@ import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import conf_dir, register_resolvers
 from sweeps.search import Search
-from sweeps.settings import Settings
+from sweeps.settings import SweepSettings
 from sweeps.sweep import study_command, sweep
-from sweeps.worker.lists import Outcome, PointList
+from sweeps.worker.point_list import Outcome, PointList
 
 
 class Asked:
@@ -32,17 +32,17 @@ class Asked:
 def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     found = Asked()
 
-    def work_off(wanted: PointList, settings: Settings) -> list[Outcome]:
+    def run_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
         del settings
         found.lists.append(wanted)
         return found.outcomes or [Outcome(point, "finished") for point in wanted.points]
 
-    def survey(wanted: PointList, settings: Settings) -> list[Outcome]:
+    def preview_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
         del settings
         return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
 
-    monkeypatch.setattr(sweeping, "work_off", work_off)
-    monkeypatch.setattr(sweeping, "survey", survey)
+    monkeypatch.setattr(sweeping, "work_off", run_points)
+    monkeypatch.setattr(sweeping, "survey", preview_points)
     monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
     return found
 
@@ -181,7 +181,7 @@ def test_one_point_is_said_to_be_one(
 
 
 def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) -> None:
-    from sweeps.points import Point
+    from sweeps.point import Point
 
     asked.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
     with pytest.raises(InputError, match="a: no such key"):
@@ -192,7 +192,7 @@ def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) 
 def test_failed_points_end_in_an_error_after_the_table(
     asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from sweeps.points import Point
+    from sweeps.point import Point
 
     asked.outcomes = [
         Outcome(Point("a", ()), "finished", keys=("k1",)),

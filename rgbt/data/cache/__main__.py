@@ -10,12 +10,15 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated
 
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from rgbt.checks import InputError, check_choice
-from rgbt.config.command import built, plain_command
+from rgbt.config.command import built
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.cache.dataset import Decoded, check_cache, decoded_dataset
 from rgbt.data.cache.store import Told, gigabytes, remove, size_of
 from rgbt.data.dataset import LabelledDataset
@@ -35,39 +38,37 @@ def shown() -> Iterator[Told]:
         yield advance
 
 
-OWN = {"cache": "auto", "remove": "false"}
+@dataclass(frozen=True)
+class Options:
+    """Of the cache."""
+
+    cache: Annotated[str, Help("auto, or the folder where caches lie")] = "auto"
+    remove: Annotated[
+        bool, Help("true: remove the cache, and those of earlier states of the same folder")
+    ] = False
 
 
-def main(arguments: dict[str, str], overrides: list[str]) -> int:
+def main(options: Options, overrides: list[str]) -> int:
     """Decode every split of a data set into a cache and show its size, or remove it.
 
-    cache      auto, or the folder where caches lie
-    remove     true: remove the cache, and those of earlier states of the same folder
-    overrides  such as dataset=mfnet dataset.root=/data/MFNet
+    Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """
-    check_choice("remove", arguments["remove"], ("true", "false"))
-    check_cache("cache", arguments["cache"])
-    for word in overrides:
-        key = word.lstrip("+").partition("=")[0]
-        if key.partition(".")[0] != "dataset" and key != "hydra.searchpath":
-            raise InputError(
-                f"'{key}' has no effect here; give dataset=... and its settings, cache=FOLDER for "
-                "where the cache lies, or remove=true."
-            )
+    check_cache("cache", options.cache)
     source: LabelledDataset = built("dataset", overrides)
-    dataset = decoded_dataset(source, arguments["cache"], num_threads=os.cpu_count() or 1)
+    dataset = decoded_dataset(source, options.cache, num_threads=os.cpu_count() or 1)
     assert isinstance(dataset, Decoded)
-    removes = arguments["remove"] == "true"
-    if not removes:
+    if not options.remove:
         splits = [split for split in source.splits if source.has(split)]
         with shown() as advance:
             dataset.ensure(tuple(name for split in splits for name in source.names(split)), advance)
     for cache in dataset.caches():
-        sys.stdout.write(f"{cache}: {gigabytes(size_of(cache))}{' removed' * removes}\n")
-        if removes:
+        sys.stdout.write(f"{cache}: {gigabytes(size_of(cache))}{' removed' * options.remove}\n")
+        if options.remove:
             remove(cache)
     return 0
 
 
+entry = PlainCommand(Options, main, heeds=("dataset",))
+
 if __name__ == "__main__":
-    plain_command(OWN, main)()
+    entry()

@@ -14,13 +14,16 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from rich.console import Console
 from rich.progress import Progress
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.check import print_report
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.freiburg import Freiburg
@@ -33,8 +36,36 @@ from rgbt.data.prepare.source import Source
 from rgbt.data.pst900 import PST900
 from rgbt.data.report.dataset import check_dataset, num_listed
 
-OWN = {"dataset": None, "source": None, "out": None, "labels": "", "lists": ""}
 OPTIONAL = ("labels", "lists")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to prepare, and where."""
+
+    dataset: Annotated[Literal["mfnet", "pst900", "kp", "freiburg"], Help("its name")]
+    source: Annotated[
+        Path,
+        Help(
+            "the download: a zip archive, or the folder into which it was unpacked; for kp the "
+            "folder of KAIST, for freiburg the folder that holds train.zip and test.zip"
+        ),
+    ]
+    out: Annotated[Path, Help("a new folder outside of it")]
+    labels: Annotated[
+        Path | None,
+        Help("kp: folder or archive of the labels of MS-UDA, where the source has none"),
+    ] = None
+    lists: Annotated[
+        Path | None,
+        Help("mfnet and kp: folder of lists to use instead of the download's, or of set numbers"),
+    ] = None
+
+    @property
+    def paths(self) -> dict[str, Path]:
+        """The paths that are read, by option."""
+        given = {key: getattr(self, key) for key in ("source", *OPTIONAL)}
+        return {key: path for key, path in given.items() if path is not None}
 
 
 class Kind(NamedTuple):
@@ -61,26 +92,14 @@ KINDS = {
 }
 
 
-def main(arguments: dict[str, str], others: list[str]) -> int:
-    """Copy what is read of a download into a new folder, and check it. Called again, it goes on.
-
-    dataset   mfnet, pst900, kp or freiburg
-    source    the download: a zip archive, or the folder into which it was unpacked; for kp the
-              folder of KAIST, for freiburg the folder that holds train.zip and test.zip
-    out       a new folder outside of it
-    labels    kp: folder or archive of the labels of MS-UDA, where the source has none
-    lists     mfnet and kp: folder of lists to use in the place of the download's, or of set numbers
-    """
-    if others:
-        raise InputError(f"'{others[0]}' is no argument; {nearest(others[0], OWN)}.")
-    name, out = arguments["dataset"], Path(arguments["out"])
-    check_choice("dataset", name, KINDS)
+def main(options: Options, overrides: list[str]) -> int:
+    """Copy what is read of a download into a new folder, and check it. Called again, it resumes."""
+    del overrides  # none is heeded
+    name, out, paths = options.dataset, options.out, options.paths
     kind = KINDS[name]
-    given = {key: arguments[key] for key in ("source", *OPTIONAL) if arguments[key]}
-    for key in given:
+    for key in paths:
         if key in OPTIONAL and key not in kind.takes:
             raise InputError(f"{key} has no meaning for dataset={name}; leave it out.")
-    paths = {key: Path(path) for key, path in given.items()}
     plan = {"dataset": name, **{key: str(path.resolve()) for key, path in paths.items()}}
     check_out(out, tuple(paths.values()), plan)
     with ExitStack() as opened:
@@ -111,7 +130,7 @@ def _check(dataset: LabelledDataset, words: str) -> int:
     return 1 if report.problems else 0
 
 
-if __name__ == "__main__":
-    from rgbt.config.command import plain_command
+entry = PlainCommand(Options, main, heeds=())
 
-    plain_command(OWN, main)()
+if __name__ == "__main__":
+    entry()

@@ -1,23 +1,23 @@
 """A contact sheet of scenes: ``python -m rgbt.data.synth.sheet out=sheet.png [key=value ...]``.
 
-Rows RGB, thermal, label by day, then the same scenes by night. Keys: seed, first (index of the
-first scene), columns, zoom, and every scene factor.
+Rows RGB, thermal, label by day, then the same scenes by night.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated
 
 import cv2
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
-from rgbt.config.values import check_value
+from rgbt.checks import InputError
+from rgbt.config.options import Help
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import Scene, render_scene
 from rgbt.ranges import Seed
@@ -32,12 +32,15 @@ COLOURS = np.array(
 """Loud colours, one per class; the published palette is too dark to be seen at this size."""
 
 
-OWN: dict[str, Any] = {
-    "seed": Seed,
-    "first": Annotated[int, Interval(ge=0, le=99_999)],
-    "columns": Annotated[int, Interval(ge=1, le=100)],
-    "zoom": Annotated[int, Interval(ge=1, le=16)],
-}
+@dataclass(frozen=True)
+class Options(SceneFactors):
+    """Of the sheet, beside the factors of a scene."""
+
+    out: Annotated[Path, Help("picture to write, in an existing folder")] = Path("sheet.png")
+    seed: Annotated[Seed, Help("of the data set")] = 0
+    first: Annotated[int, Interval(ge=0, le=99_999), Help("index of the first scene")] = 0
+    columns: Annotated[int, Interval(ge=1, le=100), Help("scenes per row")] = 5
+    zoom: Annotated[int, Interval(ge=1, le=16), Help("enlargement")] = 2
 
 
 def contact_sheet(
@@ -74,50 +77,22 @@ def _column(scene: Scene, zoom: int) -> NDArray[np.uint8]:
     return np.asarray(np.vstack([*smooth, label]), np.uint8)
 
 
-def _parsed(arguments: list[str]) -> tuple[Path, dict[str, int], SceneFactors]:
-    """Where to write, the sheet's own numbers, the factors."""
-    own = {"seed": 0, "first": 0, "columns": 5, "zoom": 2}
-    factors = asdict(SceneFactors())
-    kinds = OWN | get_type_hints(SceneFactors, include_extras=True)
-    out = Path("sheet.png")
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key == "out":
-            out = Path(value)
-        elif key in own:
-            own[key] = check_value(key, _number(argument, value, int), kinds[key])
-        elif key in factors:
-            factors[key] = check_value(
-                key, _number(argument, value, type(factors[key])), kinds[key]
-            )
-        else:
-            known = nearest(key, ["out", *own, *factors])
-            raise InputError(f"'{key}' is not a setting of the sheet; {known}.")
-    return out, own, SceneFactors(**factors)
-
-
-def _number(argument: str, value: str, kind: type[int] | type[float]) -> float:
-    try:
-        return kind(value)
-    except ValueError:
-        raise InputError(f"'{argument}': expected {kind.__name__}, got '{value}'.") from None
-
-
-def main(arguments: list[str]) -> int:
-    """Write the sheet; 2 after a mistake in the arguments."""
-    try:
-        out, own, factors = _parsed(arguments)
-    except InputError as error:
-        sys.stderr.write(f"rgbt: {error}\n")
-        return 2
-    sheet = contact_sheet(own["seed"], own["first"], factors, own["columns"], own["zoom"])
-    if not out.parent.is_dir():
-        sys.stderr.write(f"rgbt: out={out} cannot be written; name a PNG in an existing folder.\n")
-        return 2
-    out.write_bytes(cv2.imencode(out.suffix, sheet[..., ::-1])[1].tobytes())
-    sys.stdout.write(f"{out}\n")
+def main(options: Options, overrides: list[str]) -> int:
+    """Draw scenes of the embedded data set: RGB, thermal, label by day, then the same by night."""
+    del overrides  # none is heeded
+    factors = SceneFactors(
+        **{each.name: getattr(options, each.name) for each in fields(SceneFactors)}
+    )
+    if not options.out.parent.is_dir():
+        raise InputError(f"out={options.out} cannot be written; name a PNG in an existing folder.")
+    sheet = contact_sheet(options.seed, options.first, factors, options.columns, options.zoom)
+    encoded = cv2.imencode(options.out.suffix, sheet[..., ::-1])[1]
+    options.out.write_bytes(encoded.tobytes())
+    sys.stdout.write(f"{options.out}\n")
     return 0
 
 
+entry = PlainCommand(Options, main, heeds=())
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    entry()

@@ -18,18 +18,18 @@ from rgbt.randomness import numpy_generator
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps import attributes
-from sweeps.points import Evaluation
-from sweeps.report.data import read
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.rendering.file_formats import tidy_csv
 from sweeps.report.records import record
+from sweeps.report.study_data import read
 from sweeps.report.tables import trials_csv
-from sweeps.sheet.files import tidy_csv
 from sweeps.study import markdown
 from sweeps.table.scoring import score
 from sweeps.table.table import load_table
 from tests.sweeps.tabled import outcome
 
 IMAGES, REGIONS, CLASSES = 12, 2, ("road", "car")
-RGB = Evaluation("rgb", "as trained")
+RGB = ExtraEvaluation("rgb", "as trained")
 RGB_FILE = "evaluations/table_rgb_as-trained.npz"
 TABLE = """
 paper: own

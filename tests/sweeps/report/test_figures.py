@@ -14,9 +14,9 @@ from optuna.trial import TrialState
 
 from sweeps import attributes
 from sweeps.report.axes import Dimension, dimension
-from sweeps.report.data import Importances, importances, read
 from sweeps.report.drawing import history, intermediate, pareto, slices
-from sweeps.report.figures import Picture, _contour, draw
+from sweeps.report.figures import StudyFigure, _contour, draw
+from sweeps.report.study_data import Importances, importances, read
 
 NONE = "no trial is complete yet."
 
@@ -50,7 +50,7 @@ def filled(*directions: str, count: int = 24) -> optuna.Study:
     return study
 
 
-def drawn(study: optuna.Study, folder: Path) -> dict[str, Picture]:
+def drawn(study: optuna.Study, folder: Path) -> dict[str, StudyFigure]:
     """Pictures by name; a warning is an error, as it would land in the user's terminal."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")

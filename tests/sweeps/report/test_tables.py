@@ -17,7 +17,7 @@ from rich.console import Console
 
 from rgbt.tracking.terminal import rich_table
 from sweeps import attributes
-from sweeps.report.data import importances, pruning, read, short_names
+from sweeps.report.study_data import importances, pruning, read, short_names
 from sweeps.report.tables import (
     counts_grid,
     failed_grid,

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from sweeps.points import Evaluation
-from sweeps.table.cell_points import Wanted
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, load_table
 from tests.sweeps.composed import checked, row_config
 
@@ -76,8 +76,8 @@ def test_the_printed_mean_is_that_of_both_columns(number: int) -> None:
 
 
 def test_what_a_network_cannot_be_asked_is_left_out() -> None:
-    three, four = (Wanted("t", TABLES[number], "demo", (0,)) for number in (3, 4))
-    thermal, day = Evaluation("thermal"), Evaluation(head="source")
+    three, four = (TableRequest("t", TABLES[number], "demo", (0,)) for number in (3, 4))
+    thermal, day = ExtraEvaluation("thermal"), ExtraEvaluation(head="source")
     assert three.evaluations(["HeatNet*"]) == ()
     assert three.evaluations(["Multi-head"]) == (thermal,)
     assert four.evaluations(["HeatNet RGB-only*"]) == ()
@@ -109,7 +109,7 @@ def test_rows_that_are_printed_twice_are_one_run(
 
 def test_rows_of_a_table_are_different_runs() -> None:
     for number, table in TABLES.items():
-        wanted = Wanted("t", table, "demo", (0,))
+        wanted = TableRequest("t", table, "demo", (0,))
         runs = [row for row in table.rows if table.runnable(row)] if number < 5 else []
         assert len(wanted.points()) == len(runs)
 

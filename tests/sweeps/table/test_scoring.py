@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.points import Evaluation
-from sweeps.table.cells import Cell
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.cells import TableCell
 from sweeps.table.scoring import check_metrics, published, score
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
@@ -75,7 +75,7 @@ def test_no_rank_correlation_of_few_or_equal_rows(rows: dict) -> None:
 
 def test_minus_is_taken_per_seed_and_modalities_have_their_counts() -> None:
     runs = {
-        ("a", seed): outcome(str(seed), {None: right(acc), Evaluation("rgb"): right(rgb)})
+        ("a", seed): outcome(str(seed), {None: right(acc), ExtraEvaluation("rgb"): right(rgb)})
         for seed, (acc, rgb) in enumerate([(50, 40), (70, 50)])
     }
     scored = score("t", table((Row(label="a"),), (ACC, RGB, LESS)), runs, scale="demo")
@@ -92,7 +92,7 @@ def test_a_mean_of_columns_is_taken_per_seed_and_says_what_is_missing() -> None:
         Column(name="gain", minus=("both", "acc")),
     )
     runs = {
-        ("a", seed): outcome(str(seed), {None: right(acc), Evaluation("rgb"): right(rgb)})
+        ("a", seed): outcome(str(seed), {None: right(acc), ExtraEvaluation("rgb"): right(rgb)})
         for seed, (acc, rgb) in enumerate([(50, 40), (70, 50)])
     }
     cells = score("t", table((Row(label="a"),), columns), runs, scale="demo").cells
@@ -112,7 +112,7 @@ def test_a_mean_of_columns_is_taken_per_seed_and_says_what_is_missing() -> None:
 
 def test_columns_that_a_row_leaves_out_have_no_cell_and_are_no_failure() -> None:
     rows = (Row(label="a", without=("rgb",)), Row(label="b"))
-    both = {None: right(50), Evaluation("rgb"): right(30)}
+    both = {None: right(50), ExtraEvaluation("rgb"): right(30)}
     runs = {("a", 0): outcome("k", right(40)), ("b", 0): outcome("l", both)}
     mean = Column(name="both", mean=("acc", "rgb"))
     cells = score("t", table(rows, (ACC, RGB, LESS, mean)), runs, scale="demo").cells
@@ -124,7 +124,7 @@ def test_columns_that_a_row_leaves_out_have_no_cell_and_are_no_failure() -> None
 
 def test_each_head_has_its_counts() -> None:
     column = Column(name="day head", metric="pixel_accuracy", modality="rgb", head="source")
-    made = {None: right(50), Evaluation("rgb", head="source"): right(30)}
+    made = {None: right(50), ExtraEvaluation("rgb", head="source"): right(30)}
     runs = {("a", 0): outcome("k", made)}
     scored = score("t", table((Row(label="a"),), (ACC, column)), runs, scale="demo")
     assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]
@@ -132,7 +132,7 @@ def test_each_head_has_its_counts() -> None:
 
 def test_failing_images_have_counts_of_their_own() -> None:
     noisy = Column(name="noisy", metric="pixel_accuracy", degradation="noise", severity=16)
-    made = {None: right(50), Evaluation(degradation="noise", severity=16.0): right(30)}
+    made = {None: right(50), ExtraEvaluation(degradation="noise", severity=16.0): right(30)}
     runs = {("a", 0): outcome("k", made)}
     scored = score("t", table((Row(label="a"),), (ACC, noisy)), runs, scale="demo")
     assert [cell.mean for cell in scored.cells.values()] == [50.0, 30.0]
@@ -146,7 +146,7 @@ def test_sizes_stand_beside_what_was_run_and_have_ranks() -> None:
     )
     runs = {("a", seed): outcome(str(seed), right(40)) for seed in (0, 1)}
     sizes = {
-        (label, "size"): Cell(millions, math.nan, 0)
+        (label, "size"): TableCell(millions, math.nan, 0)
         for label, millions in (("a", 54.36), ("b", 44.56), ("c", 51.0))
     }
     scored = score("t", table(rows, (ACC, size)), runs, scale="demo", sizes=sizes)
@@ -164,7 +164,7 @@ def test_regions_of_the_table_and_placeholders() -> None:
         Row(label="Road", settings={"class": "road"}),
         Row(label="Car", settings={"class": "car"}),
     )
-    run = outcome("k", {Evaluation("default", "ring9"): counts_of()})
+    run = outcome("k", {ExtraEvaluation("default", "ring9"): counts_of()})
     runs = {("Road", 0): run, ("Car", 0): run}
     scored = score("t", table(rows, (column,), regions="ring9"), runs, scale="demo")
     assert scored.cells["Road", "R2"].mean == pytest.approx(75.0)
@@ -186,8 +186,8 @@ def test_protocols_have_their_counts_and_a_column_of_ours_no_order() -> None:
     made = {
         label: {
             None: right(share),
-            Evaluation(frames="released"): pairs_of(same, 2, "released"),
-            Evaluation(frames="aligned"): pairs_of(same + 2, 0 if label == "c" else 2),
+            ExtraEvaluation(frames="released"): pairs_of(same, 2, "released"),
+            ExtraEvaluation(frames="aligned"): pairs_of(same + 2, 0 if label == "c" else 2),
         }
         for label, share, same in (("a", 40, 6), ("b", 50, 8), ("c", 60, 2))
     }
@@ -208,7 +208,7 @@ def test_protocols_have_their_counts_and_a_column_of_ours_no_order() -> None:
 
 def test_pairs_that_were_not_counted_say_so() -> None:
     column = Column(name="TC", metric="TC", frames="aligned")
-    run = outcome("k", {Evaluation(frames="aligned"): right(40)})
+    run = outcome("k", {ExtraEvaluation(frames="aligned"): right(40)})
     (cell,) = score(
         "t", table((Row(label="a"),), (column,)), {("a", 0): run}, scale="demo"
     ).cells.values()

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from sweeps.points import Evaluation
-from sweeps.table.cell_points import Wanted
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, load_table
 from tests.sweeps.composed import row_config
 
@@ -63,14 +63,14 @@ def test_the_printed_columns_are_of_the_released_protocol(number: int) -> None:
         ("TC aligned", "TC", "aligned", False),
         ("CA aligned", "CA", "aligned", False),
     ]
-    assert Wanted("t", TABLES[number], "demo", (0,)).evaluations() == (
-        Evaluation(frames="released"),
-        Evaluation(frames="aligned"),
+    assert TableRequest("t", TABLES[number], "demo", (0,)).evaluations() == (
+        ExtraEvaluation(frames="released"),
+        ExtraEvaluation(frames="aligned"),
     )
     assert any("come from the released protocol" in remark for remark in TABLES[number].remarks)
 
 
 def test_backbones_of_rtfnet_differ_at_the_scale_of_the_paper_alone() -> None:
-    wanted = {scale: Wanted("t", TABLES[5], scale, (0,)) for scale in ("demo", "paper")}
+    wanted = {scale: TableRequest("t", TABLES[5], scale, (0,)) for scale in ("demo", "paper")}
     assert [len(each.points()) for each in wanted.values()] == [1, 2]
     assert wanted["paper"].models() == {"rtfnet_50", "rtfnet_152"}

@@ -57,7 +57,7 @@ ALIVE = Owner("another-host", 7, "7")
 
 
 def trial(desk: Desk, number: int) -> Any:
-    return desk.ledger.study.get_trials(deepcopy=False)[number]
+    return desk.store.study.get_trials(deepcopy=False)[number]
 
 
 def test_a_list_is_run_once_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_a_list_is_run_once_and_a_second_call_runs_nothing(tmp_path: Path) -> No
     assert [how for _, how, _ in desk.view.ends] == ["finished"] * 4
     again = list_desk(tmp_path, plans(4), storage=storage).run()
     assert again.executor.calls == []
-    assert len(again.ledger.trials()) == 4
+    assert len(again.store.trials()) == 4
 
 
 def test_no_more_processes_at_a_time_than_workers(tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_three_drivers_of_a_search_make_twenty_trials_with_parameters_of_their_o
         search_desk(runs, storage=open_storage(None, runs), me=me, trials=20) for me in owners(3)
     ]
     together(desks)
-    trials = desks[0].ledger.trials()
+    trials = desks[0].store.trials()
     assert [each.state.name for each in trials] == ["COMPLETE"] * 20
     assert len({each.params["x"] for each in trials}) == 20
     assert sum(len(desk.executor.calls) for desk in desks) == 20
@@ -326,8 +326,8 @@ def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
         silent(storage, 0)
     lost = trial(before, 0).params
     desk = search_desk(tmp_path, storage=storage, trials=3).run()
-    done = [each for each in desk.ledger.trials() if each.state.name == "COMPLETE"]
-    assert len(done) == len(desk.ledger.trials()) == 3
+    done = [each for each in desk.store.trials() if each.state.name == "COMPLETE"]
+    assert len(done) == len(desk.store.trials()) == 3
     assert desk.executor.started()[0] == before.executor.started()[0]
     assert [each.params for each in done].count(lost) == 1
 
@@ -358,9 +358,9 @@ def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
     storage = memory()
     killed(search_desk(tmp_path, hang, storage=storage, me=GONE, trials=1))
     a, b = (search_desk(tmp_path, storage=storage, me=me, trials=1) for me in owners(2))
-    seen = [list(b.ledger.orphans(())), []]
+    seen = [list(b.store.stale_trials(())), []]
     assert len(seen[0]) == 1
-    monkeypatch.setattr(b.ledger, "orphans", lambda mine: seen.pop(0) if seen else [])
+    monkeypatch.setattr(b.store, "orphans", lambda mine: seen.pop(0) if seen else [])
     a.run()
     b.run()
     assert a.numbers("COMPLETE") == [1]
@@ -380,7 +380,7 @@ def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: 
         rounds.append(len(works))
         if len(rounds) == 30:
             finish(tmp_path / points[0].key)
-            other.ledger.complete(task.number, [1.0], {})
+            other.store.complete(task.number, [1.0], {})
 
     desk = list_desk(tmp_path, points, storage=storage, wait=True, view=FakeView(look)).run()
     assert len(rounds) >= 30
@@ -392,7 +392,7 @@ def test_a_driver_says_that_it_is_alive(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(drivers, "BEAT_S", 0.0)
     beats: list[list[int]] = []
     desk = list_desk(tmp_path, plans(1))
-    monkeypatch.setattr(desk.ledger, "beat", lambda numbers: beats.append(list(numbers)))
+    monkeypatch.setattr(desk.store, "beat", lambda numbers: beats.append(list(numbers)))
     desk.run()
     assert [0] in beats
 
@@ -405,7 +405,7 @@ def test_ctrl_c_stops_the_processes_and_gives_the_points_back(tmp_path: Path) ->
         desk.run()
     assert [call.stops for call in desk.executor.calls] == [1, 1]
     assert desk.executor.running() == []
-    assert desk.ledger.trials() == []
+    assert desk.store.trials() == []
     again = list_desk(tmp_path, plans(3), storage=storage).run()
     assert len(again.executor.calls) == 3
     assert again.states() == {f"x={x}": ["COMPLETE"] for x in range(3)}
@@ -420,7 +420,7 @@ def test_ctrl_c_puts_the_trials_of_a_search_into_its_queue(tmp_path: Path) -> No
     assert desk.numbers("WAITING") == [1]
     again = search_desk(tmp_path, storage=storage, trials=2).run()
     assert again.executor.started()[0] == desk.executor.started()[0]
-    assert len(again.numbers("COMPLETE")) == len(again.ledger.trials()) == 2
+    assert len(again.numbers("COMPLETE")) == len(again.store.trials()) == 2
 
 
 def test_ctrl_c_while_a_process_is_being_started_gives_the_point_back(tmp_path: Path) -> None:
@@ -434,7 +434,7 @@ def test_ctrl_c_while_a_process_is_being_started_gives_the_point_back(tmp_path: 
     desk.executor.start = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         desk.run()
-    assert desk.ledger.trials() == []
+    assert desk.store.trials() == []
 
 
 def test_a_process_that_cannot_be_started_fails_its_point_alone(tmp_path: Path) -> None:
@@ -486,7 +486,7 @@ def test_a_hopeless_trial_is_stopped_and_booked_as_pruned(tmp_path: Path) -> Non
 
     desk = search_desk(tmp_path, described, pruner=pruner, objectives=UP, trials=3)
     desk.run()
-    assert [each.state.name for each in desk.ledger.trials()] == ["COMPLETE", "PRUNED", "COMPLETE"]
+    assert [each.state.name for each in desk.store.trials()] == ["COMPLETE", "PRUNED", "COMPLETE"]
     pruned = trial(desk, 1)
     assert pruned.intermediate_values == {2: 50.0, 4: 10.0}
     assert pruned.user_attrs[names.REASON] == "pruned at step 4"
@@ -507,7 +507,7 @@ def test_the_mean_over_replicates_is_the_value_and_the_first_seed_reports(tmp_pa
         return (yield from scored(score, end=ending(score))(call))
 
     desk = search_desk(tmp_path, by_seed, objectives=UP, trials=1, replicates=3).run()
-    (one,) = desk.ledger.trials()
+    (one,) = desk.store.trials()
     assert one.values == [50.0]
     assert one.intermediate_values == {2: 50.0}
     assert [call.words[-1] for call in desk.executor.calls] == list(values)
@@ -517,13 +517,13 @@ def test_the_mean_over_replicates_is_the_value_and_the_first_seed_reports(tmp_pa
 def test_two_objectives_are_told_in_their_order(tmp_path: Path) -> None:
     both = (Objective("test/Var", "minimize"), Objective("test/mIoU", "maximize"))
     desk = search_desk(tmp_path, objectives=both, trials=2).run()
-    assert [each.values for each in desk.ledger.trials()] == [[9.0, 25.0]] * 2
+    assert [each.values for each in desk.store.trials()] == [[9.0, 25.0]] * 2
 
 
 def test_duplicates_of_finished_points_are_answered_without_a_run(tmp_path: Path) -> None:
     space = {"x": {"type": "categorical", "choices": [1, 2]}}
     desk = search_desk(tmp_path, space=space, trials=8, workers=2).run()
-    trials = desk.ledger.trials()
+    trials = desk.store.trials()
     assert [each.state.name for each in trials] == ["COMPLETE"] * 8
     assert len(desk.executor.calls) == len({each.params["x"] for each in trials}) == 2
 
@@ -542,8 +542,8 @@ def test_a_search_that_was_cut_in_two_asks_the_same_points(tmp_path: Path) -> No
     search_desk(tmp_path / "b", storage=storage, trials=2).run()
     rest = search_desk(tmp_path / "b", storage=storage, trials=6).run()
     assert len(rest.executor.calls) == 4
-    parameters = [each.params for each in rest.ledger.trials()]
-    assert parameters == [each.params for each in whole.ledger.trials()]
+    parameters = [each.params for each in rest.store.trials()]
+    assert parameters == [each.params for each in whole.store.trials()]
 
 
 def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
@@ -552,7 +552,7 @@ def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path:
     other = list_desk(tmp_path, plans(1), storage=storage, me=ALIVE)
 
     def taken_over(call: Call) -> Process:
-        other.ledger.complete(0, [99.0], {})
+        other.store.complete(0, [99.0], {})
         return (yield from succeed(call))
 
     desk = list_desk(tmp_path, plans(1), taken_over, storage=storage).run()
@@ -565,7 +565,7 @@ def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_pat
 
     def taken_over(call: Call) -> Process:
         if len(desk.executor.calls) == 1:
-            other.ledger.release(0, "its driver was gone", again=False)
+            other.store.release(0, "its driver was gone", again=False)
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path, taken_over, storage=storage, trials=1, objectives=UP)
@@ -589,7 +589,7 @@ def test_a_storage_that_is_away_for_a_moment_is_waited_for(
 ) -> None:
     monkeypatch.setattr(drivers, "PAUSE_S", 0.0, raising=False)
     desk = list_desk(tmp_path, plans(2))
-    complete = desk.ledger.complete
+    complete = desk.store.complete
     tries: list[int] = []
 
     def away(*arguments: Any) -> None:
@@ -598,7 +598,7 @@ def test_a_storage_that_is_away_for_a_moment_is_waited_for(
             raise optuna.exceptions.StorageInternalError("no route to host")
         complete(*arguments)
 
-    monkeypatch.setattr(desk.ledger, "complete", away)
+    monkeypatch.setattr(desk.store, "complete", away)
     desk.run()
     assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["COMPLETE"]}
     assert len(desk.executor.calls) == 2

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.points import Evaluation
+from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker import executors
 from sweeps.worker.executors import Job, LocalExecutor, check_gpus
 from tests.sweeps.fakes import DEADLINE_S, until
@@ -307,7 +307,11 @@ def test_what_is_loaded_beforehand_can_be_loaded() -> None:
 
 
 def test_every_command_that_is_called_of_a_run_is_loaded_by_its_process_alone() -> None:
-    evaluations = (Evaluation(), Evaluation(frames="aligned"), Evaluation(frames="next"))
+    evaluations = (
+        ExtraEvaluation(),
+        ExtraEvaluation(frames="aligned"),
+        ExtraEvaluation(frames="next"),
+    )
     called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
     assert called == set(executors.COMMANDS)
     assert not called & set(executors.own_modules())

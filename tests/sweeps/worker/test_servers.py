@@ -18,7 +18,7 @@ from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from sweeps.attributes import DROPPED, KEY, OWNER, REASON, RUNS
-from sweeps.worker.found import Runs
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import load_study, open_storage, study_names
 from tests.commands import SMALL, short
 from tests.sweeps.servers import mlflow_server, new_database, postgres
@@ -141,7 +141,7 @@ def test_a_run_of_one_machine_is_found_on_another(servers: Servers, tmp_path: Pa
     assert this_run.startswith(servers.mlflow)
     assert list(servers.artifacts.rglob("counts_test.npz")), "files go through the server"
 
-    runs = Runs(there, tracking(there))
+    runs = RunStore(there, tracking(there))
     assert runs.find("0123456789ab", "other data") is None
     found = runs.find("0123456789ab", "feed")
     assert found is not None

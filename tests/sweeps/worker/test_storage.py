@@ -14,10 +14,10 @@ from sweeps import attributes as names
 from sweeps.settings import Objective
 from sweeps.worker import storage as stores
 from sweeps.worker.storage import (
-    begin_study,
-    existing_study,
+    find_study,
     load_study,
     open_storage,
+    open_study,
     study_names,
 )
 
@@ -27,7 +27,7 @@ BOTH = (*UP, Objective("test/Var", "minimize"))
 
 def test_the_default_is_a_journal_in_the_folder_of_runs(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path / "runs")
-    begin_study("study", storage, UP, {})
+    open_study("study", storage, UP, {})
     assert (tmp_path / "runs" / "studies.journal").is_file()
     assert study_names(open_storage(None, tmp_path / "runs")) == ["study"]
 
@@ -35,7 +35,7 @@ def test_the_default_is_a_journal_in_the_folder_of_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("named", ["{}/deep/one.journal", "sqlite:///{}/two.db"])
 def test_a_study_is_there_again_in_a_named_storage(tmp_path: Path, named: str) -> None:
     where = named.format(tmp_path)
-    begin_study("study", open_storage(where, tmp_path), BOTH, {names.KIND: "list"})
+    open_study("study", open_storage(where, tmp_path), BOTH, {names.KIND: "list"})
     study = load_study("study", open_storage(where, tmp_path))
     assert study.user_attrs[names.KIND] == "list"
     assert study.user_attrs[names.METRICS] == ["test/mIoU", "test/Var"]
@@ -135,28 +135,28 @@ def test_several_processes_open_a_fresh_storage_at_the_same_time(
 
 def test_a_study_with_other_objectives_or_another_space_is_refused(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
-    begin_study("study", storage, UP, {names.SIGNATURE: "a"})
-    begin_study("study", storage, UP, {names.SIGNATURE: "a"})
+    open_study("study", storage, UP, {names.SIGNATURE: "a"})
+    open_study("study", storage, UP, {names.SIGNATURE: "a"})
     with pytest.raises(InputError, match="'study' with other objectives"):
-        begin_study("study", storage, BOTH, {names.SIGNATURE: "a"})
+        open_study("study", storage, BOTH, {names.SIGNATURE: "a"})
     with pytest.raises(InputError, match="'study' with another space"):
-        begin_study("study", storage, UP, {names.SIGNATURE: "b"})
+        open_study("study", storage, UP, {names.SIGNATURE: "b"})
     with pytest.raises(InputError, match="'study' with another space"):
-        begin_study("study", storage, UP, {names.KIND: "list"})
+        open_study("study", storage, UP, {names.KIND: "list"})
 
 
 def test_a_search_under_the_name_of_a_list_is_refused(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
-    begin_study("study", storage, UP, {names.KIND: "list"})
+    open_study("study", storage, UP, {names.KIND: "list"})
     with pytest.raises(InputError, match="study"):
-        begin_study("study", storage, UP, {names.KIND: "search", names.SIGNATURE: "a"})
+        open_study("study", storage, UP, {names.KIND: "search", names.SIGNATURE: "a"})
 
 
 def test_a_study_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     with pytest.raises(InputError, match="no study 'x'; the storage holds none"):
         load_study("x", storage)
-    begin_study("table/one", storage, UP, {})
+    open_study("table/one", storage, UP, {})
     with pytest.raises(InputError, match="did you mean 'table/one'"):
         load_study("table/on", storage)
 
@@ -164,29 +164,29 @@ def test_a_study_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -
 def test_looking_for_a_study_makes_nothing(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
-        assert existing_study("study", named, runs) is None
+        assert find_study("study", named, runs) is None
     assert list(tmp_path.iterdir()) == []
 
 
 def test_looking_for_a_study_finds_it_in_every_kind_of_storage(tmp_path: Path) -> None:
     for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
-        begin_study("study", open_storage(named, tmp_path), UP, {})
-        found: Any = existing_study("study", named, tmp_path)
+        open_study("study", open_storage(named, tmp_path), UP, {})
+        found: Any = find_study("study", named, tmp_path)
         assert found.study_name == "study"
-        assert existing_study("another", named, tmp_path) is None
+        assert find_study("another", named, tmp_path) is None
 
 
 def test_a_journal_in_the_home_folder_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    begin_study("study", open_storage("~/one.journal", tmp_path), UP, {})
+    open_study("study", open_storage("~/one.journal", tmp_path), UP, {})
     assert (tmp_path / "one.journal").is_file()
-    assert existing_study("study", "~/one.journal", tmp_path) is not None
+    assert find_study("study", "~/one.journal", tmp_path) is not None
 
 
 def test_a_name_that_mlflow_cannot_show_is_refused(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     with pytest.raises(InputError, match="MLflow takes names"):
-        begin_study('a "b"', storage, UP, {})
-    begin_study("table/my-1: x_2.0", storage, UP, {})
+        open_study('a "b"', storage, UP, {})
+    open_study("table/my-1: x_2.0", storage, UP, {})

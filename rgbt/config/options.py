@@ -1,0 +1,201 @@
+"""The options of a command: declared once, as the fields of a frozen dataclass.
+
+    @dataclass(frozen=True)
+    class Options:
+        run: Annotated[str, Help("run folder, config key or MLflow run id")]
+        resamples: Annotated[int, Interval(ge=100, le=10**6), Help("of the images")] = 2000
+
+``resamples=500`` sets one; a field without a default must be given. Types and ranges are checked as
+those of a configuration are (`rgbt.config.values`), and ``--help`` is made from the declaration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import textwrap
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.words import with_home
+
+WIDTH = 100
+"""Columns of a help text."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Help:
+    """What an option means, in an annotation: ``Annotated[str, Help("of the data set")]``."""
+
+    text: str
+
+
+def types_of(options: type) -> dict[str, Any]:
+    """Annotation of every option, by name."""
+    return typing.get_type_hints(options, include_extras=True)
+
+
+def parse(
+    options: type[T], words: Sequence[str], heeds: Sequence[str] | None = None
+) -> tuple[T, list[str]]:
+    """The options that `words` set, and the words that are overrides of the configuration.
+
+    Args:
+        options: dataclass that declares them.
+        words: ``key=value``, as typed.
+        heeds: keys of the configuration that take effect, each with all below it; None: all.
+
+    Raises:
+        InputError: a word of another form, an unknown key, a value of a wrong type, or none where
+            one is needed.
+    """
+    kinds = types_of(options)
+    values, overrides = {}, []
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals:
+            raise InputError(f"'{word}': expected key=value; {nearest(key, kinds)}.")
+        if key in kinds:
+            values[key] = read_text(key, text, kinds[key])
+        else:
+            _check_override(word, list(kinds), heeds)
+            overrides.append(word)
+    for field in dataclasses.fields(options):  # type: ignore[arg-type]  # T is a dataclass
+        if _is_required(field) and field.name not in values:
+            raise InputError(f"'{field.name}' has no value; give one with {field.name}=...")
+    return options(**values), overrides
+
+
+def read_text(key: str, text: str, annotation: Any) -> Any:
+    """The value that a text on the command line stands for, checked against its annotation.
+
+    Raises:
+        InputError: it does not fit the annotation.
+    """
+    from rgbt.config.values import check_value
+
+    return check_value(key, _plain(key, text, annotation), annotation)
+
+
+def _plain(key: str, text: str, annotation: Any) -> Any:
+    """The text itself where the annotation takes a text; else as Hydra reads a value."""
+    text = with_home(text)
+    kinds = _leaves(annotation)
+    if type(None) in kinds and text in ("", "null"):
+        return None
+    if Path in kinds and not text:
+        raise InputError(f"'{key}' has no value; give a path.")
+    if str in kinds or Path in kinds or text in kinds:
+        return text
+    for kind in kinds:
+        if typing.get_origin(kind) is tuple:
+            item = typing.get_args(kind)[0]
+            return [_plain(key, each, item) for each in split_list(text, "values")]
+    return _as_hydra_reads(key, text)
+
+
+def _leaves(annotation: Any) -> list[Any]:
+    """The members of a union without their ranges, those of a Literal as they are."""
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _leaves(args[0])
+    if origin is typing.Literal:
+        return list(args)
+    if args and origin not in (tuple, dict, list):
+        return [leaf for each in args for leaf in _leaves(each)]
+    return [annotation]
+
+
+def choices_of(annotation: Any) -> list[str]:
+    """The texts that an annotation names one by one."""
+    leaves = _leaves(annotation)
+    booleans = ["true", "false"] if bool in leaves else []
+    return [*booleans, *(each for each in leaves if isinstance(each, str))]
+
+
+def _as_hydra_reads(key: str, text: str) -> Any:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_override(f"{key}={text}")
+        # What is no single value (1,2) is refused as the text that it is.
+        return text if parsed.is_sweep_override() else parsed.value()
+    except HydraException:
+        return text
+
+
+def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None) -> None:
+    key = word.lstrip("+~").partition("=")[0]
+    if heeds is None:
+        _check_key(word, key, names)
+        return
+    # The search path says where files of a data set of one's own lie.
+    known = (*heeds, "hydra.searchpath") if heeds else ()
+    if not any(key == each or key.startswith(f"{each}.") for each in known):
+        raise InputError(f"'{key}' has no effect here; {nearest(key, [*names, *heeds])}.")
+
+
+def _check_key(word: str, key: str, names: Sequence[str]) -> None:
+    """Refuse a word without a dot that is no key of a configuration: an option, misspelt."""
+    from rgbt.config.hydra_messages import key_hint, top_level_keys
+
+    known = top_level_keys()
+    if key not in known and not word.startswith("+") and not set(key) & set("./@"):
+        raise InputError(f"'{key}' is no option of this command; {key_hint(key, names)}.")
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is field.default_factory is dataclasses.MISSING
+
+
+def help_text(usage: str, options: type, about: str, given: Sequence[str] = ()) -> str:
+    """What ``--help`` shows: the text of a command around its options.
+
+    Args:
+        usage: the command as it is typed, without its options.
+        options: dataclass that declares them.
+        about: the first paragraph says what the command does; others stand below the options.
+        given: options that `usage` names already.
+    """
+    summary, _, rest = about.partition("\n\n")
+    fields = dataclasses.fields(options)
+    needed = [each.name for each in fields if _is_required(each) and each.name not in given]
+    usage = " ".join(["usage:", usage, *(f"{name}=..." for name in needed), "[option=value ...]"])
+    kinds = types_of(options)
+    width = 2 + max(map(len, kinds), default=0)
+    lines = [_entry(field, kinds[field.name], width) for field in fields]
+    return "\n\n".join(filter(None, [summary, usage, "\n".join(lines), rest]))
+
+
+def _entry(field: dataclasses.Field[Any], annotation: Any, width: int) -> str:
+    """One option with its meaning, choices and default."""
+    notes = [each.text for each in getattr(annotation, "__metadata__", ()) if type(each) is Help]
+    text = "; ".join(notes)
+    choices = [each for each in choices_of(annotation) if each not in ("true", "false")]
+    if not all(re.search(rf"\b{re.escape(each)}\b", text) for each in choices):
+        text += f"; one of: {', '.join(choices)}"
+    shown = _shown(field.default)
+    if shown and "default" not in text:
+        text += f" (default: {shown})"
+    return textwrap.fill(
+        text.lstrip("; "),
+        WIDTH,
+        initial_indent=f"  {field.name:<{width}}",
+        subsequent_indent=" " * (width + 2),
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+
+
+def _shown(default: Any) -> str:
+    """A default as one types it; "" for none."""
+    if isinstance(default, bool):
+        return str(default).lower()
+    return "" if default is None or default is dataclasses.MISSING else str(default)

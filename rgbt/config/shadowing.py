@@ -1,0 +1,55 @@
+"""A user's own folder ``sweeps/`` or ``analysis/`` in the working directory, and ours.
+
+``python -m`` looks for modules in the working directory first; the command ``rgbt`` looks there
+last, so that a user's own maskers are found and nothing of ours is hidden.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import PathFinder
+from pathlib import Path
+
+from rgbt.checks import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+"""The folder that holds our packages."""
+
+
+def search_working_directory_last() -> None:
+    """Let modules of the working directory be found after all others."""
+    here = str(Path.cwd())
+    sys.path[:] = [*(path for path in sys.path if path not in ("", here)), here]
+
+
+def check_not_shadowed(package: str) -> None:
+    """Refuse a folder or file of the user's that ``python -m`` imports instead of our package.
+
+    Args:
+        package: top-level name that is imported next.
+
+    Raises:
+        InputError: naming what shadows the package.
+    """
+    _check(package, sys.path, "type `rgbt ...` instead of `python -m ...`, ")
+
+
+def check_jobs_import_ours(package: str) -> None:
+    """The same for processes that are started with ``python -m`` in the working directory.
+
+    Raises:
+        InputError: see `check_not_shadowed`.
+    """
+    _check(package, [str(Path.cwd()), *sys.path], "")
+
+
+def _check(package: str, path: list[str], remedy: str) -> None:
+    spec = PathFinder.find_spec(package, path)
+    origin = Path(spec.origin).resolve() if spec is not None and spec.origin else None
+    if origin is None or origin.is_relative_to(ROOT / package):
+        return
+    shown = origin.parent if origin.name == "__init__.py" else origin
+    raise InputError(
+        f"{shown} is imported instead of rgbt's own package `{package}`, because python -m looks "
+        f"in the working directory first; {remedy}rename it, or work in another folder."
+    )

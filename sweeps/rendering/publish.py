@@ -1,0 +1,111 @@
+"""A finished table: printed, written as files and sent to MLflow."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rgbt.files.atomic import write_atomic
+from rgbt.tracking.terminal import line_width, place_lines, show, tell
+from sweeps.rendering.figure import draw_table
+from sweeps.rendering.file_formats import latex, markdown, tidy_csv
+from sweeps.rendering.rendered_table import RenderedTable, render_table
+from sweeps.rendering.terminal import terminal
+from sweeps.report.records import record
+from sweeps.table.cells import NO_VALUE
+from sweeps.table.parameter_counts import parameter_cells
+from sweeps.table.request import TableRequest
+from sweeps.table.scoring import ScoredTable, score
+from sweeps.worker.point_list import Outcome, other_code_line
+
+if TYPE_CHECKING:
+    from rgbt.tracking.tracker import Tracking
+
+
+def finish(wanted: TableRequest, outcomes: Sequence[Outcome], out: Path, tracking: Tracking) -> int:
+    """Print the table, write its files, record it in MLflow.
+
+    Args:
+        wanted: the table.
+        outcomes: of its points.
+        out: folder for table.md, table.csv, table.tex and figure.png.
+        tracking: as the configuration builds it.
+
+    Returns:
+        1 where a cell failed or has no value, or the files could not be written; else 0.
+    """
+    runs, sizes = wanted.runs(outcomes), parameter_cells(wanted)
+    scored = score(wanted.name, wanted.table, runs, scale=wanted.scale, sizes=sizes)
+    sheet = render_table(scored, wanted.typed())
+    show(terminal(sheet, plain=not sys.stdout.isatty(), width=line_width()))
+    failed = _tell_what_is_missing(scored, outcomes)
+    try:
+        files = write_files(scored, sheet, out)
+    except OSError as error:
+        tell(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
+        return 1
+    links = record(
+        tracking,
+        name=f"{wanted.name} {wanted.variant}",
+        kind="table",
+        files=files,
+        metrics=metrics(scored, outcomes),
+        tags={
+            "rgbt.table": wanted.name,
+            "rgbt.scale": wanted.scale,
+            "rgbt.seeds": ", ".join(map(str, wanted.seeds)),
+        },
+        note=markdown(sheet),
+    )
+    places = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
+    show(place_lines(places))
+    return 1 if failed else 0
+
+
+def write_files(scored: ScoredTable, sheet: RenderedTable, out: Path) -> list[Path]:
+    """Write the table in every form, and its figure where there is something to draw."""
+    out.mkdir(parents=True, exist_ok=True)
+    texts = {
+        "table.md": markdown(sheet),
+        "table.csv": tidy_csv(scored),
+        "table.tex": latex(sheet),
+    }
+    for name, text in texts.items():
+        write_atomic(out / name, text.encode())
+    figure = out / "figure.png"
+    drawn = draw_table(scored, figure)
+    return [*(out / name for name in texts), *([figure] if drawn else [])]
+
+
+def metrics(scored: ScoredTable, outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """Numbers of the table's run in MLflow: runs by state, and how well the orders agree."""
+    states = [outcome.state for outcome in outcomes]
+    counts = {f"runs/{state}": float(states.count(state)) for state in ("finished", "failed")}
+    rhos = {f"order/{name}": order.rho for name, order in scored.orders.items()}
+    return counts | {name: rho for name, rho in rhos.items() if math.isfinite(rho)}
+
+
+def _tell_what_is_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:
+    """Lines on stderr; whether a cell failed or has no value."""
+    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
+    others = [outcome for outcome in outcomes if outcome.state in ("running", "waiting")]
+    empty = any(cell.mark == NO_VALUE for cell in scored.cells.values())
+    if failed:
+        tell(
+            f"{len(failed)} of {len(outcomes)} runs failed, see the footnotes; the same command "
+            "with retry=failed tries them again."
+        )
+    if others:
+        tell(
+            f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them or "
+            "have not begun; the same command later completes the table, wait=true stays for it."
+        )
+    if empty:
+        tell("some cells have no value although nothing is missing, see the footnotes.")
+    other = other_code_line(outcomes)
+    if other:
+        tell(other)
+    return bool(failed) or empty

@@ -1,0 +1,82 @@
+"""The end of a grid: one row per configuration, mean and spread over its seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rgbt.metrics import names
+from rgbt.tracking.tables import ABSENT, Grid, number
+from sweeps.point import Point
+from sweeps.rendering.text_cell import Text
+from sweeps.table.cells import TableCell, Value, over_seeds
+from sweeps.worker.point_list import Outcome
+
+MOST_REGIONS = 99
+
+
+def group_grid(title: str, outcomes: Sequence[Outcome]) -> Grid:
+    """Scores on the test split by configuration.
+
+    Args:
+        title: shown above.
+        outcomes: of the points of a grid.
+
+    Returns:
+        columns: configuration, seeds that went into the row ("2 of 3" where some are missing),
+        mIoU, Var and the regions as "mean ± standard deviation (n - 1)", of one seed its value
+        alone, and of configurations of one run each the key of that run.
+    """
+    groups: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        groups.setdefault(configuration(outcome.point), []).append(outcome)
+    metrics = _metrics(outcomes)
+    has_seeds = any(len(members) > 1 for members in groups.values())
+    rows = []
+    for label, members in groups.items():
+        cells = [_cell(metric, members) for metric in metrics]
+        seeds, key = _seeds(cells[0], members), members[0].keys
+        beside = [] if has_seeds else [" ".join(key) or ABSENT]
+        rows.append((label, seeds, *map(_shown, cells), *beside))
+    header = ("configuration", "seeds", *metrics, *([] if has_seeds else ["run"]))
+    return Grid(title, header, tuple(rows))
+
+
+def unfinished_grid(outcomes: Sequence[Outcome]) -> Grid:
+    """Points without a result and why; no rows where all are finished."""
+    rows = tuple(
+        (each.point.label, each.state, " ".join(each.keys) or ABSENT, each.reason)
+        for each in outcomes
+        if each.state != "finished"
+    )
+    return Grid("Points without a result", ("point", "state", "run", "reason"), rows)
+
+
+def configuration(point: Point) -> str:
+    """What the seeds of a point share: its label without the seed, else its experiment."""
+    label = " ".join(word for word in point.label.split(" ") if not word.startswith("seed="))
+    named = (word.partition("=") for word in point.overrides)
+    return label or next((value for key, _, value in named if key == "+experiment"), ABSENT)
+
+
+def _metrics(outcomes: Sequence[Outcome]) -> list[str]:
+    """Names of the columns: mIoU, Var and the regions that some run has."""
+    known = {name for outcome in outcomes for run in outcome.found for name in run.scores()}
+    regions = map(names.region, range(1, MOST_REGIONS))
+    return [names.MIOU, names.VAR, *(name for name in regions if f"test/{name}" in known)]
+
+
+def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
+    values: dict[int, Value] = {}
+    for index, outcome in enumerate(members):
+        scores = outcome.found[0].scores() if outcome.state == "finished" and outcome.found else {}
+        values[index] = scores.get(f"test/{metric}", outcome.reason or outcome.state)
+    return over_seeds(values)
+
+
+def _seeds(cell: TableCell, members: Sequence[Outcome]) -> str:
+    return f"{cell.seeds} of {len(members)}" if cell.seeds < len(members) else str(cell.seeds)
+
+
+def _shown(cell: TableCell) -> str:
+    spread = number(cell.sd) if cell.seeds > 1 else ""
+    return Text(number(cell.mean), spread).whole

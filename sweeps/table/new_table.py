@@ -1,0 +1,212 @@
+"""One's own ablation as a table file: ``python -m sweeps.reproduce new table=my/ablation ...``."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.compose import PIXELS, compose
+from rgbt.config.options import Help
+from rgbt.config.schema import check
+from rgbt.files.atomic import write_atomic
+from sweeps.table.table import OWN as FOLDER
+from sweeps.table.table import PUBLISHED, load_table
+
+RINGS = 5
+END = "\n..."
+"""PyYAML's mark behind a value that stands alone."""
+
+LOG_FROM = 8.0
+"""Ratio of the largest to the smallest value from which the axis of the figure is logarithmic."""
+
+HEAD = """\
+# {title}
+# Run:  python -m sweeps.reproduce table={name} seeds=3 workers=2
+# Look: python -m sweeps.reproduce table={name} seeds=3 dry_run=true
+# A row is `python -m rgbt.run +experiment=<experiment> <overrides>`; add, change and remove rows as
+# you like: what is finished is found again, only what is missing is run.
+"""
+
+COLUMNS = """\
+columns: # or: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
+  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB,
+  # head: source with one head of a network of two; degradation: noise and severity: 16 of failing
+  # images (docs/robustness.md); {name: both, mean: [day, night]} and {name: gain, minus: [day,
+  # night]} of other columns; {name: TC, metric: TC, frames: aligned} and CA, of two frames
+  # (docs/consistency.md); {name: size, parameters: true} counts the network
+"""
+
+ROWS = """\
+# Beside each row may stand: values: {mIoU: 61.79} (printed somewhere, shown beside ours),
+# remarks: [a footnote], settings: {why: said here}, at: {paper: [model=mask2former_swin_s]},
+# without: [a column that the row's network has no score for]
+rows:
+"""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One override that is varied, or not: its key and values as text."""
+
+    key: str
+    values: tuple[str, ...]
+
+    @property
+    def numbers(self) -> tuple[float, ...] | None:
+        """The values, where it is varied and all are numbers."""
+        try:
+            found = tuple(float(value) for value in self.values)
+        except ValueError:
+            return None
+        return found if len(found) > 1 and all(map(math.isfinite, found)) else None
+
+
+@dataclass(frozen=True)
+class NewOptions:
+    """Of ``rgbt reproduce new``."""
+
+    table: Annotated[str, Help("its name, my/ablation for the file tables/my/ablation.yaml")]
+    experiment: Annotated[str, Help("a file of conf/experiment")]
+
+
+def new(options: NewOptions, overrides: list[str]) -> int:
+    """Write a table of your own, to be run with `rgbt reproduce table=my/ablation`.
+
+    Overrides with comma lists say what is varied: masker.sigma_div=1,2,4 masker.patch_size=32,64
+    """
+    path = write_new(options.table, options.experiment, overrides)
+    rows = len(load_table(options.table).rows)
+    sys.stdout.write(
+        f"{path} has {rows} rows; run them with\n"
+        f"rgbt reproduce table={options.table} seeds=3 workers=2\n"
+    )
+    return 0
+
+
+def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path = FOLDER) -> Path:
+    """Write the file of a new table; every row is composed and checked before.
+
+    Args:
+        name: e.g. "my/ablation".
+        experiment: a file of ``conf/experiment``.
+        overrides: of `python -m rgbt.run`; comma lists are varied, all with all.
+        folder: where one's own tables lie.
+
+    Returns:
+        the file.
+
+    Raises:
+        InputError: the file is there already, nothing is varied, or a row does not fit.
+    """
+    path = folder / f"{name}.yaml"
+    _check_name(name, path)
+    factors = [_factor(override) for override in overrides]
+    for factor in factors:
+        if factor.key == "seed":
+            raise InputError("seed=...: seeds are chosen when the table is run, seeds=3.")
+        if factor.key == "runs_dir":
+            raise InputError("runs_dir=...: where runs lie is said when the table is run.")
+    if not any(len(factor.values) > 1 for factor in factors):
+        raise InputError("nothing is varied; give a comma list, such as masker.sigma_div=1,2,4.")
+    points = list(itertools.product(*(factor.values for factor in factors)))
+    for point in points:
+        chosen = [f"{f.key}={value}" for f, value in zip(factors, point, strict=True)]
+        every = [f"+experiment={experiment}", *chosen]
+        with composing(every):
+            check(compose(every))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, _text(name, experiment, factors, points).encode())
+    return path
+
+
+def _check_name(name: str, path: Path) -> None:
+    if path.exists():
+        raise InputError(f"{path} is there already; edit it, or choose another name.")
+    if (PUBLISHED / f"{name}.yaml").exists():
+        raise InputError(f"table={name} is a published table; choose another name.")
+    if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
+
+
+def _factor(override: str) -> Factor:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    with composing([override]):
+        parsed = OverridesParser.create().parse_override(override)
+        if parsed.is_sweep_override():
+            values = tuple(parsed.sweep_string_iterator())
+        else:
+            values = (override.partition("=")[2],)
+    key, _, _ = override.partition("=")
+    return Factor(key, values)
+
+
+def _text(
+    name: str, experiment: str, factors: Sequence[Factor], points: Sequence[Sequence[str]]
+) -> str:
+    """The file."""
+    varied = [factor for factor in factors if len(factor.values) > 1]
+    folder, _, last = name.rpartition("/")
+    title = f"{experiment} with " + " and ".join(_short(f.key, varied) for f in varied) + " varied"
+    parts = [
+        HEAD.format(title=f"Own table: {title}.", name=name),
+        *_lines(paper=folder or "own", number=last, caption=f"{title}."),
+        *_lines(data="the data set of each row", unit="percent"),
+        COLUMNS,
+        *(f"  - {{name: IoU{n}, metric: region/{n}}}\n" for n in range(1, RINGS + 1)),
+        "  - {name: mIoU, metric: mIoU}\n",
+        "  - {name: Var, metric: Var, best: lowest}\n",
+    ]
+    axis = varied[0] if len(varied) == 1 and varied[0].numbers is not None else None
+    if axis is not None:
+        parts += _lines(factor={"name": _short(axis.key, varied), "axis": _axis(axis)})
+    rows = (_row(experiment, factors, point, axis) for point in points)
+    return "".join([*parts, ROWS, *rows])
+
+
+def _row(
+    experiment: str, factors: Sequence[Factor], point: Sequence[str], axis: Factor | None
+) -> str:
+    varied = [factor for factor in factors if len(factor.values) > 1]
+    pairs = list(zip(factors, point, strict=True))
+    words = [f"{_short(factor.key, varied)}={value}" for factor, value in pairs if factor in varied]
+    # Hydra escapes ${px:64} inside a list; which value it has depends on the scale.
+    label = PIXELS.sub(r"\1px", re.sub(r"\\(.)", r"\1", " ".join(words))).replace("'", "")
+    overrides = [f"{factor.key}={value}" for factor, value in pairs]
+    lines = _lines(label=label, experiment=experiment, overrides=overrides)
+    if axis is not None:
+        lines += _lines(x=float(point[list(factors).index(axis)]))
+    return "  - " + textwrap.indent("".join(lines), "    ").lstrip()
+
+
+def _short(key: str, varied: Sequence[Factor]) -> str:
+    """The last part of a key where that says enough."""
+    last = key.lstrip("+").rpartition(".")[2]
+    ends = [factor.key.lstrip("+").rpartition(".")[2] for factor in varied]
+    return last if ends.count(last) == 1 else key.lstrip("+")
+
+
+def _axis(factor: Factor) -> str:
+    numbers = factor.numbers or ()
+    spread = min(numbers) > 0 and max(numbers) / min(numbers) >= LOG_FROM
+    return "log" if spread else "linear"
+
+
+def _lines(**entries: Any) -> list[str]:
+    """``key: value`` lines of YAML, each value in one line."""
+    import yaml
+
+    texts = {
+        key: yaml.safe_dump(value, sort_keys=False, default_flow_style=True, width=10_000)
+        for key, value in entries.items()
+    }
+    return [f"{key}: {text.partition(END)[0].rstrip()}\n" for key, text in texts.items()]

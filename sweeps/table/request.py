@@ -1,0 +1,152 @@
+"""The runs that a table needs, as points: one per row and seed, rows that are the same run once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rgbt.checks import InputError
+from rgbt.config.words import readable_paths
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Point
+from sweeps.table.cells import evaluation_of, is_counted
+from sweeps.table.table import Table
+
+if TYPE_CHECKING:
+    from sweeps.worker.point_list import Outcome
+
+DEFAULT_SCALE = "demo"
+"""What a run is without ``scale=...``."""
+
+TAG = "rgbt.table/"
+"""Beginning of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
+
+BETWEEN = " | "
+TAG_LENGTH = 5000
+
+
+@dataclass(frozen=True)
+class TableRequest:
+    """A table that is asked for.
+
+    Attributes:
+        name: of the table.
+        table: its file.
+        scale: "demo" or "paper".
+        seeds: of every row.
+        extra: overrides that win over those of the rows.
+        weights: files of weights by the name of the network, for tables of several backbones.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    extra: tuple[str, ...] = ()
+    weights: Mapping[str, str] = field(default_factory=dict)
+
+    def overrides(self, label: str, seed: int) -> tuple[str, ...]:
+        """Overrides of the run of row `label` with that seed."""
+        (row,) = (row for row in self.table.rows if row.label == label)
+        experiment, *others = self.table.overrides(row, self.scale)
+        scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
+        weights = _weights_of(others, self.weights)
+        return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
+
+    def places(self) -> list[tuple[str, int]]:
+        """(label, seed) of every cell that can be run; all rows of a seed before the next seed.
+
+        None where no column is counted: parameters are, without any run.
+        """
+        if not any(map(is_counted, self.table.columns)):
+            return []
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        return [(row.label, seed) for seed in self.seeds for row in rows]
+
+    def points(self) -> list[Point]:
+        """What is to be run; rows with equal overrides share a point."""
+        sharing: dict[tuple[str, ...], list[str]] = {}
+        for label, seed in self.places():
+            sharing.setdefault(self.overrides(label, seed), []).append(label)
+        return [
+            Point(
+                label=f"{_short(labels)} {overrides[-1]}",
+                overrides=overrides,
+                tags={TAG + self.name: BETWEEN.join(labels)[:TAG_LENGTH]},
+                evaluations=self.evaluations(labels),
+            )
+            for overrides, labels in sharing.items()
+        ]
+
+    def evaluations(self, labels: Collection[str] | None = None) -> tuple[ExtraEvaluation, ...]:
+        """What the runs of the rows `labels` are evaluated with beside their own evaluation.
+
+        Args:
+            labels: of the rows; None: of all that are run.
+        """
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        named = [row for row in rows if labels is None or row.label in labels]
+        names = {column.name for row in named for column in self.table.columns_of(row)}
+        counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
+        asked = (evaluation_of(column, self.table) for column in counted)
+        return tuple(dict.fromkeys(each for each in asked if each is not None))
+
+    def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
+        """The outcome of every cell."""
+        by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
+        return {place: by_overrides[self.overrides(*place)] for place in self.places()}
+
+    def typed(self) -> tuple[str, ...]:
+        """What was asked for beside the table itself, as it was typed."""
+        return (*self.extra, *(f"weights.{model}={file}" for model, file in self.weights.items()))
+
+    @property
+    def variant(self) -> str:
+        """The scale; with a short hash where further overrides make it another table."""
+        shown = [word for word in self.typed() if not word.startswith("dataset.root=")]
+        digest = hashlib.sha256("\n".join(sorted(shown)).encode()).hexdigest()[:6]
+        return f"{self.scale}-{digest}" if shown else self.scale
+
+    def models(self) -> set[str]:
+        """Networks that the rows name."""
+        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        named = (_model_of(self.table.overrides(row, self.scale)) for row in rows)
+        return {name for name in named if name is not None}
+
+
+def _model_of(overrides: Sequence[str]) -> str | None:
+    named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
+    return named[-1] if named else None
+
+
+def _weights_of(overrides: Sequence[str], weights: Mapping[str, str]) -> tuple[str, ...]:
+    file = weights.get(_model_of(overrides) or "")
+    return () if file is None else tuple(readable_paths([f"model.weights={file}"]))
+
+
+def seeds_of(text: str) -> tuple[int, ...]:
+    """Seeds of ``seeds=3`` (these are 0, 1, 2) or of ``seeds=0,4,7``.
+
+    Raises:
+        InputError: something else.
+    """
+    is_list = text.startswith("[") and text.endswith("]")
+    words = (text[1:-1] if is_list else text).split(",")
+    numbers = tuple(int(word) for word in words if word.strip().isdecimal())
+    counted = len(numbers) == 1 and not is_list
+    if (
+        len(numbers) != len(words)
+        or len(set(numbers)) != len(numbers)
+        or (counted and not any(numbers))
+    ):
+        raise InputError(
+            f"seeds={text}: expected how many (3 for the seeds 0, 1, 2) or a list of different "
+            "ones (0,4,7)."
+        )
+    return tuple(range(numbers[0])) if counted else numbers
+
+
+def _short(labels: Sequence[str]) -> str:
+    return labels[0] if len(labels) == 1 else f"{labels[0]} (and {len(labels) - 1} more)"

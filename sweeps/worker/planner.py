@@ -1,0 +1,135 @@
+"""From points to run keys: the configuration of every run of a point, composed and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.compose import compose, with_pixels
+from rgbt.config.schema import build, check
+from rgbt.spec.run_key import run_key
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Point
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a point.
+
+    Attributes:
+        key: config key, which names its folder.
+        dataset: fingerprint of its data set.
+        overrides: of `python -m rgbt.run`.
+        steps: optimiser steps it takes.
+        pixel_factor: size of its images relative to the paper's.
+    """
+
+    key: str
+    dataset: str
+    overrides: tuple[str, ...]
+    steps: int
+    pixel_factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class PlannedPoint:
+    """A point with the runs it is made of.
+
+    Attributes:
+        point: the point.
+        key: names the point in a study: the key of its run, or a hash where there is more to it.
+        runs: one, or one per seed.
+        pixel_factor: size of its images relative to the paper's.
+    """
+
+    point: Point
+    key: str
+    runs: tuple[PlannedRun, ...]
+    pixel_factor: float = 1.0
+
+
+class Planner:
+    """Plans points; every data set is looked at once.
+
+    Args:
+        base: overrides that all runs have, e.g. where runs and data lie.
+    """
+
+    def __init__(self, base: Sequence[str] = ()) -> None:
+        self.base = tuple(base)
+        self._fingerprints: dict[str, str] = {}
+
+    def plan(self, point: Point) -> PlannedPoint:
+        """Compose and check all runs of `point`.
+
+        Raises:
+            InputError: a configuration or a data set that does not fit, in one sentence.
+        """
+        runs = tuple(self._run(overrides) for overrides in point.runs())
+        key = runs[0].key
+        if len(runs) > 1 or point.evaluations:
+            # Attributes that came later are left out where they say what older studies did.
+            plain = vars(ExtraEvaluation())
+            asked = [
+                {
+                    name: value
+                    for name, value in vars(each).items()
+                    if name in ("modality", "regions") or value != plain[name]
+                }
+                for each in point.evaluations
+            ]
+            parts = [[run.key for run in runs], asked]
+            key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+        factor = runs[0].pixel_factor
+        return PlannedPoint(
+            replace(point, label=with_pixels(point.label, factor)), key, runs, factor
+        )
+
+    def config(self, overrides: Sequence[str]) -> DictConfig:
+        """The checked configuration of one run.
+
+        Raises:
+            InputError: see `plan`; what Hydra refuses is told in the words of the command line.
+        """
+        with composing(overrides):
+            config = compose(overrides)
+            check(config)
+        return config
+
+    def _run(self, overrides: tuple[str, ...]) -> PlannedRun:
+        every = (*self.base, *overrides)
+        config = self.config(every)
+        key = run_key(config)
+        return PlannedRun(
+            key=key,
+            dataset=self._fingerprint(config),
+            overrides=every,
+            steps=int(config.trainer.max_steps),
+            pixel_factor=float(config.scale.pixel_factor),
+        )
+
+    def _fingerprint(self, config: DictConfig) -> str:
+        text = json.dumps(_plain(config.dataset), sort_keys=True)
+        if text not in self._fingerprints:
+            dataset: Any = build(config.dataset)
+            if not any(dataset.has(split) for split in dataset.splits):
+                places = ", ".join(dict.fromkeys(dataset.splits.values()))
+                raise InputError(
+                    f"{dataset.root} holds none of the lists or files {places} of the data set; "
+                    "name its folder with dataset.root=..."
+                )
+            self._fingerprints[text] = dataset.fingerprint()
+        return self._fingerprints[text]
+
+
+def _plain(node: DictConfig) -> object:
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_container(node, resolve=True)

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import pytest
+
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.rendering.figure import draw_table, figure_of, main_columns
+from sweeps.rendering.panel import OURS, PUBLISHED, are_far_apart
+from sweeps.table.cells import TableCell
+from sweeps.table.scoring import score
+from sweeps.table.table import Column, Factor, Row
+from tests.sweeps.tabled import Made, counts_of, outcome, pairs_of, table
+
+MIOU = Column(name="mIoU", metric="mIoU")
+VAR = Column(name="Var", metric="Var", best="lowest")
+
+
+def factor_table(shift: float = 0.0):
+    rows = [Row(label="base", experiment="crm", values={"mIoU": 60.0 + shift})]
+    rows += [
+        Row(label=f"x={x}", experiment="crm", x=x, values={"mIoU": 60.0 + x + shift, "Var": 9.0})
+        for x in (4.0, 1.0, 2.0)
+    ]
+    made = table(tuple(rows), (MIOU, VAR), factor=Factor(name="sigma", axis="log"))
+    runs = {(row.label, seed): outcome("k", counts_of()) for row in rows for seed in (0, 1)}
+    return score("own/factor", made, runs, scale="demo")
+
+
+def test_factor_against_both_metrics_in_order_of_x() -> None:
+    figure = figure_of(factor_table(shift=8.0))
+    upper, lower = figure.axes[0], figure.axes[1]
+    assert (upper.get_ylabel(), lower.get_ylabel()) == ("mIoU", "Var")
+    assert lower.get_xlabel() == "sigma"
+    assert lower.get_xscale() == "log"
+    printed = next(line for line in upper.lines if line.get_markerfacecolor() == "none")
+    assert list(printed.get_xdata()) == [1.0, 2.0, 4.0]
+    assert list(printed.get_ydata()) == [69.0, 70.0, 72.0]
+    levels = [line.get_ydata()[0] for line in upper.lines if line.get_label().startswith("base")]
+    assert levels[1:] == [68.0]
+
+
+def test_published_values_far_away_get_an_axis_of_their_own() -> None:
+    near, far = figure_of(factor_table()), figure_of(factor_table(shift=-40.0))
+    assert len(far.axes) > len(near.axes)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "expected"),
+    [
+        ([48.0, 50.0], [60.0, 61.0], True),
+        ([48.0, 60.0], [60.0, 61.0], False),
+        ([48.0, 52.0], [57.0, 61.0], False),
+        ([50.0], [50.0], False),
+        ([], [50.0], False),
+    ],
+)
+def test_far_apart(ours: list[float], theirs: list[float], expected: bool) -> None:
+    assert are_far_apart(ours, theirs) is expected
+
+
+def test_rows_below_each_other_without_a_factor() -> None:
+    scored = Made({"a long label": ((40, 60), 48.0), "b": ((), 50.0)}).scored()
+    axes = figure_of(scored).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["a long label", "b"]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first row on top
+
+
+def test_one_panel_per_row_for_tables_of_regions() -> None:
+    columns = tuple(Column(name=f"R{n}", metric=f"region/{n}") for n in range(1, 7))
+    rows = tuple(Row(label=label, values={"R1": 3.0, "R2": 4.0}) for label in ("Car", "Bike"))
+    scored = score("t", table(rows, columns), {}, scale="demo")
+    assert main_columns(scored) == [columns[0], columns[1]]
+    many = tuple(Row(label=r.label, values={c.name: 1.0 for c in columns}) for r in rows)
+    figure = figure_of(score("t", table(many, columns), {}, scale="demo"))
+    assert [axes.get_title() for axes in figure.axes] == ["Car", "Bike"]
+
+
+def test_consistency_of_both_protocols_has_panels_beside_the_iou() -> None:
+    columns = (
+        Column(name="mAcc", metric="mAcc"),
+        MIOU,
+        Column(name="TC", metric="TC", frames="released"),
+        Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
+        Column(name="car", metric="class/car/TC", frames="aligned", printed=False),
+    )
+    made = {None: counts_of()} | {
+        ExtraEvaluation(frames=frames): pairs_of(6, 2, frames) for frames in ("released", "aligned")
+    }
+    rows = (Row(label="a", experiment="crm", values={"mIoU": 60.0, "TC": 34.0}),)
+    scored = score("t", table(rows, columns), {("a", 0): outcome("k", made)}, scale="demo")
+    assert main_columns(scored) == [columns[1], columns[2], columns[3]]
+    figure = figure_of(scored)
+    assert [axes.get_xlabel() for axes in figure.axes[:3]] == ["mIoU", "TC", "TC aligned"]
+    hollow = [line for line in figure.axes[2].lines if line.get_markerfacecolor() == "none"]
+    assert not hollow, "nothing is published of it"
+
+
+def test_png_holds_both_colours(tmp_path: Path) -> None:
+    assert draw_table(factor_table(), tmp_path / "figure.png")
+    image = cv2.imread(str(tmp_path / "figure.png"))[..., ::-1].reshape(-1, 3)
+    for colour in (OURS, PUBLISHED):
+        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert (image == rgb).all(1).sum() > 100
+
+
+def test_sizes_are_drawn_without_runs() -> None:
+    column = Column(name="size", parameters=True)
+    made = table((Row(label="a", values={"size": 54.4}), Row(label="b")), (column,))
+    sizes = {(label, "size"): TableCell(50.0, math.nan, 0) for label in "ab"}
+    figure = figure_of(score("own/t", made, {}, scale="demo", sizes=sizes))
+    assert figure is not None
+    assert figure.get_suptitle() == "own/t (ours: counted at scale=paper)"
+    assert [line.get_markerfacecolor() == "none" for line in figure.axes[0].lines].count(False)
+    assert figure_of(score("own/t", made, {}, scale="demo")).get_suptitle().endswith("(published)")
+
+
+def test_nothing_to_draw(tmp_path: Path) -> None:
+    scored = score("t", table((Row(label="a", needs="flow"),)), {}, scale="demo")
+    assert not draw_table(scored, tmp_path / "figure.png")
+    assert not (tmp_path / "figure.png").exists()

@@ -1,0 +1,80 @@
+"""What a dry run says of a table: the state of its runs, and what is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from sweeps.rendering.preview import cells_grid, summary, tables_grid
+from sweeps.table.request import TableRequest
+from sweeps.table.table import Column, Row
+from sweeps.worker.point_list import Outcome
+from tests.sweeps.tabled import table
+
+FRAMES = (
+    Column(name="TC", metric="TC", frames="released"),
+    Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
+    Column(name="next", metric="TC", frames="next", printed=False),
+)
+RGB = Column(name="rgb", metric="mIoU", modality="rgb")
+ROWS = (Row(label="a", experiment="crm"), Row(label="b", experiment="grbm"))
+
+
+def asked(columns: tuple[Column, ...]) -> tuple[TableRequest, list[Outcome]]:
+    wanted = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
+    return wanted, [Outcome(point, "waiting") for point in wanted.points()]
+
+
+class Trained:
+    """Stands for a finished run of ten seconds."""
+
+    key = "k"
+    is_of_other_code = False
+
+    def __init__(self, folder: Any) -> None:
+        self.folder = folder
+
+
+def test_each_command_that_is_called_of_a_run_is_told_once() -> None:
+    wanted, outcomes = asked((*FRAMES, RGB))
+    assert summary(wanted, outcomes, 2) == [
+        "2 runs: 2 waiting.",
+        "Time left with workers=2: known once a run is finished.",
+        "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "
+        "python -m rgbt.consistency frames=next; "
+        "python -m rgbt.evaluate modality=rgb 'regions=as trained'.",
+    ]
+
+
+def test_a_table_without_further_evaluations_or_without_runs_says_nothing_of_them() -> None:
+    assert len(summary(*asked((Column(name="mIoU", metric="mIoU"),)), 1)) == 2
+    wanted, _ = asked(FRAMES)
+    assert summary(wanted, [], 1) == ["0 runs: none."]
+
+
+def test_sizes_are_counted_without_a_run() -> None:
+    wanted, outcomes = asked((Column(name="size", parameters=True),))
+    assert outcomes == []
+    assert summary(wanted, [], 1) == [
+        "0 runs: none.",
+        "Column 'size' is counted at scale=paper, without any run.",
+    ]
+    assert tables_grid([(wanted, [])], 1).rows == (("own/t", "0 of 2", *"0000", "-"),)
+
+
+def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> None:
+    (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
+    wanted, (first, second) = asked(FRAMES)
+    found: Any = (Trained(tmp_path),)
+    outcomes = [replace(first, found=found, keys=("k",)), second]
+    assert summary(wanted, outcomes, 1)[1:] == [
+        "Time left with workers=1: 10 s.",
+        "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "
+        "python -m rgbt.consistency frames=next.",
+        "Trained already: 1; the time of evaluations is not counted.",
+    ]
+    rows = cells_grid(wanted, outcomes).rows
+    assert [row[1:] for row in rows] == [
+        ("waiting", "10", "k", "trained, not evaluated for all columns"),
+        ("waiting", "-", "-", ""),
+    ]

@@ -1,0 +1,56 @@
+"""The table at the end of a grid: values by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from sweeps.point import Point
+from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
+from sweeps.worker.point_list import Outcome
+from sweeps.worker.run_store import RunResult
+from tests.sweeps.fakes import finish
+
+
+def made(folder: Path, label: str, **scores: float) -> Outcome:
+    test: Mapping[str, float] = {name.replace("__", "/"): value for name, value in scores.items()}
+    run = finish(folder / label.replace(" ", "_"), test=test)
+    key = run.path.name
+    return Outcome(Point(label, ()), "finished", found=(RunResult(key, run.path),), keys=(key,))
+
+
+def test_a_row_is_the_mean_and_the_sample_sd_over_seeds(tmp_path: Path) -> None:
+    outcomes = [
+        made(tmp_path, "sigma_div=1 seed=0", mIoU=0.40, Var=2.0, region__1=0.5),
+        made(tmp_path, "sigma_div=1 seed=1", mIoU=0.44, Var=4.0, region__1=0.5),
+        made(tmp_path, "sigma_div=1 seed=2", mIoU=0.48, Var=6.0, region__1=0.5),
+        made(tmp_path, "sigma_div=2 seed=0", mIoU=0.30, Var=1.0, region__1=0.25),
+        Outcome(Point("sigma_div=2 seed=1", ()), "failed", "a bad day", keys=("k",)),
+        Outcome(Point("sigma_div=3 seed=0", ()), "running", keys=("l",)),
+        Outcome(Point("sigma_div=3 seed=1", ()), "failed", "a bad day", keys=("m",)),
+    ]
+    grid = group_grid("study", outcomes)
+    assert grid.header == ("configuration", "seeds", "mIoU", "Var", "region/1")
+    assert grid.rows == (
+        ("sigma_div=1", "3", "44.00 ± 4.00", "4.00 ± 2.00", "50.00 ± 0.00"),
+        ("sigma_div=2", "1 of 2", "30.00", "1.00", "25.00"),
+        ("sigma_div=3", "0 of 2", "-", "-", "-"),
+    )
+    assert unfinished_grid(outcomes).rows == (
+        ("sigma_div=2 seed=1", "failed", "k", "a bad day"),
+        ("sigma_div=3 seed=0", "running", "l", ""),
+        ("sigma_div=3 seed=1", "failed", "m", "a bad day"),
+    )
+
+
+def test_configurations_of_one_run_show_its_key(tmp_path: Path) -> None:
+    outcomes = [made(tmp_path, f"sigma_div={n}", mIoU=0.4, Var=2.0) for n in (1, 2)]
+    grid = group_grid("study", outcomes)
+    assert grid.header[-1] == "run"
+    assert grid.rows[1] == ("sigma_div=2", "1", "40.00", "2.00", "sigma_div=2")
+    assert not unfinished_grid(outcomes).rows
+
+
+def test_a_grid_of_seeds_alone_is_called_by_its_experiment() -> None:
+    assert configuration(Point("seed=3", ("+experiment=grbm", "seed=3"))) == "grbm"
+    assert configuration(Point("seed=3", ("seed=3",))) == "-"

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rgbt.checks import InputError
+from sweeps.reproduce import entry
+from sweeps.table.new_table import write_new
+from sweeps.table.table import load_table
+from tests.commands import Call, assert_one_sentence
+
+
+def test_one_factor(tmp_path: Path) -> None:
+    path = write_new(
+        "my/ablation", "grbm", ["masker.sigma_div=1,4,16", "masker.patch_size=32"], tmp_path
+    )
+    table = load_table("my/ablation", tmp_path)
+    assert path == tmp_path / "my" / "ablation.yaml"
+    assert [row.label for row in table.rows] == ["sigma_div=1", "sigma_div=4", "sigma_div=16"]
+    assert [row.x for row in table.rows] == [1.0, 4.0, 16.0]
+    assert table.rows[1].overrides == ("masker.sigma_div=4", "masker.patch_size=32")
+    assert table.rows[1].experiment == "grbm"
+    assert table.factor is not None
+    assert (table.factor.name, table.factor.axis) == ("sigma_div", "log")
+    names = [column.name for column in table.columns]
+    assert names == ["IoU1", "IoU2", "IoU3", "IoU4", "IoU5", "mIoU", "Var"]
+    assert table.columns[-1].best == "lowest"
+    text = path.read_text()
+    assert text.count("#") >= 7
+    assert "{name: TC, metric: TC, frames: aligned}" in text
+
+
+def test_a_product_has_no_axis(tmp_path: Path) -> None:
+    write_new("two", "grbm", ["masker.sigma_div=1,2", "masker.patch_size='${px:64}',32"], tmp_path)
+    table = load_table("two", tmp_path)
+    assert [row.label for row in table.rows][:2] == [
+        "sigma_div=1 patch_size=64px",
+        "sigma_div=1 patch_size=32",
+    ]
+    assert len(table.rows) == 4
+    assert table.factor is None
+    assert table.rows[0].x is None
+
+
+def test_values_that_are_no_numbers_and_keys_that_end_alike(tmp_path: Path) -> None:
+    path = write_new("groups", "grbm", ["masker=grbm_paper,grbm_released"], tmp_path)
+    assert [row["label"] for row in yaml.safe_load(path.read_text())["rows"]] == [
+        "masker=grbm_paper",
+        "masker=grbm_released",
+    ]
+    write_new("alike", "grbm", ["scale.lr=0.1,0.2", "recipe.lr=0.1,0.2"], tmp_path)
+    assert load_table("alike", tmp_path).rows[1].label == "scale.lr=0.1 recipe.lr=0.2"
+    write_new("near", "grbm", ["masker.sigma_div=2,3"], tmp_path)
+    factor = load_table("near", tmp_path).factor
+    assert factor is not None
+    assert factor.axis == "linear"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("grbm", ["masker.sigma_dv=1,2"]), "did you mean 'sigma_div'"),
+        (("grbm", ["masker.sigma_div=1,abc"]), "masker.sigma_div"),
+        (("grbn", ["masker.sigma_div=1,2"]), "did you mean 'grbm'"),
+        (("grbm", ["seed=0,1"]), "seeds=3"),
+        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "when the table is run"),
+        (("grbm", ["masker.sigma_div=1"]), "nothing is varied"),
+    ],
+)
+def test_refused(tmp_path: Path, arguments: tuple[str, list[str]], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        write_new("my/bad", *arguments, tmp_path)
+    assert not (tmp_path / "my").exists()
+
+
+@pytest.mark.parametrize("name", ["spatialseg/table3", "../up", "my/x.yaml", "/abs"])
+def test_refused_names(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="another name|such as my/ablation"):
+        write_new(name, "grbm", ["masker.sigma_div=1,2"], tmp_path)
+
+
+def test_the_command_writes_once(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("new", "table=my/ablation", "experiment=grbm", "masker.sigma_div=1,2")
+    code, out, _ = call(entry, *words)
+    assert code == 0
+    assert "tables/my/ablation.yaml has 2 rows" in out
+    written = (tmp_path / "tables/my/ablation.yaml").read_text()
+    code, _, err = call(entry, *words)
+    assert code == 2
+    assert_one_sentence(err, "is there already")
+    assert (tmp_path / "tables/my/ablation.yaml").read_text() == written

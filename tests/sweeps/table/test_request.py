@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import pytest
+from sweeps.asked import wanted_of
+
+from rgbt.checks import InputError
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.request import TableRequest, seeds_of
+from sweeps.table.table import Column, Row
+from sweeps.worker.point_list import Outcome
+from tests.sweeps.tabled import table
+
+COLUMNS = (
+    Column(name="mIoU", metric="mIoU"),
+    Column(name="night", metric="mIoU", modality="thermal"),
+    Column(name="cold", metric="Var", modality="thermal"),
+    Column(name="less", minus=("night", "mIoU")),
+    Column(name="TC", needs="flow"),
+)
+ROWS = (
+    Row(label="small", experiment="crm", at={"paper": ("model=mask2former_swin_s",)}),
+    Row(label="large", experiment="crm", at={"paper": ("model=mask2former_swin_b",)}),
+    Row(label="other", experiment="grbm", overrides=("masker.sigma_div=2",)),
+    Row(label="later", experiment="grbm", needs="flow"),
+    Row(label="theirs", values={"mIoU": 3.0}),
+)
+
+
+def wanted(scale: str = "demo", **others: object) -> TableRequest:
+    at = {"paper": ("recipe.batch_size=5",)}
+    return TableRequest("own/t", table(ROWS, COLUMNS, at=at, **others), scale, (0, 2), ("a.b=1",))
+
+
+def test_a_point_per_run_with_the_rows_that_share_it() -> None:
+    points = wanted().points()
+    assert [point.label for point in points] == [
+        "small (and 1 more) seed=0",
+        "other seed=0",
+        "small (and 1 more) seed=2",
+        "other seed=2",
+    ]
+    assert points[0].overrides == ("+experiment=crm", "a.b=1", "seed=0")
+    assert points[1].overrides == ("+experiment=grbm", "masker.sigma_div=2", "a.b=1", "seed=0")
+    assert points[0].tags == {"rgbt.table/own/t": "small | large"}
+    assert points[0].seeds == ()
+    assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
+
+
+def test_at_paper_scale_the_rows_differ_and_the_users_overrides_win() -> None:
+    points = wanted("paper").points()
+    assert len(points) == 6
+    assert points[1].overrides == (
+        *("+experiment=crm", "scale=paper", "recipe.batch_size=5", "model=mask2former_swin_b"),
+        *("a.b=1", "seed=0"),
+    )
+
+
+def test_regions_of_the_table_are_evaluated_for_every_modality() -> None:
+    assert wanted(regions="ring9").points()[0].evaluations == (
+        ExtraEvaluation("default", "ring9"),
+        ExtraEvaluation("thermal", "ring9"),
+    )
+
+
+def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
+    columns = (
+        Column(name="mIoU", metric="mIoU"),
+        Column(name="TC", metric="TC", frames="released"),
+        Column(name="CA", metric="CA_released", frames="released"),
+        Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
+    )
+    for regions, others in (("as trained", ()), ("ring9", (ExtraEvaluation(regions="ring9"),))):
+        asked = TableRequest("own/t", table(ROWS, columns, regions=regions), "demo", (0,))
+        assert asked.points()[0].evaluations == (
+            *others,
+            ExtraEvaluation(frames="released"),
+            ExtraEvaluation(frames="aligned"),
+        )
+
+
+def test_a_run_is_evaluated_for_the_columns_that_its_rows_have() -> None:
+    columns = (
+        Column(name="rgb", metric="mIoU"),
+        Column(name="thermal", metric="mIoU", modality="thermal"),
+        Column(name="ring", metric="TC", frames="aligned"),
+    )
+    rows = (
+        Row(label="a", experiment="crm", without=("thermal",)),
+        Row(label="b", experiment="grbm", without=("thermal",)),
+        Row(label="c", experiment="grbm", without=("ring",)),
+        Row(label="later", experiment="crm", needs="flow"),
+    )
+    asked = TableRequest("own/t", table(rows, columns), "demo", (0,))
+    thermal, frames = ExtraEvaluation("thermal"), ExtraEvaluation(frames="aligned")
+    assert [point.evaluations for point in asked.points()] == [(frames,), (thermal, frames)]
+    assert asked.evaluations() == (thermal, frames)
+
+
+def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
+    columns = (
+        Column(name="night", metric="night/mIoU"),
+        Column(name="by day", metric="night/mIoU", head="source"),
+        Column(name="both", mean=("night", "by day")),
+        Column(name="size", parameters=True),
+    )
+    asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
+    assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)
+    alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
+    assert (alone.places(), alone.points(), alone.runs([])) == ([], [], {})
+    assert alone.models() == set()
+
+
+def test_failing_images_are_evaluated_apart() -> None:
+    columns = (
+        Column(name="mIoU", metric="mIoU"),
+        Column(name="no thermal", metric="mIoU", degradation="thermal_removed"),
+        Column(name="noisy", metric="mIoU", degradation="noise", severity=16),
+        Column(name="noisier", metric="Var", degradation="noise", severity=32),
+        Column(name="loss", minus=("noisier", "noisy")),
+    )
+    asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
+    assert asked.points()[0].evaluations == (
+        ExtraEvaluation(degradation="thermal_removed"),
+        ExtraEvaluation(degradation="noise", severity=16),
+        ExtraEvaluation(degradation="noise", severity=32),
+    )
+
+
+def test_outcomes_go_back_to_their_cells() -> None:
+    asked = wanted()
+    outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]
+    runs = asked.runs(outcomes)
+    assert {place: run.reason for place, run in runs.items()} == {
+        ("small", 0): "small (and 1 more) seed=0",
+        ("large", 0): "small (and 1 more) seed=0",
+        ("other", 0): "other seed=0",
+        ("small", 2): "small (and 1 more) seed=2",
+        ("large", 2): "small (and 1 more) seed=2",
+        ("other", 2): "other seed=2",
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7)), ("[5,0]", (5, 0)), ("[7]", (7,))],
+)
+def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
+    assert seeds_of(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
+def test_no_seeds(text: str) -> None:
+    with pytest.raises(InputError, match="how many"):
+        seeds_of(text)
+
+
+def test_rows_of_different_networks_take_weights_of_their_own() -> None:
+    arguments = {"scale": "paper", "seeds": "1"}
+    given = ("weights.mask2former_swin_t=/w/t=1.pth", "weights.mask2former_swin_b=b.pth", "x=1")
+    wanted = wanted_of("spatialseg/table7", arguments, given)
+    assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
+        *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
+    )
+    assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
+    assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
+    assert wanted.typed() == ("x=1", *given[:2])
+    with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
+        wanted_of("spatialseg/table7", arguments, ("weights.mask2former_swinb=x",))

@@ -1,0 +1,141 @@
+"""Points known beforehand: how long they will take, and whose tags a shared run gets."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.spec.naming import VARIED
+from rgbt.tracking.provenance import code
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import COLOUR, Point, colour, varied_keys
+from sweeps.worker import point_list
+from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.point_list import (
+    Outcome,
+    PointList,
+    estimated_seconds,
+    other_code_line,
+    preview_points,
+)
+from sweeps.worker.run_store import RunResult, RunStore
+from tests.sweeps.fakes import counts, finish, plan_of, settings
+
+
+def made(folder: Path, seconds: float) -> Outcome:
+    run = finish(folder)
+    (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
+    return Outcome(Point("p", ()), "finished", found=(RunResult(run.path.name, run.path),))
+
+
+def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
+    tmp_path: Path,
+) -> None:
+    known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
+    left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
+    assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
+    assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
+    assert estimated_seconds(left, 1) is None
+
+
+def test_the_time_of_what_is_trained_and_not_evaluated_is_not_counted(tmp_path: Path) -> None:
+    trained = replace(made(tmp_path / "a", 40), state="waiting")
+    failed = replace(made(tmp_path / "b", 20), state="failed")
+    waiting = Outcome(Point("q", ()), "waiting")
+    assert [each.is_trained for each in (trained, failed, waiting)] == [True, True, False]
+    assert not made(tmp_path / "c", 1).is_trained
+    assert estimated_seconds([trained, failed, waiting], 1) == 30.0
+    assert estimated_seconds([trained], 1) == 0.0
+
+
+def test_a_survey_tells_what_lacks_further_evaluations_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(point_list, "Planner", OneKey)
+    aligned = ExtraEvaluation(frames="aligned")
+    point = Point("a", ("x=1",), evaluations=(aligned,))
+    run = finish(tmp_path / plan_of(point).runs[0].key)
+    (outcome,) = preview_points(wanted(tmp_path, point), settings())
+    assert (outcome.state, outcome.is_trained, outcome.seconds) == ("waiting", True, 2.5)
+    (run.path / "evaluations").mkdir()
+    counts().save(run.path / aligned.path)
+    (outcome,) = preview_points(wanted(tmp_path, point), settings())
+    assert (outcome.state, outcome.is_trained) == ("finished", False)
+
+
+class OneKey:
+    """Plans every point as the same run."""
+
+    def __init__(self, base: object) -> None:
+        del base
+
+    def plan(self, point: Point) -> PlannedPoint:
+        if "wrong" in point.overrides:
+            raise InputError("wrong=1 is no key.")
+        return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
+
+
+def wanted(tmp_path: Path, *points: Point) -> PointList:
+    from rgbt.tracking.mlflow_store import NoTracking
+
+    return PointList("s", "s", "list", points, RunStore(tmp_path, NoTracking()))
+
+
+def test_points_that_are_one_run_share_their_tags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(point_list, "Planner", OneKey)
+    rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
+    prepared = point_list._PlannedPoints(wanted(tmp_path, *rows))
+    first, second = (plan.point.tags for plan in prepared.plans.values())
+    assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
+
+
+def test_what_varies_are_the_keys_that_not_all_points_share() -> None:
+    words = [("+e=a", f"+y={y}", f"seed={seed}") for y in (1, 2) for seed in (0, 1)]
+    points = [Point(str(index), each) for index, each in enumerate(words)]
+    assert varied_keys(points) == ["y", "seed"]
+    assert varied_keys(points[:1]) == varied_keys([]) == []
+
+
+def test_runs_of_a_grid_have_colours_that_can_be_told_apart() -> None:
+    colours = [colour("s", index) for index in range(20)]
+    assert all(re.fullmatch("#[0-9a-f]{6}", each) for each in colours)
+    assert len(set(colours)) == 20
+    channels = np.array([[int(each[n : n + 2], 16) for n in (1, 3, 5)] for each in colours[:9]])
+    apart = np.abs(channels[:, None] - channels[None]).sum(-1) + 999 * np.eye(9, dtype=int)
+    assert apart.min() > 40
+
+
+def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
+    found = []
+    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
+        run = finish(tmp_path / name)
+        run.add_provenance({"code": digest, "diff": ""})
+        found.append(RunResult(name, run.path))
+    outcomes = [Outcome(Point("p", ()), "finished", found=tuple(found[:2]))] * 2
+    assert other_code_line(outcomes[:0]) == ""
+    assert other_code_line([Outcome(Point("p", ()), "finished", found=(found[1],))]) == ""
+    outcomes.append(Outcome(Point("q", ()), "finished", found=(found[2],)))
+    assert other_code_line(outcomes) == (
+        "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
+    )
+
+
+def test_a_mistake_of_all_points_is_one_of_the_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(point_list, "Planner", OneKey)
+    wrong, good = Point("a", ("wrong",)), Point("b", ("x=1",))
+    with pytest.raises(InputError, match="wrong=1 is no key"):
+        preview_points(wanted(tmp_path, wrong, wrong), settings())
+    states = [
+        outcome.state for outcome in preview_points(wanted(tmp_path, wrong, good), settings())
+    ]
+    assert states == ["failed", "waiting"]
+    assert list(tmp_path.iterdir()) == []

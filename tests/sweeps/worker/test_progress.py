@@ -1,0 +1,139 @@
+"""What a person sees of a driver: lines in a log, a live view in a terminal."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from sweeps.worker import progress
+from sweeps.worker.progress import ProgressView, duration
+
+
+class Shown:
+    """Stands for a work."""
+
+    def __init__(
+        self,
+        label: str = "Ny/4 seed=1",
+        *,
+        score: float = math.nan,
+        share: float = 0.5,
+        seconds: float = 100.0,
+    ) -> None:
+        self.score = score
+        self.done_share = share
+        self.seconds = seconds
+        self.status = "training"
+        self.plan = type("Plan", (), {"point": type("Point", (), {"label": label})})
+
+
+def works(*shown: Shown) -> Any:
+    return list(shown)
+
+
+@pytest.fixture
+def console(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], io.StringIO]:
+    def make(is_terminal: bool) -> io.StringIO:
+        text = io.StringIO()
+        made = Console(file=text, force_terminal=is_terminal, width=160, color_system=None)
+        monkeypatch.setattr(progress, "CONSOLE", made)
+        return text
+
+    return make
+
+
+Make = Callable[[bool], io.StringIO]
+
+
+def test_in_a_log_every_begin_and_end_is_a_line(console: Make) -> None:
+    text = console(False)
+    view = ProgressView("table", 3, 1, lambda: 0)
+    with view:
+        one: Any = Shown(score=0.4567)
+        view.began(one)
+        view.update([one])
+        view.ended(one, "finished", "")
+        view.ended(one, "failed", "ValueError: [red]not a colour[/red] [1,2]")
+        view.refused("p", "x does not fit.")
+    lines = [line[9:] for line in text.getvalue().splitlines()]
+    assert lines == [
+        "begins   Ny/4 seed=1",
+        "finished Ny/4 seed=1  100 s  val mIoU 45.67",
+        "failed   Ny/4 seed=1  100 s  val mIoU 45.67: ValueError: [red]not a colour[/red] [1,2]",
+        "failed   p: x does not fit.",
+    ]
+
+
+def test_in_a_terminal_the_workers_are_drawn_and_only_trouble_stays(console: Make) -> None:
+    text = console(True)
+    view = ProgressView("table", 4, 2, lambda: 1)
+    with view:
+        one: Any = Shown(score=0.5)
+        view.began(one)
+        view.update(works(one))
+        drawn = view._live.get_renderable()  # type: ignore[union-attr]
+        probe = Console(file=io.StringIO(), width=160)
+        probe.print(drawn)
+        seen = probe.file.getvalue()  # type: ignore[attr-defined]
+        assert "table: 1 of 4 done, 1 running, about" in seen
+        assert "Ny/4 seed=1" in seen
+        assert "50 %" in seen
+        assert "training" in seen
+        assert "val mIoU 50.00" in seen
+        view.ended(one, "finished", "")
+        view.ended(one, "failed", "a bad day")
+        view.ended(one, "pruned", "pruned at step 2")
+        headline = view._headline([])
+        assert headline.startswith("table: 4 of 4 done, 1 failed, 1 pruned, 0 running")
+    assert "a bad day" in text.getvalue()
+    assert "finished Ny/4" not in text.getvalue()
+
+
+def test_the_time_left_follows_from_what_was_finished_by_all_workers(console: Make) -> None:
+    console(False)
+    view = ProgressView("table", 10, 2, lambda: 0)
+    assert view._left([]) == ""
+    # None is finished: one half took 100 s, so each takes 200 s; 9 wait and a half is left.
+    assert view._left(works(Shown())) == f", about {duration(9.5 * 200 / 2)} left"
+    for seconds in (10.0, 20.0, 60.0, 1.0):  # the last one was known already
+        view.ended(works(Shown(seconds=seconds))[0], "finished", "")
+    assert view._left(works(Shown())) == f", about {duration(5.5 * 20 / 2)} left"
+    assert ProgressView("search", None, 2, lambda: 0)._left(works(Shown())) == ""
+
+
+def test_what_other_drivers_finished_is_counted_now_and_then(
+    console: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    console(True)
+    done = [1]
+    with ProgressView("table", 10, 2, lambda: done[0]) as view:
+        done[0] = 7
+        assert view._headline([]).startswith("table: 1 of 10")
+        later = progress.time.monotonic() + 60
+        monkeypatch.setattr(progress.time, "monotonic", lambda: later)
+        view.update([])
+        assert view._headline([]).startswith("table: 7 of 10")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "0 s"), (89.4, "89 s"), (90, "2 min"), (3600, "60 min"), (5400, "1 h 30 min"),
+     (12060, "3 h 21 min")],
+)  # fmt: skip
+def test_durations_are_read_by_people(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize("label", ["fresh=[decoder]", "files=[/data/a]"])
+def test_a_label_with_brackets_is_shown_as_it_is(console: Make, label: str) -> None:
+    console(True)
+    with ProgressView("table", 4, 2, lambda: 1) as view:
+        view.update(works(Shown(label)))
+        probe = Console(file=io.StringIO(), width=160)
+        probe.print(view._live.get_renderable())  # type: ignore[union-attr]
+        assert label in probe.file.getvalue()  # type: ignore[attr-defined]

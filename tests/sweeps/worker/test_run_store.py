@@ -1,0 +1,286 @@
+"""Finished runs: their scores and files, here and in MLflow, and tags that are added to them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rgbt.checks import InputError, RunError
+from rgbt.metrics import names, scores
+from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.mlflow_fill import read_sent
+from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.percent import in_percent
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.worker.run_store import FETCHED, RunResult, RunStore, open_run_store
+from tests.sweeps.fakes import DATASET, counts, finish
+
+DEAD_STORE = "http://127.0.0.1:9"
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> RunStore:
+    return RunStore(tmp_path, NoTracking())
+
+
+def test_a_finished_run_is_found_and_an_unfinished_one_is_not(runs: RunStore) -> None:
+    finish(runs.runs_dir / "a")
+    RunFolder(runs.runs_dir / "b").append(1, "val", {"mIoU": 0.5})
+    found = runs.find("a", DATASET)
+    assert found is not None
+    assert (found.key, found.folder, found.run_id) == ("a", runs.runs_dir / "a", "")
+    assert found.result["test"] == {"mIoU": 0.25, "Var": 9.0}
+    assert runs.find("b", DATASET) is None
+    assert runs.find("c", DATASET) is None
+    assert not (runs.runs_dir / "c").exists()
+    assert not (runs.runs_dir / FETCHED).exists()
+
+
+def test_a_run_on_other_files_of_the_data_set_is_told(runs: RunStore) -> None:
+    finish(runs.runs_dir / "a", dataset="another-fingerprint")
+    with pytest.raises(RunError, match=r"a was made on other files .*another-, now fingerpr"):
+        runs.find("a", DATASET)
+
+
+def test_scores_are_in_percent_but_for_the_variance_and_without_what_is_missing(
+    tmp_path: Path,
+) -> None:
+    val = {"mIoU": 0.512345678, "Var": 9.25, "day/mIoU": 0.5, "day/Var": 4.0, "class/car": None}
+    finish(tmp_path / "a", val=val, test={"region/1": 0.1, "class/car": 0.25, "mAcc": 1.0})
+    assert RunResult("a", tmp_path / "a").scores() == pytest.approx(
+        {
+            "val/mIoU": 51.2345678,
+            "val/Var": 9.25,
+            "val/day/mIoU": 50.0,
+            "val/day/Var": 4.0,
+            "test/region/1": 10.0,
+            "test/class/car": 25.0,
+            "test/mAcc": 100.0,
+        },
+        abs=1e-12,
+    )
+
+
+def test_every_score_of_a_run_but_the_variances_becomes_percent() -> None:
+    for name in scores.summary(counts(), "released"):
+        factor = 1 if name.split("/")[-1] == names.VAR else 100
+        assert in_percent(name, 0.123456) == pytest.approx(factor * 0.123456)
+
+
+def test_counts_of_a_run_and_of_its_further_evaluations_have_files_of_their_own(
+    tmp_path: Path,
+) -> None:
+    finish(tmp_path)
+    found = RunResult("a", tmp_path)
+    assert found.counts().counts[0, 0, 0, 0] == 3
+    ring = ExtraEvaluation("thermal", "ring9")
+    assert found.counts_file(ring) == tmp_path / "evaluations" / "table_thermal_ring9.npz"
+    assert found.counts_file(ExtraEvaluation()).name == "table_default_as-trained.npz"
+    with pytest.raises(InputError, match="no file of counts"):
+        found.counts(ring)
+    ring_file = found.counts_file(ring)
+    ring_file.parent.mkdir()
+    counts(right=7).save(ring_file)
+    assert found.counts(ring).counts[0, 0, 0, 0] == 7
+
+
+def test_the_commit_is_that_of_the_first_process_with_a_mark_for_changes(tmp_path: Path) -> None:
+    run = finish(tmp_path)
+    found = RunResult("a", tmp_path)
+    assert found.commit is None
+    run.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": False})
+    assert found.commit == "0123456789"
+    run.add_provenance({"git_commit": "f" * 16, "git_dirty": True})
+    assert found.commit == "0123456789"
+    (tmp_path / "provenance.json").write_text(
+        json.dumps([{"git_commit": "0123456789abcdef", "git_dirty": True}])
+    )
+    assert found.commit == "0123456789+"
+    (tmp_path / "provenance.json").write_text(json.dumps([{"git_commit": None}]))
+    assert found.commit is None
+
+
+def tags_of(folder: Path) -> dict[str, str]:
+    return dict(json.loads((folder / "run.json").read_text())["tags"])
+
+
+def test_tags_are_added_to_those_that_a_run_has(runs: RunStore) -> None:
+    finish(runs.runs_dir / "a", tags={"rgbt.table/one": "row"})
+    found = RunResult("a", runs.runs_dir / "a")
+    runs.tag(found, {"rgbt.table/two": "other row"})
+    assert tags_of(found.folder) == {
+        "rgbt.key": "a",
+        "rgbt.table/one": "row",
+        "rgbt.table/two": "other row",
+    }
+    before = (found.folder / "run.json").stat().st_mtime_ns
+    runs.tag(found, {"rgbt.table/two": "other row"})
+    assert (found.folder / "run.json").stat().st_mtime_ns == before, "nothing new, nothing written"
+
+
+def test_a_stopped_run_says_why(runs: RunStore) -> None:
+    finish(runs.runs_dir / "a")
+    (runs.runs_dir / "a" / "result.json").unlink()
+    runs.stopped("a", "pruned at step 2")
+    assert tags_of(runs.runs_dir / "a")["rgbt.stopped"] == "pruned at step 2"
+    runs.stopped("nothing began", "pruned at step 2")
+    assert not (runs.runs_dir / "nothing began").exists()
+
+
+def test_a_run_that_finished_while_it_was_stopped_is_not_shown_as_stopped(runs: RunStore) -> None:
+    finish(runs.runs_dir / "a")
+    runs.stopped("a", "pruned at step 2")
+    assert "rgbt.stopped" not in tags_of(runs.runs_dir / "a")
+
+
+def test_a_store_that_is_away_is_told_once_and_runs_here_are_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def away(self: MlflowTracking) -> Any:
+        asked.append(self.uri)
+        raise ConnectionError("no route to\nthe host")
+
+    monkeypatch.setattr(MlflowTracking, "store", away)
+    tracking = MlflowTracking(
+        DEAD_STORE, artifact_uri=None, experiment="rgbt", runs_dir=str(tmp_path)
+    )
+    runs = RunStore(tmp_path, tracking)
+    runs.touch()
+    finish(tmp_path / "a")
+    assert runs.find("b", DATASET) is None
+    found = runs.find("a", DATASET)
+    assert found is not None
+    runs.tag(found, {"rgbt.table/one": "row"})
+    runs.send(found)
+    assert tags_of(found.folder)["rgbt.table/one"] == "row", "kept for a later sync"
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith("rgbt: MLflow cannot be used (no route to);")
+    assert "rgbt.tracking.sync" in told[0]
+    assert asked == [DEAD_STORE], "asked once, then left alone"
+
+
+def test_runs_are_opened_where_a_configuration_says(tmp_path: Path) -> None:
+    from omegaconf import OmegaConf
+
+    node = {"_target_": "rgbt.tracking.mlflow_store.NoTracking"}
+    config: Any = OmegaConf.create(
+        {"runs_dir": f"{tmp_path}/x/../runs", "tracking": node, "fresh": True}
+    )
+    runs = open_run_store(config)
+    assert runs.runs_dir == tmp_path.resolve() / "runs"
+    assert isinstance(runs.tracking, NoTracking)
+    assert runs.fresh
+
+
+class Machines:
+    """Two folders of runs that share one MLflow store."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.uri = f"sqlite:///{root / 'mlflow.db'}"
+
+    def runs(self, name: str) -> RunStore:
+        folder = self.root / name
+        folder.mkdir(exist_ok=True)
+        place = (self.root / "artifacts").as_uri()
+        tracking = MlflowTracking(
+            self.uri, artifact_uri=place, experiment="rgbt", runs_dir=str(folder)
+        )
+        return RunStore(folder, tracking)
+
+    def send(self, key: str) -> RunFolder:
+        """A run finished at the first machine, and sent."""
+        there = self.runs("there")
+        run = finish(there.runs_dir / key, tags={"rgbt.table/one": "row"})
+        run.add_provenance({"git_commit": "0123456789abcdef"})
+        there.send(RunResult(key, run.path))
+        return run
+
+    def tags(self, run: RunFolder) -> dict[str, str]:
+        sent = read_sent(run)
+        assert sent is not None
+        client = self.runs("there").tracking.store().client  # type: ignore[attr-defined]
+        return dict(client.get_run(sent.run_id).data.tags)
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Machines:
+    return Machines(tmp_path_factory.mktemp("machines"))
+
+
+@pytest.mark.slow
+def test_a_run_made_elsewhere_is_found_in_mlflow_with_its_files(machines: Machines) -> None:
+    made = machines.send("a")
+    here = machines.runs("here")
+    found = here.find("a", DATASET)
+    assert found is not None
+    assert found.folder == here.runs_dir / FETCHED / "a"
+    assert found.run_id
+    assert found.result == made.result()
+    assert found.counts().counts.tolist() == counts().counts.tolist()
+    assert found.commit == "0123456789"
+    assert not (here.runs_dir / "a").exists(), "a run folder is for runs made here"
+    assert here.find("a", "another data set") is None
+    assert machines.runs("third").find("a", "another data set") is None
+
+    here.tag(found, {"rgbt.table/two": "other row"})
+    tags = machines.tags(made)
+    assert (tags["rgbt.table/one"], tags["rgbt.table/two"]) == ("row", "other row")
+
+    # What was fetched is kept: no store is needed any more.
+    away = RunStore(here.runs_dir, NoTracking())
+    assert away.find("a", DATASET) == found
+
+
+@pytest.mark.slow
+def test_tags_added_to_a_run_here_arrive_in_mlflow_beside_the_old_ones(machines: Machines) -> None:
+    made = machines.send("b")
+    there = machines.runs("there")
+    there.tag(RunResult("b", made.path), {"rgbt.table/two": "other row"})
+    tags = machines.tags(made)
+    assert (tags["rgbt.table/one"], tags["rgbt.table/two"]) == ("row", "other row")
+    assert tags["rgbt.dataset"] == DATASET
+
+
+@pytest.mark.slow
+def test_unfinished_runs_and_half_fetched_ones_are_not_taken(machines: Machines) -> None:
+    made = machines.send("c")
+    here = machines.runs("here")
+    found = here.find("c", DATASET)
+    assert found is not None
+    shutil.rmtree(found.folder)
+    (found.folder).mkdir()
+    (found.folder / "result.json").write_text("{}")  # a copy that was interrupted
+    again = here.find("c", DATASET)
+    assert again is not None
+    assert again.result == made.result()
+
+    there = machines.runs("there")
+    begun = finish(there.runs_dir / "d")
+    (begun.path / "result.json").unlink()
+    there.stopped("d", "pruned at step 2")
+    assert here.find("d", DATASET) is None
+    assert machines.tags(begun)["rgbt.stopped"] == "pruned at step 2"
+
+
+@pytest.mark.slow
+def test_evaluations_made_elsewhere_later_are_fetched(machines: Machines) -> None:
+    made = machines.send("e")
+    here, there = machines.runs("here"), machines.runs("there")
+    assert here.find("e", DATASET) is not None
+    ring = ExtraEvaluation("thermal", "ring9")
+    file = RunResult("e", made.path).counts_file(ring)
+    file.parent.mkdir()
+    counts(right=7).save(file)
+    there.send(RunResult("e", made.path))
+    found = here.find("e", DATASET)
+    assert found is not None
+    assert here.fetch_again(found, ring)
+    assert found.counts(ring).counts.tolist() == counts(right=7).counts.tolist()

@@ -1,0 +1,346 @@
+"""Trials of a study: who claims what, what counts, and what becomes of a dead driver's trials."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import optuna
+import pytest
+from optuna.distributions import IntDistribution
+
+from sweeps import attributes as names
+from sweeps.space.samplers import build_sampler
+from sweeps.worker.owner import STALE_S, Owner
+from sweeps.worker.storage import open_storage
+from sweeps.worker.trial_store import TrialClaim, TrialStore
+from tests.sweeps.fakes import DEAD, GONE, memory, silent, store_on
+
+
+@pytest.fixture
+def store() -> TrialStore:
+    return store_on(memory())
+
+
+def claim(store: TrialStore, key: str = "k", **more: Any) -> int | None:
+    return store.claim(TrialClaim(key, {names.LABEL: f"point {key}"}, **more))
+
+
+def trial(store: TrialStore, number: int) -> Any:
+    return store.study.get_trials(deepcopy=False)[number]
+
+
+def states(store: TrialStore) -> list[str]:
+    return [each.state.name for each in store.trials()]
+
+
+def searching(storage: Any, me: Owner | None = None) -> TrialStore:
+    """A ledger of a search; every driver has a study object and a sampler of its own."""
+    return store_on(storage, me, sampler=build_sampler("random", 0, {}, 1))
+
+
+def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
+    """Ask for a trial of one parameter, and note its point."""
+    asked = store.ask(total)
+    assert asked is not None
+    x = asked.suggest_float("x", 0, 1)
+    store.note(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
+    return asked.number, x
+
+
+def stale_trials(store: TrialStore, *mine: int) -> list[int]:
+    return [each.number for each in store.stale_trials(mine)]
+
+
+def test_a_claim_is_a_running_trial_with_all_that_is_known_of_the_point(store: TrialStore) -> None:
+    number = claim(store, params={"x": 3}, distributions={"x": IntDistribution(0, 9)})
+    assert number == 0
+    found = trial(store, 0)
+    assert found.state.name == "RUNNING"
+    assert found.params == {"x": 3}
+    assert found.user_attrs[names.KEY] == "k"
+    assert found.user_attrs[names.LABEL] == "point k"
+    assert found.user_attrs[names.OWNER] == str(Owner.me())
+    assert abs(found.user_attrs[names.HEARTBEAT] - time.time()) < 60
+
+
+def test_a_point_that_runs_is_not_claimed_again_and_the_attempt_does_not_count(
+    store: TrialStore,
+) -> None:
+    assert claim(store) == 0
+    assert claim(store) is None
+    assert claim(store, "other") == 2
+    assert [each.number for each in store.trials()] == [0, 2]
+    assert "trial 0" in trial(store, 1).user_attrs[names.REASON]
+
+
+@pytest.mark.parametrize("how", ["complete", "prune"])
+def test_a_point_that_is_done_is_not_claimed_again_unless_that_is_past(
+    store: TrialStore, how: str
+) -> None:
+    claim(store)
+    if how == "complete":
+        store.complete(0, [1.0], {})
+    else:
+        store.prune(0, "hopeless", {})
+    assert claim(store) is None
+    assert claim(store, past=[0]) == 2
+
+
+def test_a_failed_trial_does_not_keep_its_point(store: TrialStore) -> None:
+    claim(store)
+    store.fail(0, "a bad day", {names.SECONDS: 3})
+    assert claim(store) == 1
+    assert trial(store, 0).user_attrs[names.REASON] == "a bad day"
+    assert trial(store, 0).user_attrs[names.SECONDS] == 3
+
+
+def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
+    where = {"journal": str(tmp_path / "s.journal"), "sqlite": f"sqlite:///{tmp_path / 's.db'}"}
+    return lambda: open_storage(where[kind], tmp_path)
+
+
+@pytest.mark.parametrize(("kind", "keys"), [("journal", "abcdefgh"), ("sqlite", "abc")])
+def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
+    tmp_path: Path, kind: str, keys: str
+) -> None:
+    opened = opener(tmp_path, kind)
+    ledgers = [store_on(opened()) for _ in range(2)]
+    got: list[list[str]] = [[], []]
+    at_once = threading.Barrier(2)
+
+    def work(index: int) -> None:
+        for key in keys:
+            at_once.wait()
+            if claim(ledgers[index], key) is not None:
+                got[index].append(key)
+
+    threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(got[0] + got[1]) == list(keys)
+    assert states(ledgers[0]) == ["RUNNING"] * len(keys)
+
+
+@pytest.mark.parametrize(("kind", "total"), [("journal", 20), ("sqlite", 7)])
+def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
+    tmp_path: Path, kind: str, total: int
+) -> None:
+    opened = opener(tmp_path, kind)
+    ledgers = [searching(opened()) for _ in range(3)]
+    drawn: list[float] = []
+
+    def work(store: TrialStore) -> None:
+        while len(store.trials()) < total:
+            asked = store.ask(total)
+            if asked is not None:
+                drawn.append(asked.suggest_float("x", 0, 1))
+
+    threads = [threading.Thread(target=work, args=(store,)) for store in ledgers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert states(ledgers[0]) == ["RUNNING"] * total, "none was told: running ones count"
+    assert len(set(drawn)) == len(drawn) == total
+
+
+def test_running_trials_of_other_drivers_count_in_the_total() -> None:
+    storage = memory()
+    mine, theirs = searching(storage), searching(storage, DEAD)
+    taken(theirs)
+    taken(mine)
+    assert mine.ask(2) is None
+    assert theirs.ask(2) is None
+    assert len(mine.study.trials) == 2, "none was made to be dropped"
+    assert mine.ask(3) is not None
+
+
+def test_of_two_that_ask_for_the_last_trial_the_earlier_number_keeps_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    storage = memory()
+    mine, theirs = searching(storage), searching(storage, DEAD)
+    ask = mine.study.ask
+
+    def both_saw_room() -> Any:
+        theirs.ask(1)
+        return ask()
+
+    monkeypatch.setattr(mine.study, "ask", both_saw_room)
+    assert mine.ask(1) is None
+    assert [each.number for each in mine.trials()] == [0]
+
+
+def test_the_last_sign_of_a_driver_is_renewed() -> None:
+    storage = memory()
+    store = store_on(storage, DEAD)
+    claim(store)
+    silent(storage, 0)
+    store.beat([0])
+    assert stale_trials(store_on(storage)) == []
+
+
+def test_a_sign_for_a_trial_that_another_driver_finished_does_no_harm(store: TrialStore) -> None:
+    claim(store)
+    store.complete(0, [1.0], {})
+    store.beat([0])
+    store.fail(0, "too late", {})
+    store.complete(0, [2.0], {})
+    assert trial(store, 0).state.name == "COMPLETE"
+    assert trial(store, 0).values == [1.0]
+    assert names.REASON not in trial(store, 0).user_attrs
+
+
+def test_what_the_storage_refuses_of_an_unfinished_trial_is_not_hidden(store: TrialStore) -> None:
+    claim(store)
+    with pytest.raises(ValueError, match="did not match the number of the objectives"):
+        store.complete(0, [1.0, 2.0], {})
+
+
+@pytest.mark.parametrize(
+    ("owner", "seconds", "is_gone"),
+    [
+        (GONE, 0.0, True),
+        (DEAD, STALE_S / 2, False),
+        (DEAD, 2 * STALE_S, True),
+    ],
+    ids=["a process that ended", "another host, heard of", "another host, silent"],
+)
+def test_trials_of_a_driver_that_is_gone_are_orphans(
+    owner: Owner, seconds: float, is_gone: bool
+) -> None:
+    storage = memory()
+    claim(store_on(storage, owner))
+    silent(storage, 0, seconds)
+    assert stale_trials(store_on(storage)) == ([0] if is_gone else [])
+
+
+def test_a_trial_of_its_own_that_a_driver_does_not_work_on_is_an_orphan(store: TrialStore) -> None:
+    claim(store, "a")
+    claim(store, "b")
+    assert stale_trials(store, 0, 1) == []
+    assert stale_trials(store, 1) == [0]
+
+
+def test_finished_and_dropped_trials_are_no_orphans() -> None:
+    storage = memory()
+    gone = store_on(storage, GONE)
+    for key in "abcd":
+        claim(gone, key)
+    gone.complete(0, [1.0], {})
+    gone.fail(1, "a bad day", {})
+    gone.drop(2, "not needed")
+    assert stale_trials(store_on(storage)) == [3]
+
+
+def test_a_search_trial_asked_for_a_moment_ago_is_no_orphan_though_nobody_signed_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    store = searching(memory())
+    store.study.ask()
+    assert stale_trials(store) == []
+    later = time.time() + 2 * STALE_S
+    monkeypatch.setattr(time, "time", lambda: later)
+    assert stale_trials(store) == [0]
+
+
+def test_a_released_point_of_a_list_can_be_claimed_again(store: TrialStore) -> None:
+    claim(store)
+    store.release(0, "its driver was gone", again=False)
+    assert store.trials() == []
+    assert claim(store) == 1
+
+
+def test_a_released_search_trial_comes_back_with_its_parameters() -> None:
+    storage = memory()
+    number, x = taken(searching(storage, GONE), 1)
+    mine = searching(storage)
+    mine.release(number, "its driver was gone", again=True)
+    assert states(mine) == ["WAITING"]
+    again = mine.ask(1)
+    assert again is not None
+    assert again.suggest_float("x", 0, 1) == x
+    assert again.user_attrs[names.KEY] == f"x={x}"
+    assert states(mine) == ["RUNNING"]
+    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.me())
+
+
+def test_a_search_trial_without_a_point_yet_is_dropped_and_another_one_asked_for() -> None:
+    storage = memory()
+    gone = searching(storage, GONE)
+    gone.ask(1)
+    mine = searching(storage)
+    mine.release(0, "its driver was gone", again=True)
+    assert states(mine) == []
+    assert mine.ask(1) is not None
+
+
+def test_two_drivers_that_release_an_orphan_one_after_the_other_queue_it_once() -> None:
+    storage = memory()
+    number, _ = taken(searching(storage, GONE))
+    a, b = searching(storage), searching(storage)
+    a.release(number, "gone", again=True)
+    b.release(number, "gone", again=True)
+    assert states(a) == ["WAITING"]
+
+
+def test_a_crash_between_queueing_an_orphan_and_dropping_it_queues_it_once() -> None:
+    storage = memory()
+    number, x = taken(searching(storage, GONE))
+    a, b = searching(storage), searching(storage)
+    a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
+    assert stale_trials(b) == [number]
+    b.release(number, "gone", again=True)
+    assert states(b) == ["WAITING"]
+
+
+@pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
+def test_an_orphan_that_another_driver_released_and_took_up_is_not_queued_again(
+    finished: bool,
+) -> None:
+    storage = memory()
+    number, _ = taken(searching(storage, GONE))
+    a, b = searching(storage), searching(storage)
+    (seen,) = stale_trials(b)
+    a.release(number, "gone", again=True)
+    again = a.ask(1)
+    assert again is not None
+    if finished:
+        a.complete(again.number, [1.0], {})
+    b.release(seen, "gone", again=True)
+    assert states(b) == ["COMPLETE" if finished else "RUNNING"]
+
+
+def test_giving_back_a_trial_that_another_driver_has_finished_changes_nothing() -> None:
+    storage = memory()
+    mine, other = searching(storage, DEAD), searching(storage)
+    number, _ = taken(mine)
+    other.complete(number, [1.0], {})
+    mine.release(number, "its driver was stopped", again=True)
+    assert states(mine) == ["COMPLETE"]
+
+
+def test_trials_are_found_by_the_key_of_their_point_earlier_ones_first(store: TrialStore) -> None:
+    claim(store, "a")
+    store.fail(0, "a bad day", {})
+    claim(store, "b")
+    claim(store, "a")
+    found = {key: [each.number for each in trials] for key, trials in store.by_key().items()}
+    assert found == {"a": [0, 2], "b": [1]}
+
+
+def test_a_trial_pruned_at_its_last_report_keeps_that_value() -> None:
+    store = searching(memory())
+    asked = store.ask(None)
+    assert isinstance(asked, optuna.Trial)
+    asked.report(40.0, 2)
+    store.prune(asked.number, "pruned at step 2", {})
+    found = trial(store, 0)
+    assert (found.state.name, found.value) == ("PRUNED", 40.0)
+    assert found.user_attrs[names.REASON] == "pruned at step 2"
