@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.figures import method_figures, paper_figures
 from analysis.figures.figure_spec import FigureSpec
-from analysis.figures.inputs import Given
+from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError, check_choice, nearest
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def make(
         raise InputError(
             f"'{idle[0]}' has no effect on figure={figure}; {nearest(idle[0], known)}."
         )
-    given = Given(figure, values, tuple(overrides), entry.metric)
+    given = FigureInput(figure, values, tuple(overrides), entry.metric)
     if not given.has_dataset:
         given.refuse([key for key in words if key.startswith("dataset.")], "dataset=...")
     return entry.make(given), {} if entry.numbers is None else entry.numbers(given)

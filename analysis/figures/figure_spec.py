@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from analysis.figures.inputs import Given
+from analysis.figures.inputs import FigureInput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,10 +39,10 @@ class FigureSpec:
     needs: str
     keys: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
-    make: Callable[[Given], Figure]
+    make: Callable[[FigureInput], Figure]
     metric: str = "ring5"
     idle: tuple[str, ...] = ("metric.absent",)
-    numbers: Callable[[Given], Mapping[str, str]] | None = None
+    numbers: Callable[[FigureInput], Mapping[str, str]] | None = None
 
 
 def figure(name: str, shows: str, needs: str, **others: Any) -> Callable[..., FigureSpec]:

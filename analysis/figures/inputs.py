@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Given:
+class FigureInput:
     """The arguments of one figure.
 
     Attributes:
@@ -216,10 +216,10 @@ class Given:
         return stored
 
     def _measured(self) -> SpatialStatistics:
-        from analysis.statistics.collect import Settings, collect
+        from analysis.statistics.collect import MeasurementSettings, collect
 
         split = self.get("split", "train")
-        settings = Settings(regions=self.regions)
+        settings = MeasurementSettings(regions=self.regions)
         with progress("measuring", len(self.dataset.names(split))) as advance:
             return collect(self.dataset, split, settings, advance)
 

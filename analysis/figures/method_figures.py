@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.bar import progress
 from analysis.figures.figure_spec import OF_RUNS, RUNS, figure
-from analysis.figures.inputs import Given
+from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError, split_list
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ LONGEST = 8
 """Times that one side of ``size=`` may be the other."""
 
 
-def robustness_numbers(given: Given) -> dict[str, str]:
+def robustness_numbers(given: FigureInput) -> dict[str, str]:
     """The numbers of both."""
     from analysis.figures.robustness import numbers
 
@@ -44,7 +44,7 @@ def robustness_numbers(given: Given) -> dict[str, str]:
     keys=OF_FAILING,
     numbers=robustness_numbers,
 )
-def robustness(given: Given) -> Figure:
+def robustness(given: FigureInput) -> Figure:
     """MIoU as images fail."""
     from analysis.figures.robustness import draw
 
@@ -58,14 +58,14 @@ def robustness(given: Given) -> Figure:
     keys=OF_FAILING,
     numbers=robustness_numbers,
 )
-def robustness_relative(given: Given) -> Figure:
+def robustness_relative(given: FigureInput) -> Figure:
     """The same in percent of the clean mIoU."""
     from analysis.figures.robustness import draw
 
     return draw(_failing(given), relative=True)
 
 
-def _failing(given: Given) -> tuple[Panel, ...]:
+def _failing(given: FigureInput) -> tuple[Panel, ...]:
     from analysis.figures.robustness import panels
     from analysis.robustness import Training, trainings
 
@@ -88,7 +88,7 @@ def _failing(given: Given) -> tuple[Panel, ...]:
     RUNS,
     keys=(*OF_RUNS, "size"),
 )
-def region_heat(given: Given) -> Figure:
+def region_heat(given: FigureInput) -> Figure:
     """Regions painted by their mIoU."""
     from analysis.figures import profiles, regions
 
@@ -118,14 +118,14 @@ def _image_hw(size: str) -> tuple[int, int]:
     RUNS,
     keys=(*OF_RUNS, "band", "resamples", "level", "blocks"),
 )
-def region_profile(given: Given) -> Figure:
+def region_profile(given: FigureInput) -> Figure:
     """MIoU over the regions with bands."""
     from analysis.figures.profiles import draw_profiles
 
     return draw_profiles(_profiles(given))
 
 
-def _profiles(given: Given) -> list[Profile]:
+def _profiles(given: FigureInput) -> list[Profile]:
     from analysis.figures.profiles import BANDS, profile
     from analysis.uncertainty import Resampling
 

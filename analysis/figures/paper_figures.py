@@ -15,7 +15,7 @@ from analysis.figures.figure_spec import (
     STATISTICS,
     figure,
 )
-from analysis.figures.inputs import Given, check_one_dataset
+from analysis.figures.inputs import FigureInput, check_one_dataset
 from analysis.figures.qualitative import qualitative
 from rgbt.checks import InputError
 
@@ -34,7 +34,7 @@ STRIPS_AND_RINGS = ("vertical", "horizontal", "ring")
     groups=DATASET_AND_METRIC,
     idle=(),
 )
-def spatialseg_fig1(given: Given) -> Figure:
+def spatialseg_fig1(given: FigureInput) -> Figure:
     """Heat maps of IoU and of sample occupancy."""
     from analysis.figures import maps
 
@@ -68,7 +68,7 @@ def spatialseg_fig1(given: Given) -> Figure:
     keys=("methods", "regions", "absent", *SPATIAL),
     groups=("dataset",),
 )
-def spatialseg_fig2(given: Given) -> Figure:
+def spatialseg_fig2(given: FigureInput) -> Figure:
     """IoU, accuracy and occupancy over three partitions."""
     from analysis.figures import trends
     from analysis.figures.maps import occupancy_over
@@ -99,7 +99,7 @@ def spatialseg_fig2(given: Given) -> Figure:
     groups=DATASET_AND_METRIC,
     metric="ring9",
 )
-def spatialseg_fig3(given: Given) -> Figure:
+def spatialseg_fig3(given: FigureInput) -> Figure:
     """Occupancy of each class, and mIoU, by region."""
     from analysis.figures import classes
 
@@ -126,7 +126,7 @@ def spatialseg_fig3(given: Given) -> Figure:
     groups=DATASET_AND_METRIC,
     metric="ring9",
 )
-def spatialseg_fig4(given: Given) -> Figure:
+def spatialseg_fig4(given: FigureInput) -> Figure:
     """A partition over a heat map or an image."""
     from analysis.figures import maps
     from analysis.predictions.maps import iou_map
@@ -164,13 +164,15 @@ def spatialseg_fig4(given: Given) -> Figure:
     groups=DATASET_AND_METRIC,
     metric="ring9",
 )
-def spatialseg_fig5(given: Given) -> Figure:
+def spatialseg_fig5(given: FigureInput) -> Figure:
     """Laplacian variance by region."""
     from analysis.figures import image_quality
-    from analysis.statistics.resampling import Blocks
+    from analysis.statistics.resampling import ConsecutiveBlocks
 
     statistics = given.statistics(by_region=True)
-    return image_quality.draw(image_quality.laplacian_series(statistics, Blocks(statistics)))
+    return image_quality.draw(
+        image_quality.laplacian_series(statistics, ConsecutiveBlocks(statistics))
+    )
 
 
 @figure(
@@ -181,16 +183,16 @@ def spatialseg_fig5(given: Given) -> Figure:
     groups=DATASET_AND_METRIC,
     metric="ring9",
 )
-def spatialseg_fig6(given: Given) -> Figure:
+def spatialseg_fig6(given: FigureInput) -> Figure:
     """Signal-to-noise ratio by region."""
     from analysis.figures import image_quality
     from analysis.statistics.derive import AVERAGES
     from analysis.statistics.measure import ESTIMATORS
-    from analysis.statistics.resampling import Blocks
+    from analysis.statistics.resampling import ConsecutiveBlocks
 
     estimator, average = given.get("estimator", ESTIMATORS[0]), given.get("average", AVERAGES[0])
     statistics = given.statistics(by_region=True)
-    series = image_quality.snr_series(statistics, Blocks(statistics), estimator, average)
+    series = image_quality.snr_series(statistics, ConsecutiveBlocks(statistics), estimator, average)
     return image_quality.draw(series)
 
 
@@ -204,7 +206,7 @@ spatialseg_fig9 = qualitative("spatialseg/fig9", "qualitative results on another
     f"{RUNS}, with counts of pairs of frames (python -m rgbt.consistency)",
     keys=("frames", *OF_RUNS),
 )
-def temporal_fig5(given: Given) -> Figure:
+def temporal_fig5(given: FigureInput) -> Figure:
     """TC and CA by class."""
     from analysis.figures import consistency
 
@@ -227,7 +229,7 @@ crm_fig4 = qualitative("crm/fig4", "qualitative results")
     keys=("names", "split", "patches", "seed"),
     groups=("dataset",),
 )
-def crm_fig5(given: Given) -> Figure:
+def crm_fig5(given: FigureInput) -> Figure:
     """Masks on a pair of images."""
     from analysis.figures import masks
     from rgbt.config.command import built
@@ -245,7 +247,7 @@ def crm_fig5(given: Given) -> Figure:
     "gradients of entropy minimisation and maximum squares loss",
     "nothing: analytic",
 )
-def multihead_fig3(given: Given) -> Figure:
+def multihead_fig3(given: FigureInput) -> Figure:
     """Gradients of two losses."""
     from analysis.figures import gradients
 
@@ -253,7 +255,7 @@ def multihead_fig3(given: Given) -> Figure:
     return gradients.draw(gradients.gradient_curves())
 
 
-def _one_name(given: Given) -> str:
+def _one_name(given: FigureInput) -> str:
     names = given.names(1)
     if len(names) > 1:
         raise InputError(f"names: figure={given.figure} shows one image, got {len(names)}.")

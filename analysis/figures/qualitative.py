@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.bar import progress
 from analysis.figures.figure_spec import DATASET_AND_METRIC, FigureSpec
-from analysis.figures.inputs import Given
+from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from analysis.figures.panels import ReadPrediction
-    from analysis.predictions.images import Reader
+    from analysis.predictions.images import PredictionReader
 
 PREDICTIONS = "label:folder of predicted label images, with commas between methods"
 
@@ -31,10 +31,10 @@ def qualitative(name: str, shows: str) -> FigureSpec:
     )
 
 
-def draw_panel(given: Given) -> Figure:
+def draw_panel(given: FigureInput) -> Figure:
     """Images, ground truth and predictions."""
     from analysis.figures import panels
-    from analysis.predictions.images import Reader
+    from analysis.predictions.images import PredictionReader
     from rgbt.tracking.terminal import tell
 
     folders = {
@@ -44,7 +44,7 @@ def draw_panel(given: Given) -> Figure:
     layout = given.get("layout", panels.LAYOUTS[0])
     form: Any = given.get("format", "auto")
     dataset = given.dataset
-    reader = Reader(dataset.classes, dataset.palette, form)
+    reader = PredictionReader(dataset.classes, dataset.palette, form)
     rule = given.get("pick", panels.RULES[0])
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):
         raise InputError("names= says which images are shown; leave pick= and rows= out.")
@@ -61,12 +61,14 @@ def draw_panel(given: Given) -> Figure:
     return panels.draw(made, layout)
 
 
-def _most_different(given: Given, folders: dict[str, Path], form: Any) -> tuple[str, ...]:
+def _most_different(given: FigureInput, folders: dict[str, Path], form: Any) -> tuple[str, ...]:
     from analysis.figures.panels import image_mious, most_different
-    from analysis.predictions.scoring import Options, score_folder
+    from analysis.predictions.scoring import ScoringOptions, score_folder
 
     split = given.get("split", "test")
-    options = Options(partitions=("ring",), regions=1, form=form, suffix=given.get("suffix", ""))
+    options = ScoringOptions(
+        partitions=("ring",), regions=1, form=form, suffix=given.get("suffix", "")
+    )
     mious = {}
     with progress("comparing", len(folders) * len(given.dataset.names(split))) as advance:
         for label, folder in folders.items():
@@ -75,7 +77,7 @@ def _most_different(given: Given, folders: dict[str, Path], form: Any) -> tuple[
     return most_different(mious, given.dataset.names(split), given.get("rows", 4))
 
 
-def _reading(folder: Path, reader: Reader, suffix: str) -> ReadPrediction:
+def _reading(folder: Path, reader: PredictionReader, suffix: str) -> ReadPrediction:
     def read(name: str) -> Any:
         path = folder / f"{name}{suffix}.png"
         if not path.is_file():

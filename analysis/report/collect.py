@@ -25,7 +25,7 @@ TITLE = "RGB-thermal segmentation: runs and tables"
 
 
 @dataclass(frozen=True)
-class Asked:
+class ReportRequest:
     """What the page is made from.
 
     Attributes:
@@ -43,7 +43,7 @@ class Asked:
     trust: tuple[str, ...] = ()
 
 
-def collect(asked: Asked, track: Track) -> ReportData:
+def collect(asked: ReportRequest, track: Track) -> ReportData:
     """Read the store; what cannot be read becomes a remark.
 
     Args:

@@ -56,7 +56,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Pair:
+class PairedRuns:
     """Runs that differ by one choice and their seeds alone."""
 
     paper: tuple[ReportRun, ...]
@@ -95,7 +95,7 @@ def difference_entries(
     )
 
 
-def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[Pair]:
+def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
     """Runs that differ by `choice` alone, those with the most seeds first."""
     keys = {*choice.paper.values, *choice.released.values}
     groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
@@ -105,7 +105,7 @@ def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[Pair]:
             group = groups.setdefault(_rest(run, keys), ([], []))
             group[sides.index(True)].append(run)
     pairs = [
-        Pair(_by_seed(paper), _by_seed(released))
+        PairedRuns(_by_seed(paper), _by_seed(released))
         for paper, released in groups.values()
         if paper and released
     ]
@@ -140,7 +140,7 @@ def _by_seed(runs: Sequence[ReportRun]) -> tuple[ReportRun, ...]:
     return tuple(sorted(runs, key=lambda run: (run.entry.seed is None, run.entry.seed or 0)))
 
 
-def _entry(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> DifferenceEntry:
+def _entry(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> DifferenceEntry:
     runs = [run.entry.key for pair in pairs[:1] for run in (*pair.paper, *pair.released)]
     return DifferenceEntry(
         topic=choice.topic,
@@ -152,7 +152,7 @@ def _entry(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> Diffe
     )
 
 
-def _effect(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> str:
+def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> str:
     if choice.released.setting is None:
         return "Cannot be compared: one side alone can be run."
     if not pairs:
@@ -172,7 +172,7 @@ def _counts(runs: Sequence[ReportRun]) -> list[Any]:
     return [run.counts for run in runs]
 
 
-def sentence(pair: Pair, compared: Comparison) -> str:
+def sentence(pair: PairedRuns, compared: Comparison) -> str:
     """Released less paper in every score, with intervals and p-values."""
     counts = (len(pair.released), len(pair.paper))
     over = "images and seeds" if all(each.both for each in compared.differences) else "images"

@@ -21,7 +21,7 @@ OWN = ""
 
 
 @dataclass(frozen=True)
-class Source:
+class CountsSource:
     """Counts that scores are taken from.
 
     Attributes:
@@ -37,7 +37,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Found:
+class CellInterval:
     """An interval, and what it is over; without one, why there is none."""
 
     interval: Interval | None
@@ -56,10 +56,10 @@ class Intervals:
     """
 
     runs: Mapping[str, ReportRun]
-    asked: dict[Source, dict[str, None]] = field(default_factory=dict)
-    found: dict[tuple[Source, str], Found] = field(default_factory=dict)
+    asked: dict[CountsSource, dict[str, None]] = field(default_factory=dict)
+    found: dict[tuple[CountsSource, str], CellInterval] = field(default_factory=dict)
 
-    def ask(self, source: Source, metric: str) -> None:
+    def ask(self, source: CountsSource, metric: str) -> None:
         """Ask for the interval of a score."""
         self.asked.setdefault(source, {})[metric] = None
 
@@ -77,7 +77,7 @@ class Intervals:
                 counts = [self._counts(source.keys, path) for path in source.paths]
                 found = _resampled(counts, metrics, settings)
             except InputError as error:
-                found = dict.fromkeys(metrics, Found(None, "none", str(error)))
+                found = dict.fromkeys(metrics, CellInterval(None, "none", str(error)))
             self.found |= {(source, metric): each for metric, each in found.items()}
 
     def _counts(self, keys: Sequence[str], path: str) -> list[Counts]:
@@ -99,7 +99,7 @@ def counts_of(run: ReportRun, path: str) -> Counts:
 
 def _resampled(
     counts: Sequence[Sequence[Counts]], metrics: Sequence[str], settings: Resampling
-) -> dict[str, Found]:
+) -> dict[str, CellInterval]:
     """Intervals of scores, or of the difference of two evaluations of the same runs."""
     if len(counts) == 1:
         estimates = estimate(counts[0], metrics, settings)
@@ -115,9 +115,9 @@ def _resampled(
     }
 
 
-def _covering(images: Interval | None, both: Interval | None, said: str) -> Found:
+def _covering(images: Interval | None, both: Interval | None, said: str) -> CellInterval:
     if both is not None:
-        return Found(both, "images and seeds")
+        return CellInterval(both, "images and seeds")
     if images is not None:
-        return Found(images, "images")
-    return Found(None, "none", f"no interval: {said} are too few.")
+        return CellInterval(images, "images")
+    return CellInterval(None, "none", f"no interval: {said} are too few.")

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from analysis.report.runs import ReportRun
-from analysis.report.tables_files import NOTHING, Recorded
-from analysis.report.tables_intervals import OWN, Source, counts_of
+from analysis.report.tables_files import NO_CELL, RecordedTable
+from analysis.report.tables_intervals import OWN, CountsSource, counts_of
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -52,14 +52,16 @@ class _Outcome:
 
 
 @dataclass(frozen=True)
-class Draft:
+class RescoredTable:
     """A recorded table with its file, scored."""
 
-    recorded: Recorded
+    recorded: RecordedTable
     scored: ScoredTable
 
 
-def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun]) -> ScoredTable:
+def score_again(
+    recorded: RecordedTable, table: Table, runs: Mapping[str, ReportRun]
+) -> ScoredTable:
     """Means, ranks and orders from the counts of the runs that the record names.
 
     Args:
@@ -79,7 +81,7 @@ def score_again(recorded: Recorded, table: Table, runs: Mapping[str, ReportRun])
     return score(recorded.name, table, places, scale=recorded.scale, sizes=sizes)
 
 
-def _sizes(recorded: Recorded, table: Table) -> dict[Place, TableCell]:
+def _sizes(recorded: RecordedTable, table: Table) -> dict[Place, TableCell]:
     """Columns of parameters as recorded: a network is not known here."""
     names = {column.name for column in table.columns if column.parameters}
     labels = {row.label for row in table.rows}
@@ -107,10 +109,10 @@ def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     return _Outcome("finished", found=(_Opened(key, run.entry.commit or None, run),))
 
 
-def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | None:
+def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:
     """Source and metric of a cell's interval; None for cells without a value from counts."""
     table, place = draft.scored.table, (row.label, column.name)
-    cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NOTHING)
+    cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NO_CELL)
     if cell is None or not cell.seeds or cell.seeds < line.seeds:
         return None
     columns = _sides(table, column) if column.sources else [column]
@@ -121,14 +123,14 @@ def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | Non
     paths = tuple(OWN if each is None else each.path for each in asked)
     # Of the runs of the row those that the value is a mean of: all of them, see the check above.
     keys = cell.keys if cell.seeds == len(cell.keys) else ()
-    return (Source(keys, paths, table.absent), metrics.pop()) if keys else None
+    return (CountsSource(keys, paths, table.absent), metrics.pop()) if keys else None
 
 
 def values_of(
-    draft: Draft, row: Row, column: Column, runs: Mapping[str, ReportRun]
+    draft: RescoredTable, row: Row, column: Column, runs: Mapping[str, ReportRun]
 ) -> tuple[float | None, ...]:
     """The score of each run of a cell, in the order of its keys; None: it has none."""
-    keys = draft.recorded.lines.get((row.label, column.name), NOTHING).keys
+    keys = draft.recorded.lines.get((row.label, column.name), NO_CELL).keys
     if not is_of_runs(column):
         return ()
     return tuple(_value(draft.scored.table, row, column, runs.get(key)) for key in keys)
@@ -155,12 +157,12 @@ def _sides(table: Table, column: Column) -> list[Column]:
     return [each for name in column.sources for each in table.columns if each.name == name]
 
 
-def changed(draft: Draft) -> list[str]:
+def changed(draft: RescoredTable) -> list[str]:
     """A sentence where counts give other means than were recorded with the table."""
     apart = [
         (place, cell.mean, line.mean)
         for place, cell in draft.scored.cells.items()
-        if (line := draft.recorded.lines.get(place, NOTHING)).mean is not None
+        if (line := draft.recorded.lines.get(place, NO_CELL)).mean is not None
         and cell.seeds == line.seeds
         and not abs(cell.mean - line.mean) <= AGREES
     ]

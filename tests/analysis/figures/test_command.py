@@ -13,7 +13,7 @@ import pytest
 
 from analysis.figures.__main__ import OF_FIGURES, OWN, main
 from analysis.figures.catalogue import FIGURES
-from analysis.predictions.scoring import Options, score_folder
+from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.statistics.data import SpatialStatistics
 from rgbt.config.command import plain_command
 from rgbt.data.mfnet import MFNet
@@ -40,7 +40,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert label is not None
             wrong = (label + shift * (np.arange(96) < index)) % 9
             cv2.imwrite(str(folder / method / f"{name}.png"), wrong.astype(np.uint8))
-        scored = score_folder(folder / method, dataset, "test", Options(regions=5, threads=1))
+        scored = score_folder(
+            folder / method, dataset, "test", ScoringOptions(regions=5, threads=1)
+        )
         for each in scored.counts:
             each.save(folder / method / f"counts_{each.partition}.npz")
         assert scored.maps is not None

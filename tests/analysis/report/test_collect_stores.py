@@ -61,6 +61,6 @@ def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(collecting, entries, lambda *_: ())
     tracking = MlflowTracking("sqlite:///x", artifact_uri=None, experiment="r", runs_dir="x")
     data = collecting.collect(
-        collecting.Asked(tracking, tmp_path, 1, ""), lambda things, _: list(things)
+        collecting.ReportRequest(tracking, tmp_path, 1, ""), lambda things, _: list(things)
     )
     assert [run.run_id for run in data.runs] == ["new"]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from analysis.report import page, tables
-from analysis.report.collect import Asked, collect
+from analysis.report.collect import ReportRequest, collect
 from analysis.report.data import ReportData
 from analysis.report.store import MlflowRun
 from analysis.report.tables_files import CSV_FILE, HEADER
@@ -34,7 +34,7 @@ def collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReportData:
     record_search(tmp_path / "runs", tracking)
     # Reading all published tables takes a second.
     monkeypatch.setattr(tables, "table_names", list)
-    asked = Asked(tracking, tmp_path / "runs", 100, "python -m analysis.report")
+    asked = ReportRequest(tracking, tmp_path / "runs", 100, "python -m analysis.report")
     return collect(asked, quiet)
 
 
