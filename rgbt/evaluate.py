@@ -65,7 +65,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.corrupted import own_words
     from rgbt.tracking.terminal import result_view, show
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     if options.out is not None and options.out.is_dir():
         raise InputError(f"out={options.out} is a folder; name the file of the counts, x.npz.")
@@ -76,7 +76,7 @@ def main(options: Options, overrides: list[str]) -> int:
         overrides = [*overrides, f"metric={options.regions}"]
     run, runs_dir, checkpoint = options.run, options.runs_dir, options.checkpoint
     stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
-    announce_stored(stored)
+    announce_network(stored)
     session = stored.session
     view = view_of(session, options.modality)
     head = None if options.head == AS_TRAINED else options.head

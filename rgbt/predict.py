@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rgbt.build.load_run import Stored
+    from rgbt.build.load_run import TrainedNetwork
     from rgbt.build.session import Session
     from rgbt.data.domains import TestedHead
     from rgbt.data.label_map import LabelMap
@@ -86,7 +86,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.build.load_run import open_trained
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.pseudo_labels import label_map_of
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     if not options.pseudo_labels and options.threshold:
         raise InputError(
@@ -97,7 +97,7 @@ def main(options: Options, overrides: list[str]) -> int:
     run, runs_dir, checkpoint = options.run, options.runs_dir, options.checkpoint
     trust = parse_trust(options.trust)
     stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
-    announce_stored(stored)
+    announce_network(stored)
     if options.pseudo_labels:
         _pseudo_labels(options, stored, label_map)
     else:
@@ -105,7 +105,7 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def _pseudo_labels(options: Options, stored: Stored, label_map: LabelMap | None) -> None:
+def _pseudo_labels(options: Options, stored: TrainedNetwork, label_map: LabelMap | None) -> None:
     from rgbt.build.session import view_of
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show

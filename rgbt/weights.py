@@ -21,10 +21,10 @@ from rgbt.checkpoints.layout import Facts
 from rgbt.checkpoints.read import Contents
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
+from rgbt.config.component import build
 from rgbt.config.compose import compose, conf_dir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
-from rgbt.config.schema import build
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
 
 NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")

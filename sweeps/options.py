@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.command import composing
 from rgbt.config.common_options import RunsDir
+from rgbt.config.component import Component
 from rgbt.config.options import Help
-from rgbt.config.schema import check_node
 from rgbt.config.words import readable_paths
 from rgbt.metrics.names import MIOU
 
@@ -208,7 +208,7 @@ def runs_of(workspace: Workspace) -> RunStore:
 
     with composing(workspace.base):
         config = compose([*workspace.base, f"fresh={str(workspace.fresh).lower()}"])
-        check_node(config.tracking, "tracking")
+        Component.from_node(config.tracking)
     return open_run_store(config)
 
 

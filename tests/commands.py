@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,13 @@ SMALL = (
         "trainer.threads=1",
     ),
 )
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Of a command that takes none."""
+
+
 Call = Callable[..., tuple[int, str, str]]
 Trained = Callable[..., Path]
 

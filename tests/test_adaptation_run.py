@@ -18,12 +18,12 @@ import pytest
 import torch
 
 from rgbt.checkpoints.stored import save
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.schemes.adversarial import Adversarial
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from tests.commands import Call, assert_one_sentence
 from tests.conftest import write_png
 from tests.test_run import ADAPTATION, EXPERIMENTS
@@ -65,7 +65,7 @@ class Runs:
 
     def folder(self, experiment: str, *overrides: str) -> Path:
         """Of a run, whether it is there or not."""
-        return self.runs / run_key(compose(self.words(experiment, *overrides)))
+        return self.runs / specify(compose(self.words(experiment, *overrides))).key
 
     def told(self, experiment: str, *overrides: str) -> tuple[int, str, str]:
         from rgbt.run import main
@@ -97,11 +97,10 @@ def elsewhere(call: Call, place: Path, tmp_path: Path) -> Callable[[str], Runs]:
 def evaluated(call: Call, tmp_path: Path) -> Callable[..., Counts]:
     """Counts of `rgbt.evaluate` of a run folder."""
     from rgbt import evaluate
-    from rgbt.config.command import plain_command
 
     def evaluate_run(folder: Path, *words: str) -> Counts:
         out = tmp_path / "evaluated.npz"
-        entry = plain_command(evaluate.OWN, evaluate.main)
+        entry = evaluate.entry
         code, _, err = call(entry, f"run={folder}", f"out={out}", *words)
         assert code == 0, err
         return Counts.load(out)
@@ -270,7 +269,6 @@ def test_which_head_predicted_what_is_said(
     run: Runs, call: Call, tmp_path: Path, experiment: str, own: str | None
 ) -> None:
     from rgbt import evaluate
-    from rgbt.config.command import plain_command
 
     folder = run(experiment)
     expected = [] if own is None else [f"heads {own}"]
@@ -281,7 +279,7 @@ def test_which_head_predicted_what_is_said(
         asked |= {head: [f"heads {head} for all images"] for head in ("source", "target")}
     for head, line in asked.items():
         words = (f"run={folder}", f"head={head}", f"out={tmp_path / 'x.npz'}")
-        code, said, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
+        code, said, err = call(evaluate.entry, *words)
         assert code == 0, err
         assert heads_line(said) == line
 
@@ -290,14 +288,13 @@ def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
     run: Runs, call: Call, tmp_path: Path
 ) -> None:
     from rgbt import predict
-    from rgbt.config.command import plain_command
 
     folder = run("multi_head_night")
     broken = without_head(folder, "target", tmp_path / "broken")
     dataset = build(compose(run.words("multi_head_night")).dataset)
     sample = dataset.read(dataset.names("test_day")[0])
     write_png(tmp_path / "mine" / "street.png", np.dstack([sample.rgb, sample.thermal]))
-    entry, out = plain_command(predict.OWN, predict.main), tmp_path / "out"
+    entry, out = predict.entry, tmp_path / "out"
     words = (f"run={broken}", f"input={tmp_path / 'mine'}", f"out={out}")
     code, _, err = call(entry, *words)
     assert code == 2

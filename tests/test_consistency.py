@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import ca, ca_released, tc
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, short, train
@@ -35,7 +34,7 @@ def copied(trained: Trained, tmp_path: Path, *overrides: str) -> Path:
 def measure(call: Call, *arguments: str) -> tuple[int, str, str]:
     from rgbt import consistency
 
-    return call(plain_command(consistency.OWN, consistency.main), *arguments)
+    return call(consistency.entry, *arguments)
 
 
 def pair_counts(path: Path) -> Counts:
@@ -138,7 +137,7 @@ def test_a_run_of_before_there_was_any_consistency(
     del tables["consistency"], tables["crc32"]
     (old / "tables.json").write_text(json.dumps(tables))
 
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), f"run={old}")
+    code, _, err = call(evaluate.entry, f"run={old}")
     assert code == 0, err
     code, _, err = measure(call, f"run={old}")
     assert code == 0, err

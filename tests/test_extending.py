@@ -13,8 +13,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.randomness import numpy_generator
+from rgbt.spec.specify import specify
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data
 
@@ -124,7 +124,6 @@ def words_of(lab: Path) -> list[str]:
 
 def test_the_page_runs(lab: Path, call: Call) -> None:
     from rgbt import evaluate, predict
-    from rgbt.config.command import plain_command
     from rgbt.maskers import sketch
     from rgbt.run import main
 
@@ -138,12 +137,12 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     assert code == 0, err
     assert (lab / "masks.png").is_file()
     words = (f"run={run}", f"degradation={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
-    code, _, err = call(plain_command(evaluate.OWN, evaluate.main), *words)
+    code, _, err = call(evaluate.entry, *words)
     assert code == 0, err
     words = (f"run={run}", "input=test", f"out={lab / 'out'}", "trust=my_lab")
-    code, _, err = call(plain_command(predict.OWN, predict.main), *words)
+    code, _, err = call(predict.entry, *words)
     assert code == 0, err
-    code, _, err = call(plain_command(predict.OWN, predict.main), *words, f"input={lab}")
+    code, _, err = call(predict.entry, *words, f"input={lab}")
     assert code == 2
     assert_one_sentence(err, "Arrays does not say how new images are read; name one of its splits")
 
@@ -180,4 +179,4 @@ def test_a_wrong_part_is_one_sentence_of_the_command(
 def test_a_misspelt_key_of_ones_own_is_named(lab: Path) -> None:
     config = compose([*words_of(lab), "masker.cell=4", "+masker.cel=4"])
     with pytest.raises(InputError, match=r"'masker.cel' is not a setting of my_lab.Halves; did"):
-        check(config)
+        specify(config)

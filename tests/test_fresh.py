@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from rgbt import evaluate
-from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
 from rgbt.spec import source_code
 from rgbt.tracking import other_code
@@ -99,9 +98,7 @@ def test_a_run_of_before_threads_had_a_number_is_opened(call: Call, data: Path, 
     text = (folder / "config.yaml").read_text()
     assert "threads: 1" in text
     (folder / "config.yaml").write_text(text.replace("threads: 1", "threads: null"))
-    code, _, err = call(
-        plain_command(evaluate.OWN, evaluate.main), f"run={folder}", f"dataset.root={data}"
-    )
+    code, _, err = call(evaluate.entry, f"run={folder}", f"dataset.root={data}")
     assert code == 0, err
 
 
@@ -141,7 +138,7 @@ def test_a_changed_loss_of_ones_own_is_another_run(
     assert losses(3.0) == pytest.approx([once, 3 * once])
     assert losses(1.0) == pytest.approx([once, 3 * once]), "the first run again"
 
-    entry = plain_command(evaluate.OWN, evaluate.main)
+    entry = evaluate.entry
     for run in runs_in(tmp_path / "runs"):
         code, _, err = call(entry, f"run={run.path}", "trust=my_scaled_loss")
         assert code == 0, err

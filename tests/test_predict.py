@@ -11,13 +11,12 @@ import pytest
 import torch
 
 from rgbt import predict
-from rgbt.config.command import plain_command
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.data.pseudo_labels import PseudoLabels
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
 
-PREDICT = plain_command(predict.OWN, predict.main)
+PREDICT = predict.entry
 ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
 
 

@@ -18,7 +18,6 @@ from torch import nn
 
 from rgbt import evaluate, robustness
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
 from rgbt.evaluation.corrupted import Failure, choose
 from rgbt.evaluation.robustness import Asked, Measured, asked_of, measure, weights_digest
 from rgbt.metrics.counts import Counts
@@ -27,8 +26,8 @@ from rgbt.robustness import chosen_of, robustness_grid
 from tests.commands import Call, Trained, assert_one_sentence, short
 from tests.corruptions.recorded import Recorded
 
-ENTRY = plain_command(robustness.OWN, robustness.main)
-EVALUATE = plain_command(evaluate.OWN, evaluate.main)
+ENTRY = robustness.entry
+EVALUATE = evaluate.entry
 NOISE = ("degradations=noise_rgb", "degradation.severities=[16,64]")
 
 

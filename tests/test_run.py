@@ -305,10 +305,9 @@ def test_evaluate_and_predict_a_stored_run(
     call: Call, data: Path, runs: Path, tmp_path: Path
 ) -> None:
     from rgbt import evaluate, predict
-    from rgbt.config.command import plain_command
 
     folder = only_run(runs)
-    evaluate_entry = plain_command(evaluate.OWN, evaluate.main)
+    evaluate_entry = evaluate.entry
 
     code, out, err = call(evaluate_entry, f"run={folder}")
     assert code == 0, err
@@ -331,7 +330,7 @@ def test_evaluate_and_predict_a_stored_run(
     other.mkdir()
     (other / "a.png").write_bytes((data / "images" / "00201D.png").read_bytes())
     code, out, err = call(
-        plain_command(predict.OWN, predict.main),
+        predict.entry,
         *(f"run={folder}", f"input={other}", f"out={tmp_path / 'out'}"),
     )
     assert code == 0, err
@@ -341,9 +340,7 @@ def test_evaluate_and_predict_a_stored_run(
     assert cv2.imread(str(tmp_path / "out" / "a_overlay.png")).shape == (48, 64, 3)
 
     before = (other / "a.png").read_bytes()
-    code, out, err = call(
-        plain_command(predict.OWN, predict.main), f"run={folder}", f"input={other}", f"out={other}"
-    )
+    code, out, err = call(predict.entry, f"run={folder}", f"input={other}", f"out={other}")
     assert code == 2
     assert_one_sentence(err, "would be overwritten")
     assert (other / "a.png").read_bytes() == before
@@ -351,10 +348,9 @@ def test_evaluate_and_predict_a_stored_run(
 
 def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
     from rgbt import evaluate
-    from rgbt.config.command import plain_command
 
     folder = only_run(runs)
-    entry = plain_command(evaluate.OWN, evaluate.main)
+    entry = evaluate.entry
     cases = {
         ("run=nowhere",): "run=nowhere: neither a run folder",
         (f"run={folder}", "modality=infrared"): "modality: 'infrared' is not a choice",

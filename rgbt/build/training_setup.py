@@ -6,19 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig
 from torch import nn
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
 from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
-from rgbt.training.pipeline import Earlier, earlier_runs, labels_folder
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
@@ -26,6 +23,7 @@ from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
 from rgbt.build.probes import check_cells, check_own_parts, example_hw, first_readable
 from rgbt.randomness import derive
+from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec, labels_key
 from rgbt.build.session import Session, open_session
 from rgbt.tracking.terminal import tell
 from rgbt.transforms.virtual_view import VirtualView
@@ -42,7 +40,7 @@ FUNCTIONS = {
 
 
 @dataclass(frozen=True)
-class Prepared:
+class TrainingSetup:
     """The objects of a training, before anything is written.
 
     Attributes:
@@ -80,7 +78,7 @@ class Prepared:
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
-        session, seed = self.session, self.session.config.seed
+        session, seed = self.session, self.session.spec.seed
         loading = replace(session.loading, augment=_where_to_augment(session))
         # Each domain is shuffled and augmented by draws of its own.
         seeds = {"source": seed, "target": derive(seed, "target domain")}
@@ -96,54 +94,52 @@ class Prepared:
         return PairedBatches(*found, first=steps.start, per_step=session.trainer.accumulate)
 
 
-def rehearse(config: DictConfig) -> None:
-    """Find what is wrong with a run before the earlier ones are trained that it stands on.
+def validate(spec: RunSpec) -> None:
+    """Build everything once, so that errors are reported before the upstream runs are trained.
 
     Raises:
-        InputError: as `prepare`, but for the weights and labels that are not there yet.
+        InputError: as `set_up_training`; what unfinished upstream runs will write is left out.
     """
-    copy = config.copy()
-    for earlier in earlier_runs(config):
-        if earlier.key == "model.weights":
-            copy.model.weights, copy.model.fresh = None, []
-            copy.scale.pretrained = False
-        else:
-            _check_teacher(config.domains[earlier.key.split(".")[1]].teacher_view, earlier)
-    prepare(copy, rehearsal=True)
+    for name, domain in spec.domains.named.items():
+        teacher = spec.dependency(labels_key(name))
+        if teacher is not None:
+            _check_teacher_view(domain.teacher_view, teacher)
+    set_up_training(spec, upstream_finished=False)
 
 
-def _check_teacher(view: View | None, earlier: Earlier) -> None:
-    """Refuse a view that the network of an earlier run does not predict from."""
+def _check_teacher_view(view: View | None, teacher: Dependency) -> None:
+    """Refuse a view that the network of an upstream run does not predict from."""
     with torch.device("meta"):
-        views = getattr(build(earlier.config.model), "views", VIEWS)
+        views = getattr(teacher.run.model.build(), "views", VIEWS)
     if view is not None and view not in views:
         raise InputError(
-            f"{earlier.key.removesuffix('labels')}teacher_view={view}, but the network of "
-            f"{earlier.experiment} predicts from {', '.join(views)}; choose one of these, or null."
+            f"{teacher.key.removesuffix('labels')}teacher_view={view}, but the network of "
+            f"{teacher.run.name} predicts from {', '.join(views)}; choose one of these, or null."
         )
 
 
-def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
-    """Build everything and look at all lists that the run will read, so that errors come first.
+def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> TrainingSetup:
+    """Build everything and read all lists of images of the run, so that errors come first.
 
     Args:
-        config: composed and checked.
-        rehearsal: pseudo-labels of earlier runs are not there yet and are not looked at.
+        spec: the run.
+        upstream_finished: False: weights and pseudo-labels of upstream runs do not exist yet and
+            are left out.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the data.
     """
-    session = open_session(config)
+    missing = () if upstream_finished else [each.key for each in spec.dependencies]
+    session = open_session(spec, load_weights=WEIGHTS not in missing)
     domains = session.domains
     for split in (
         *(domain.split for domain in domains.named.values()),
         *(session.trainer.selection_split, "test"),
     ):
         session.dataset.names(split)
-    awaited = [earlier.key for earlier in earlier_runs(config)] if rehearsal else []
     datasets = {
         name: session.dataset
-        if f"domains.{name}.labels" in awaited
+        if labels_key(name) in missing
         else _labelled(session, name, domain)
         for name, domain in domains.named.items()
     }
@@ -152,11 +148,11 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
         _check_labelled(session, name, domain)
     _where_to_augment(session)
     check_own_parts(session)
-    masker: Masker = build(config.masker)
+    masker: Masker = spec.masker.build()
     check_cells(session, masker)
-    if not rehearsal:
+    if upstream_finished:
         _tell_what_is_not_as_published(session)
-    loss = build(config.loss)
+    loss = spec.loss.build()
     loss = CheckedLoss(loss) if is_own(loss) else loss
     _check_loss(loss, session)
     model = session.fabric.setup_module(session.model)
@@ -165,20 +161,22 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
-    return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
+    return TrainingSetup(
+        session, datasets, model, others, optimizers, scheme, spec.schedule.build()
+    )
 
 
 def _tell_what_is_not_as_published(session: Session) -> None:
     """Remarks on what is no mistake, and yet not what a paper's numbers were made with."""
-    config, data = session.config, session.dataset
-    expected = config.scale.pretrained and getattr(session.model, "pretrained_parts", ())
+    spec, data = session.spec, session.dataset
+    expected: object = spec.scale.pretrained and getattr(session.model, "pretrained_parts", ())
     if expected and session.weights is None:
         tell(
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
             "file with pretrained=..., or expect less than published."
         )
-    meant = config.recipe.dataset
-    if config.scale.name == "paper" and meant != data.name:
+    meant = spec.recipe.dataset
+    if spec.scale.name == "paper" and meant != data.name:
         known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
         tell(
             f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
@@ -201,7 +199,7 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
     asked = session.loading.augment
     can = getattr(session.transform, "works_on_batches", False)
     if asked == "device" and not can:
-        has_choice = "colour" in session.config.transform
+        has_choice = "colour" in session.spec.transform.values
         works = "transform.colour=intended" if has_choice else "transform=crm"
         raise InputError(
             f"data.augment=device, but {type(session.transform).__name__} works on single images "
@@ -214,8 +212,7 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
 
 def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
     """The data set with the labels that a domain is trained with."""
-    config = session.config
-    folder = labels_folder(config, name)
+    folder = session.spec.labels_folder(name)
     if folder is not None:
         found = PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
         listed = session.dataset.names(domain.split)
@@ -263,10 +260,12 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
 
 def _scheme(session: Session, **collaborators: Any) -> Scheme:
     """The scheme; weights of networks of its own are drawn from (seed, "scheme weights")."""
-    config = session.config
+    spec = session.spec
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(config.seed, "scheme weights"))
-        scheme: Scheme = build(config.scheme, **collaborators, domains=session.domains, **FUNCTIONS)
+        torch.manual_seed(derive(spec.seed, "scheme weights"))
+        scheme: Scheme = spec.scheme.build(
+            **collaborators, domains=session.domains, **FUNCTIONS
+        )
     return scheme
 
 
@@ -274,7 +273,7 @@ def _set_up(
     session: Session, scheme: Any
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
-    builder, fabric = build(session.config.optimizer), session.fabric
+    builder, fabric = session.spec.optimizer.build(), session.fabric
     parts: dict[str, tuple[str, ...]] = getattr(scheme, "optimizers", {"main": ()})
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     others: dict[str, nn.Module] = getattr(scheme, "others", {})

@@ -20,10 +20,11 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
+from rgbt.config.component import build
 from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.config.hydra_messages import check_words, hydra_sentence
+from rgbt.config.keys import check_keys
 from rgbt.config.reporting import exit_code
-from rgbt.config.schema import build, check, check_node
 from rgbt.config.words import readable_paths
 from rgbt.runtime.signals import answered
 
@@ -75,7 +76,7 @@ def task_overrides() -> list[str]:
 
 
 def _checked(main: Main, config: DictConfig) -> int | None:
-    check(config)
+    check_keys(config)
     return main(config)
 
 
@@ -110,5 +111,4 @@ def built(node: str, overrides: Sequence[str]) -> Any:
     """
     with composing(overrides):
         config = compose(overrides)
-        check_node(config[node], node)
         return build(config[node])

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.compose import compose, conf_dir, flatten
-from rgbt.config.schema import NODES, TOP_LEVEL
+from rgbt.config.keys import top_level
 
 ADDED = ("experiment", "search", "debug")
 """Groups of which the configuration holds no file by itself: they are added with a plus."""
@@ -157,7 +157,8 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
 
 def top_level_keys() -> tuple[str, ...]:
     """What a word without a dot may name: keys of the configuration, and groups that are added."""
-    return (*NODES, *TOP_LEVEL, *ADDED)
+    nodes, values = top_level()
+    return (*nodes, *values, *ADDED)
 
 
 def key_hint(key: str, names: Sequence[str]) -> str:
@@ -168,7 +169,9 @@ def key_hint(key: str, names: Sequence[str]) -> str:
         names: options of the command.
     """
     inner = _below(compose([]), key)
-    return f"did you mean {' or '.join(inner)}" if inner else nearest(key, [*names, *NODES])
+    return (
+        f"did you mean {' or '.join(inner)}" if inner else nearest(key, [*names, *top_level()[0]])
+    )
 
 
 def _leaves(config: DictConfig) -> list[str]:

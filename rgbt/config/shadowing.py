@@ -6,7 +6,10 @@ last, so that a user's own maskers are found and nothing of ours is hidden.
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from pathlib import Path
 
@@ -15,11 +18,33 @@ from rgbt.checks import InputError
 ROOT = Path(__file__).resolve().parents[2]
 """The folder that holds our packages."""
 
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Variable that keeps a Python from searching the working directory first."""
+
 
 def search_working_directory_last() -> None:
     """Let modules of the working directory be found after all others."""
     here = str(Path.cwd())
     sys.path[:] = [*(path for path in sys.path if path not in ("", here)), here]
+
+
+def searches_working_directory_first() -> bool:
+    """Whether this process was started as ``python -m`` is, and not by ``rgbt``."""
+    return not sys.flags.safe_path and sys.path[:1] in ([""], [str(Path.cwd())])
+
+
+@contextmanager
+def starting_alike() -> Iterator[None]:
+    """Pythons started within search the working directory first only if this process does."""
+    before = os.environ.get(SAFE_PATH)
+    if not searches_working_directory_first():
+        os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(SAFE_PATH, None)
+        if before is not None:
+            os.environ[SAFE_PATH] = before
 
 
 def check_not_shadowed(package: str) -> None:

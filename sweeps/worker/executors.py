@@ -15,11 +15,13 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Protocol
 
 import rgbt
 from rgbt.checks import InputError
+from rgbt.config.shadowing import searches_working_directory_first, starting_alike
 from rgbt.spec.source_code import counted_modules
 
 PRELOADED = (
@@ -83,8 +85,11 @@ class LocalExecutor:
         if not self._is_preloaded:
             # Now, when the points are planned and have imported what the user wrote for them.
             last = "sweeps.worker.preload"
-            modules = (*PRELOADED, *own_modules(), *counted_modules(), last)
+            first = () if searches_working_directory_first() else ("sweeps.worker.search_last",)
+            modules = (*first, *PRELOADED, *own_modules(), *counted_modules(), last)
             self._context.set_forkserver_preload(list(modules))
+            with starting_alike():
+                forkserver.ensure_running()
             self._is_preloaded = True
         process = self._context.Process(
             target=_run_module, args=(tuple(command), dict(environment), str(log), str(Path.cwd()))

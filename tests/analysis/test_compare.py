@@ -12,16 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.compare import OWN, comparison_csv, main, metrics_of, settings_of
+from analysis.compare import Options, comparison_csv, entry, metrics_of, settings_of
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
+from rgbt.config.options import parse
 from rgbt.metrics.counts import Counts
 from tests.analysis.test_results import COMMAS, make_run
 from tests.analysis.uncertainty.simulated import Population, counts_of
 from tests.commands import Call, assert_one_sentence
 
-ENTRY = plain_command(OWN, main)
 FAST = ("resamples=200", "blocks=none")
 
 
@@ -43,7 +42,7 @@ def files(tmp_path: Path) -> tuple[str, str]:
 
 
 def test_table_and_sentence(call: Call, files: tuple[str, str]):
-    code, out, err = call(ENTRY, *files, *FAST)
+    code, out, err = call(entry, *files, *FAST)
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].strip() == "grbm less crm: 40 single images, ring2"
@@ -76,7 +75,7 @@ def test_seeds_have_their_columns(call: Call, tmp_path: Path):
         for seed, array in enumerate(arrays):
             counts_of(array).save(tmp_path / f"{name}{seed}.npz")
     arguments = [f"{n}=" + ",".join(f"{tmp_path}/{n}{seed}.npz" for seed in range(3)) for n in "ab"]
-    code, out, _ = call(ENTRY, *arguments, *FAST, "metrics=mIoU, Var", "level=0.9")
+    code, out, _ = call(entry, *arguments, *FAST, "metrics=mIoU, Var", "level=0.9")
     assert code == 0
     assert "90 % over images and seeds" in out
     assert "a0 + a1 + a2" in out
@@ -94,7 +93,7 @@ def test_groups_of_a_store(call: Call, tmp_path: Path):
         arrays = Population().pair(rng, 40, 2, Population(skill=skill))[1]
         for seed in range(2):
             counts_of(arrays[seed]).save(runs / f"{key}{seed}" / "counts_test.npz")
-    code, out, err = call(ENTRY, "a=crm", f"b={COMMAS}", f"runs_dir={runs}", *FAST)
+    code, out, err = call(entry, "a=crm", f"b={COMMAS}", f"runs_dir={runs}", *FAST)
     assert (code, err) == (0, "")
     assert f"{COMMAS} less crm: 40 single images" in out
     assert f"The mIoU of {COMMAS} is " in out
@@ -108,7 +107,7 @@ def test_names_with_brackets_are_shown_whole(call: Call, tmp_path: Path, name: s
     make_run(runs, "aaa0", name, 0)
     a.save(runs / "aaa0" / "counts_test.npz")
     b.save(tmp_path / "other.npz")
-    code, out, err = call(ENTRY, "a=aaa0", f"b={tmp_path}/other.npz", f"runs_dir={runs}", *FAST)
+    code, out, err = call(entry, "a=aaa0", f"b={tmp_path}/other.npz", f"runs_dir={runs}", *FAST)
     assert (code, err) == (0, "")
     assert f"other less {name}: 40 single images" in out
     assert f"than that of {name} (" in out
@@ -122,17 +121,17 @@ def test_names_that_are_equal_are_told_apart(call: Call, tmp_path: Path):
         counts.save(tmp_path / folder / "counts_test.npz")
         counts.save(tmp_path / folder / "mine.npz")
     arguments = f"a={tmp_path}/x/mine.npz", f"b={tmp_path}/y/mine.npz"
-    code, out, _ = call(ENTRY, *arguments, *FAST)
+    code, out, _ = call(entry, *arguments, *FAST)
     assert code == 0
     assert "b: mine less a: mine" in out
     arguments = f"a={tmp_path}/x/counts_test.npz", f"b={tmp_path}/y/counts_test.npz"
-    assert "y less x" in call(ENTRY, *arguments, *FAST)[1]
+    assert "y less x" in call(entry, *arguments, *FAST)[1]
 
 
 def test_files(call: Call, files: tuple[str, str], tmp_path: Path):
     out_dir = tmp_path / "new" / "out"
     metrics = ("mIoU", "class/cone")
-    code, out, _ = call(ENTRY, *files, *FAST, f"metrics={','.join(metrics)}", f"out={out_dir}")
+    code, out, _ = call(entry, *files, *FAST, f"metrics={','.join(metrics)}", f"out={out_dir}")
     assert code == 0
     assert "comparison.md, comparison.csv" in out
     text = (out_dir / "comparison.md").read_text()
@@ -156,9 +155,9 @@ def test_files(call: Call, files: tuple[str, str], tmp_path: Path):
 
 
 def test_same_command_same_output(call: Call, files: tuple[str, str]):
-    first = call(ENTRY, *files, *FAST)
-    assert first == call(ENTRY, *files, *FAST)
-    assert first != call(ENTRY, *files, *FAST, "seed=1")
+    first = call(entry, *files, *FAST)
+    assert first == call(entry, *files, *FAST)
+    assert first != call(entry, *files, *FAST, "seed=1")
 
 
 def test_nothing_to_score(call: Call, tmp_path: Path):
@@ -169,7 +168,7 @@ def test_nothing_to_score(call: Call, tmp_path: Path):
         replace(counts, counts=array).save(tmp_path / f"{name}.npz")
     arguments = [f"{name}={tmp_path}/{name}.npz" for name in "ab"]
     code, out, err = call(
-        *(ENTRY, *arguments, *FAST, "absent=exclude", "metrics=class/cone", f"out={tmp_path}")
+        *(entry, *arguments, *FAST, "absent=exclude", "metrics=class/cone", f"out={tmp_path}")
     )
     assert (code, err) == (0, "")
     assert "class/cone of a and b cannot be compared: nothing to score." in out
@@ -183,7 +182,7 @@ def test_auto_metrics(call: Call, tmp_path: Path, at_night: int):
     for name, counts in zip("ab", pair(), strict=True):
         replace(counts, night=night).save(tmp_path / f"{name}.npz")
     arguments = [f"{name}={tmp_path}/{name}.npz" for name in "ab"]
-    assert call(ENTRY, *arguments, *FAST, f"out={tmp_path}")[0] == 0
+    assert call(entry, *arguments, *FAST, f"out={tmp_path}")[0] == 0
     lines = (tmp_path / "comparison.csv").read_text().splitlines()[1:]
     expected = ["mIoU", "Var", "region/1", "region/2"]
     parts = ["day/mIoU", "night/mIoU"] if at_night else []
@@ -196,10 +195,10 @@ def test_auto_leaves_out_a_night_with_too_few_images(call: Call, tmp_path: Path)
     for name, counts in zip("ab", pair(), strict=True):
         replace(counts, night=night).save(tmp_path / f"{name}.npz")
     arguments = [f"{name}={tmp_path}/{name}.npz" for name in "ab"]
-    code, out, err = call(ENTRY, *arguments, *FAST)
+    code, out, err = call(entry, *arguments, *FAST)
     assert (code, err) == (0, "")
     assert "night/mIoU" not in out
-    code, _, err = call(ENTRY, *arguments, *FAST, "metrics=night/mIoU")
+    code, _, err = call(entry, *arguments, *FAST, "metrics=night/mIoU")
     assert code == 2
     assert_one_sentence(err, "5 single images are too few")
 
@@ -209,7 +208,7 @@ def test_auto_leaves_out_a_night_that_only_one_tells(call: Call, tmp_path: Path)
     a, b = pair()
     replace(a, night=tuple(place < 15 for place in range(40))).save(tmp_path / "a.npz")
     b.save(tmp_path / "b.npz")
-    code, out, err = call(ENTRY, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
+    code, out, err = call(entry, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
     assert (code, err) == (0, "")
     assert "the mIoU of b" in out
 
@@ -219,7 +218,7 @@ def test_title_counts_the_images_of_the_first_line(call: Call, tmp_path: Path):
     for name, counts in zip("ab", pair(), strict=True):
         replace(counts, night=night).save(tmp_path / f"{name}.npz")
     arguments = [f"{name}={tmp_path}/{name}.npz" for name in "ab"]
-    code, out, _ = call(ENTRY, *arguments, *FAST, "metrics=night/mIoU,mIoU")
+    code, out, _ = call(entry, *arguments, *FAST, "metrics=night/mIoU,mIoU")
     assert code == 0
     assert "the night/mIoU of b" in out
     assert "over 15 images" in out
@@ -237,14 +236,14 @@ def lacking(tmp_path: Path) -> tuple[str, str]:
 
 
 def test_missing_images_are_refused(call: Call, lacking: tuple[str, str]):
-    code, out, err = call(ENTRY, *lacking, *FAST)
+    code, out, err = call(entry, *lacking, *FAST)
     assert (code, out) == (2, "")
     assert_one_sentence(err, "not of the same images: 35 of split 'test' against 37")
     assert_one_sentence(err, "missing=leave_out")
 
 
 def test_missing_images_are_left_out(call: Call, lacking: tuple[str, str]):
-    code, out, err = call(ENTRY, *lacking, *FAST, "missing=leave_out", "metrics=mIoU")
+    code, out, err = call(entry, *lacking, *FAST, "missing=leave_out", "metrics=mIoU")
     assert code == 0
     assert "grbm less crm: 32 single images" in out
     assert "8 of 40 images are not in all counts and were left out" in err
@@ -256,26 +255,27 @@ def test_missing_images_are_left_out(call: Call, lacking: tuple[str, str]):
 
 
 def test_nothing_is_said_where_none_is_missing(call: Call, files: tuple[str, str]):
-    code, _, err = call(ENTRY, *files, *FAST, "missing=leave_out")
+    code, _, err = call(entry, *files, *FAST, "missing=leave_out")
     assert (code, err) == (0, "")
 
 
-def test_settings_as_text():
-    given = {**{key: value for key, value in OWN.items() if value is not None}, "blocks": "12"}
-    assert settings_of(given) == Resampling(blocks=12)
-    changed = settings_of({**given, "resamples": "1000", "level": ".9", "seed": "2"})
+def test_settings_from_options_are_those_given():
+    def given(*words: str) -> Resampling:
+        return settings_of(parse(Options, ["blocks=12", *words])[0])
+
+    assert given() == Resampling(blocks=12)
+    changed = given("resamples=1000", "level=.9", "seed=2")
     assert (changed.resamples, changed.level, changed.seed) == (1000, 0.9, 2)
-    with pytest.raises(InputError, match="level"):
-        settings_of({**given, "level": ""})
+    with pytest.raises(InputError, match="'level' must be a number"):
+        given("level=")
 
 
 def test_help_is_light():
     """No torch, matplotlib, mlflow or pandas for a page of help."""
     code = (
         "import sys; sys.argv = ['compare', '--help']\n"
-        "from analysis.compare import OWN, main\n"
-        "from rgbt.config.command import plain_command\n"
-        "try:\n    plain_command(OWN, main)()\n"
+        "from analysis.compare import entry\n"
+        "try:\n    entry()\n"
         "except SystemExit as left:\n    assert not left.code\n"
         "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"

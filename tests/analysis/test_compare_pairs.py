@@ -8,18 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from analysis.compare import OWN, main, metrics_of
+from analysis.compare import entry, metrics_of
 from analysis.results import open_counts
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import PROTOCOLS, file_name
 from tests.analysis.test_results import make_run
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call, assert_one_sentence
 
-ENTRY = plain_command(OWN, main)
 FAST = ("resamples=200", "blocks=none")
 IMAGES = 40
 NIGHT = tuple(place < 15 for place in range(IMAGES))
@@ -50,7 +48,7 @@ def test_a_difference_in_tc_has_its_interval_over_images_and_seeds(
     call: Call, runs: Path, tmp_path: Path
 ):
     words = (*groups(runs), *FAST, "frames=aligned", f"out={tmp_path}")
-    code, out, err = call(ENTRY, *words)
+    code, out, err = call(entry, *words)
     assert (code, err) == (0, "")
     assert "temporal less plain: 40 single images, aligned3" in out
     assert "The TC of temporal is " in out
@@ -70,7 +68,7 @@ def test_a_difference_in_tc_has_its_interval_over_images_and_seeds(
 def test_metrics_that_are_asked_for(call: Call, runs: Path, tmp_path: Path):
     metrics = "CA,class/car/TC,night/class/cone/CA_released"
     words = (*groups(runs), *FAST, "frames=released", f"metrics={metrics}", f"out={tmp_path}")
-    assert call(ENTRY, *words)[0] == 0
+    assert call(entry, *words)[0] == 0
     lines = (tmp_path / "comparison.csv").read_text().splitlines()[1:]
     assert [line.split(",")[0] for line in lines] == metrics.split(",")
 
@@ -108,7 +106,7 @@ def test_files_compare_without_frames(call: Call, runs: Path):
     files = [
         f"{side}={runs}/{run}0/{file_name('aligned', 'test')}" for side, run in zip("ab", AGREE)
     ]
-    code, out, _ = call(ENTRY, *files, *FAST)
+    code, out, _ = call(entry, *files, *FAST)
     assert code == 0
     assert "temporal0 less plain0: 40 single images, aligned3" in out
 
@@ -146,7 +144,7 @@ def test_files_compare_without_frames(call: Call, runs: Path):
 def test_nonsense_is_refused(call: Call, runs: Path, words: list[str], sentence: str):
     given = dict(word.split("=", 1) for word in (*groups(runs), *FAST))
     given |= dict(word.format(runs=runs).split("=", 1) for word in words)
-    code, out, err = call(ENTRY, *(f"{key}={text}" for key, text in given.items()))
+    code, out, err = call(entry, *(f"{key}={text}" for key, text in given.items()))
     assert (code, out) == (2, "")
     assert_one_sentence(err, sentence)
 

@@ -7,19 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from analysis.compare import OWN, main
+from analysis.compare import entry
 from analysis.results import open_counts
 from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
 from rgbt.evaluation.robustness import CLEAN, FORMAT
 from rgbt.metrics.named import value
 from rgbt.robustness import FOLDER
 from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
-
-ENTRY = plain_command(OWN, main)
 
 
 @pytest.fixture
@@ -114,13 +111,13 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
 
 def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
     where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
-    code, out, err = call(ENTRY, "a=k2", "b=k0", "degradation=noise", "severity=16", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "degradation=noise", "severity=16", *where)
     assert code == 0, err
     # 40 against 35 on noisy images (80 against 75 on clean ones).
     assert "crm (noise 16) less none (noise 16)" in out
     assert "35.00" in out
     assert "40.00" in out
-    code, out, err = call(ENTRY, "a=k2", "b=k0", "degradation=rgb_removed", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "degradation=rgb_removed", *where)
     assert code == 0, err
     assert "15.00" in out
 
@@ -134,7 +131,7 @@ def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
     ],
 )
 def test_compare_refuses(call: Call, runs: Path, words: list[str], sentence: str) -> None:
-    code, out, err = call(ENTRY, "a=k2", "b=k0", f"runs_dir={runs}", *words)
+    code, out, err = call(entry, "a=k2", "b=k0", f"runs_dir={runs}", *words)
     assert (code, out) == (2, "")
     assert sentence in err
 

@@ -16,9 +16,8 @@ import pytest
 from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import score_folder
 from analysis.predictions.table import ScoreKey
-from analysis.score import OWN, main, score_tables
+from analysis.score import entry, score_tables
 from analysis.uncertainty import Resampling, estimate
-from rgbt.config.command import plain_command
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -45,7 +44,7 @@ def predictions(data: Path, tmp_path: Path) -> Path:
 
 
 def score(call: Call, *arguments: str) -> tuple[int, str, str]:
-    return call(plain_command(OWN, main), *arguments)
+    return call(entry, *arguments)
 
 
 def place(data: Path) -> tuple[str, str]:
@@ -316,7 +315,7 @@ def test_help_waits_for_no_heavy_import() -> None:
     code = (
         "import sys; sys.argv[1:] = ['--help']\n"
         "from analysis.score import *\n"
-        "try: plain_command(OWN, main)()\n"
+        "try: entry()\n"
         "except SystemExit as left: assert left.code == 0\n"
         "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'PIL', 'cv2'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.compare import OWN, absent_classes
-from analysis.compare import main as compare_command
+from analysis.compare import absent_classes, entry
 from analysis.figures import classes, consistency, inputs, maps, panels, profiles, trends
 from analysis.predictions.maps import PixelMaps, iou_map
 from analysis.predictions.table import ScoreKey, score_table
@@ -133,9 +132,8 @@ def test_means_over_different_classes_are_refused(tmp_path: Path) -> None:
         )
     counts.save(tmp_path / "a.npz")
     other.save(tmp_path / "b.npz")
-    given = {**OWN, "a": str(tmp_path / "a.npz"), "b": str(tmp_path / "b.npz")}
     with pytest.raises(InputError, match=REFUSED):
-        compare_command({**given, "resamples": "100"}, [])
+        entry.run([f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", "resamples=100"])
 
 
 # Tables of predictions.

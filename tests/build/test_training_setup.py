@@ -16,7 +16,8 @@ from rgbt.training import pipeline as earlier
 from rgbt.build import training_setup as prepared_module
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check
+from rgbt.config.component import build
+from rgbt.spec.specify import specify
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
 from rgbt.evaluation.pseudo_labels import BEGUN, Teacher, write_pseudo_labels
@@ -48,7 +49,7 @@ def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
 def composed(words: Callable[..., list[str]]) -> Composed:
     def make(name: str, *more: str) -> DictConfig:
         config = compose(words(name, *more))
-        check(config)
+        specify(config)
         return config
 
     return make

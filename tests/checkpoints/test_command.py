@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from rgbt.weights import main
+from rgbt.weights import entry
 from tests.checkpoints.files import like, network, saved
 from tests.checkpoints.imagenet import resnet_file
 from tests.models.golden import SHARED
@@ -22,7 +22,7 @@ def called(monkeypatch: pytest.MonkeyPatch, capsys: Captured, *words: str) -> tu
     """Exit code, stdout and stderr."""
     monkeypatch.setattr(sys, "argv", ["rgbt.weights", *words])
     with pytest.raises(SystemExit) as left:
-        main()
+        entry()
     out, err = capsys.readouterr()
     return int(left.value.code or 0), out, err
 
@@ -168,7 +168,7 @@ def test_export_and_inspect(
         (("inspect", "missing.pth"), "there is no such file"),
         (("export", "run=x"), "'format' has no value"),
         (("export", "run=x", "format=released", "out=y"), "run=x"),
-        (("export", "run=x", "format=released", "out=y", "modl=z"), "'modl=z'"),
+        (("export", "run=x", "format=released", "out=y", "modl=z"), "'modl' has no effect here"),
         (("export", "run=x", "format=released", "out=y", "checkpoint=first"), "checkpoint"),
     ],
 )
@@ -183,8 +183,8 @@ def test_usage_errors(
 
 def test_help(monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
     said = {
-        ("--help",): "python -m rgbt.weights inspect FILE",
-        ("inspect", "--help"): "FILE      of weights",
+        ("--help",): "rgbt weights inspect FILE",
+        ("inspect", "--help"): "file   of weights",
         ("export", "--help"): "released_temporal (CMX",
     }
     for words, sentence in said.items():

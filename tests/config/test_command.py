@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from rgbt.config.command import plain_command
-from tests.commands import Call, assert_one_sentence
+from rgbt.config.plain_command import PlainCommand
+from tests.commands import Call, NoOptions, assert_one_sentence
 
 
 def test_sigterm_is_answered_by_plain_commands_too(call: Call) -> None:
     tidied: list[bool] = []
 
-    def main(arguments: dict[str, str], overrides: list[str]) -> int:
-        del arguments, overrides
+    def main(options: NoOptions, overrides: list[str]) -> int:
+        del options, overrides
         try:
             os.kill(os.getpid(), signal.SIGTERM)
             signal.pause()
@@ -27,7 +27,7 @@ def test_sigterm_is_answered_by_plain_commands_too(call: Call) -> None:
         return 0
 
     before = signal.getsignal(signal.SIGTERM)
-    code, _, err = call(plain_command({}, main))
+    code, _, err = call(PlainCommand(NoOptions, main))
     assert (code, tidied) == (143, [True])
     assert_one_sentence(err, "stopped by SIGTERM")
     assert signal.getsignal(signal.SIGTERM) is before

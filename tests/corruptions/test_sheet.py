@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.config.command import plain_command
-from rgbt.corruptions.__main__ import OWN, main
+from rgbt.corruptions.__main__ import entry
 from rgbt.corruptions.late import Delayed
 from rgbt.corruptions.noise import Noise
 from rgbt.corruptions.removed import Removed
@@ -18,7 +17,6 @@ from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample
 
-ENTRY = plain_command(OWN, main)
 KINDS = (
     Noise(image="rgb", severities=(8.0, 16.0)),
     Delayed(severities=(1.0,)),
@@ -53,10 +51,10 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
     root = write_mfnet({"test": ["00001D", "00002D"]})
     out = tmp_path / "a" / "sheet.png"
     where = (f"dataset.root={root}", "dataset=mfnet", f"out={out}")
-    code, said, err = call(ENTRY, "degradations=noise,rgb_removed", *where)
+    code, said, err = call(entry, "degradations=noise,rgb_removed", *where)
     assert (code, said.strip()) == (0, str(out)), err
     assert cv2.imread(str(out)).shape[1] > 500
-    code, _, err = call(ENTRY, "name=00003D", *where)
+    code, _, err = call(entry, "name=00003D", *where)
     assert code == 2
     assert "split 'test' has no such sample; did you mean" in err
 
@@ -69,6 +67,6 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
     ],
 )
 def test_bad_input(call: Call, words: list[str], sentence: str) -> None:
-    code, out, err = call(ENTRY, *words)
+    code, out, err = call(entry, *words)
     assert (code, out) == (2, "")
     assert sentence in err

@@ -20,7 +20,7 @@ from rgbt.checks import InputError
 from rgbt.data.cache import file as decoded_file
 from rgbt.data.cache import stamps as decoded_stamps
 from rgbt.data.cache import store as decoded_store
-from rgbt.data.cache.__main__ import main
+from rgbt.data.cache.__main__ import entry
 from rgbt.data.cache.dataset import Decoded, decoded_dataset, default_folder
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
@@ -746,17 +746,17 @@ def test_the_command(
     case: Case, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("rgbt.data.cache.__main__.built", lambda node, overrides: case.source)
-    arguments = {"cache": str(case.cache), "remove": "false"}
-    assert main(arguments, []) == 0
+    cache = f"cache={case.cache}"
+    assert entry.run([cache]) == 0
     size = sum(path.stat().st_size for path in case.cache.glob("arrays-*/*"))
     assert capsys.readouterr().out.endswith(f": {size / 1e6:.1f} MB\n")
-    assert main({**arguments, "remove": "true"}, []) == 0
+    assert entry.run([cache, "remove=true"]) == 0
     assert capsys.readouterr().out.endswith(" MB removed\n")
     assert list(case.cache.iterdir()) == []
-    with pytest.raises(InputError, match="remove: 'maybe' is not a choice"):
-        main({**arguments, "remove": "maybe"}, [])
+    with pytest.raises(InputError, match="'remove' must be true or false"):
+        entry.run([cache, "remove=maybe"])
     with pytest.raises(InputError, match=r"^cache: 'null' names no folder; expected auto or a"):
-        main({**arguments, "cache": "null"}, [])
+        entry.run(["cache=null"])
 
 
 def test_real_pairs_bit_for_bit(tmp_path: Path) -> None:
@@ -774,5 +774,5 @@ def test_real_pairs_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_the_command_refuses_what_it_does_not_heed(case: Case) -> None:
-    with pytest.raises(InputError, match=r"'data\.cache' has no effect here; .*cache=FOLDER"):
-        main({"cache": str(case.cache), "remove": "false"}, ["dataset=synth", "data.cache=/x"])
+    with pytest.raises(InputError, match=r"'data\.cache' has no effect here; did you mean 'cache'"):
+        entry.run([f"cache={case.cache}", "dataset=synth", "data.cache=/x"])

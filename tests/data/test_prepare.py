@@ -20,7 +20,7 @@ from rgbt.data.kp_names import SPLITS
 from rgbt.data.mfnet import MFNet
 from rgbt.data.prepare import __main__ as prepare
 from rgbt.data.prepare import copying as prepare_copy
-from rgbt.data.prepare.__main__ import main
+from rgbt.data.prepare.__main__ import entry
 from rgbt.data.prepare.kp import plan_kp
 from rgbt.data.prepare.plans import Given
 from rgbt.data.prepare.source import Entry, Source
@@ -34,8 +34,8 @@ MF = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["01402D", "0118
 
 def call(dataset: str, source: Path, out: Path, **others: Path | str) -> int:
     """The command; its exit code."""
-    words = {"dataset": dataset, "source": str(source), "out": str(out), "labels": "", "lists": ""}
-    return main(words | {key: str(value) for key, value in others.items()}, [])
+    words = {"dataset": dataset, "source": source, "out": out, **others}
+    return entry.run([f"{key}={value}" for key, value in words.items()]) or 0
 
 
 def files_in(root: Path) -> list[str]:
@@ -612,7 +612,7 @@ def test_files_that_cannot_be_read(
 
 def test_words_that_mean_nothing(mfnet: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with pytest.raises(InputError, match=r"dataset: 'mfnt' is not a choice; did you mean 'mfnet'"):
+    with pytest.raises(InputError, match=r"'dataset' must be 'mfnet', .* got \"mfnt\""):
         call("mfnt", mfnet, out)
     with pytest.raises(InputError, match=r"labels has no meaning for dataset=mfnet"):
         call("mfnet", mfnet, out, labels=mfnet)
@@ -620,6 +620,6 @@ def test_words_that_mean_nothing(mfnet: Path, tmp_path: Path) -> None:
         call("pst900", mfnet, out, lists=mfnet)
     with pytest.raises(InputError, match=r"source: there is no file or folder '.*nowhere'"):
         call("mfnet", tmp_path / "nowhere", out)
-    with pytest.raises(InputError, match=r"'sources=x' is no argument; did you mean 'source'"):
-        main({}, ["sources=x"])
+    with pytest.raises(InputError, match=r"'sources' has no effect here; did you mean 'source'"):
+        entry.run(["sources=x"])
     assert not out.exists()

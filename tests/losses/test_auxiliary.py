@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.losses.auxiliary import WithAuxiliary
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.types import Output

@@ -8,6 +8,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,13 +17,20 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.files import decode
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.archive import Archive
-from tests.commands import Call, assert_one_sentence, only_run, short, train
+from tests.commands import Call, NoOptions, assert_one_sentence, only_run, short, train
 
 SMALL_MB = 2
+
+
+@dataclass(frozen=True)
+class OutOptions:
+    out: str = ""
+
+
 RESUME = "rerun the command to resume from the last checkpoint."
 
 
@@ -31,10 +39,10 @@ def full() -> OSError:
 
 
 def raising(error: Callable[[], BaseException]) -> Callable[[], None]:
-    def main(arguments: dict[str, str], overrides: list[str]) -> None:
+    def main(options: OutOptions, overrides: list[str]) -> None:
         raise error()
 
-    return plain_command({"out": ""}, main)
+    return PlainCommand(OutOptions, main)
 
 
 def hidden() -> BaseException:
@@ -87,7 +95,7 @@ def test_a_sentence_that_hides_its_cause_stays_as_it_is(call: Call) -> None:
         except OSError:
             raise InputError("no shared memory in /dev/shm.") from None
 
-    code, _, err = call(plain_command({}, lambda _, __: refused()))
+    code, _, err = call(PlainCommand(NoOptions, lambda _, __: refused()))
     assert (code, err) == (2, "rgbt: no shared memory in /dev/shm.\n")
 
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from torch.utils.data import DataLoader
 
-from rgbt.config.command import plain_command
+from rgbt.config.plain_command import PlainCommand
 from rgbt.data.reader import start_worker
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
 from rgbt.runtime.signals import Stopped, answered, at_once, deferred
 from rgbt.types import Batch
-from tests.commands import Call, assert_one_sentence
+from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -188,13 +188,13 @@ def test_a_signal_between_two_evaluations_is_raised_at_the_next() -> None:
 def test_commands_end_with_the_code_of_the_signal(
     call: Call, number: signal.Signals, code: int, said: str
 ) -> None:
-    def main(arguments: dict[str, str], overrides: list[str]) -> int:
-        del arguments, overrides
+    def main(options: NoOptions, overrides: list[str]) -> int:
+        del options, overrides
         send(number)
         raise AssertionError("the signal waits")
 
     before = signal.getsignal(number)
-    found, _, err = call(plain_command({}, main))
+    found, _, err = call(PlainCommand(NoOptions, main))
     assert found == code
     assert_one_sentence(err, said)
     assert signal.getsignal(number) is before

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from rgbt.consistency import OWN as OF_CONSISTENCY
-from rgbt.evaluate import OWN as OF_EVALUATE
+from rgbt.config.options import types_of
+from rgbt.consistency import Options as OfConsistency
+from rgbt.evaluate import Options as OfEvaluate
 from sweeps.evaluation import ExtraEvaluation
 
 
@@ -12,7 +13,7 @@ def test_of_single_frames_every_evaluation_is_a_call_and_a_file() -> None:
     assert ring.command == ("rgbt.evaluate", "modality=thermal", "regions=ring9")
     assert ring.path == "evaluations/table_thermal_ring9.npz"
     assert ring.label == "thermal, ring9"
-    assert {word.partition("=")[0] for word in ring.command[1:]} <= set(OF_EVALUATE)
+    assert {word.partition("=")[0] for word in ring.command[1:]} <= set(types_of(OfEvaluate))
 
 
 def test_a_head_that_is_asked_for_has_a_file_of_its_own() -> None:
@@ -20,7 +21,7 @@ def test_a_head_that_is_asked_for_has_a_file_of_its_own() -> None:
     assert day.command == ("rgbt.evaluate", "modality=rgb", "regions=ring9", "head=source")
     assert day.path == "evaluations/table_rgb_ring9_source-head.npz"
     assert day.label == "rgb, ring9, source head"
-    assert {word.partition("=")[0] for word in day.command[1:]} <= set(OF_EVALUATE)
+    assert {word.partition("=")[0] for word in day.command[1:]} <= set(types_of(OfEvaluate))
     assert ExtraEvaluation(head="own").path == "evaluations/table_default_as-trained_own-head.npz"
     assert ExtraEvaluation(head="own").command[-1] == "head=own"
 
@@ -31,7 +32,7 @@ def test_failing_images_have_a_file_of_their_own() -> None:
     assert noisy.command == ("rgbt.evaluate", *words)
     assert noisy.path == "evaluations/table_rgbt_ring9_noise-16.npz"
     assert noisy.label == "rgbt, ring9, noise-16"
-    assert {word.partition("=")[0] for word in words} <= set(OF_EVALUATE)
+    assert {word.partition("=")[0] for word in words} <= set(types_of(OfEvaluate))
     removed = ExtraEvaluation(head="own", degradation="rgb_removed")
     assert removed.command[-2:] == ("head=own", "degradation=rgb_removed")
     assert removed.path == "evaluations/table_default_as-trained_own-head_rgb_removed.npz"
@@ -48,4 +49,4 @@ def test_of_virtual_views_one_call_makes_two_files() -> None:
     assert released.path == "evaluations/consistency_released_test.npz"
     assert aligned.label == "consistency, aligned"
     assert ExtraEvaluation(frames="next").command == ("rgbt.consistency", "frames=next")
-    assert {word.partition("=")[0] for word in aligned.command[1:]} <= set(OF_CONSISTENCY)
+    assert {word.partition("=")[0] for word in aligned.command[1:]} <= set(types_of(OfConsistency))

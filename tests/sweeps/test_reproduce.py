@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweeps.asked import OF_THE_TABLE, settings_of
 from sweeps.sheet import results as table_results
 
 from rgbt.checks import InputError
+from rgbt.config.options import parse, types_of
 from rgbt.tracking.mlflow_store import NoTracking
+from sweeps.options import OF_THE_TABLE, Options, settings_of
 from sweeps.point import Point
-from sweeps.reproduce import OWN, entry
+from sweeps.reproduce import entry
 from sweeps.settings import EXECUTION, SweepSettings
 from sweeps.worker import point_list
 from sweeps.worker.point_list import Outcome, PointList
@@ -246,17 +247,19 @@ def test_mistakes_cost_one_sentence(
 
 
 def test_every_key_of_execution_is_a_key_of_the_command() -> None:
-    assert set(OWN) - set(OF_THE_TABLE) == set(EXECUTION)
+    assert set(types_of(Options)) - set(OF_THE_TABLE) == set(EXECUTION)
 
 
 def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() -> None:
-    given = {key: value for key, value in OWN.items() if value is not None}
-    plain = settings_of(given)
+    def given(*words: str) -> SweepSettings:
+        return settings_of(parse(Options, ["table=a", *words])[0])
+
+    plain = given()
     assert (plain.workers, plain.storage, plain.gpus, plain.submitit) == (1, None, None, {})
     url = "postgresql://me@host/db?a=b"
-    options = {"storage": url, "gpus": "[0,1]", "executor": "submitit"}
-    asked = settings_of(given | options | {"submitit": "{cluster: slurm, timeout_min: 9}"})
-    assert (asked.storage, asked.gpus) == (url, (0, 1))
-    assert asked.submitit == {"cluster": "slurm", "timeout_min": 9}
-    with pytest.raises(InputError, match="gpus="):
-        settings_of(given | {"gpus": "[0"})
+    options = (f"storage={url}", "gpus=[0,1]", "executor=submitit")
+    changed = given(*options, "submitit={cluster: slurm, timeout_min: 9}")
+    assert (changed.storage, changed.gpus) == (url, (0, 1))
+    assert changed.submitit == {"cluster": "slurm", "timeout_min": 9}
+    with pytest.raises(InputError, match="'gpus\\[0\\]' must be a whole number"):
+        given("gpus=[0")

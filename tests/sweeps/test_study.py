@@ -13,14 +13,9 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from rgbt.config.command import plain_command
 from sweeps import attributes
-from sweeps.study import OWN, dashboard_command, main, study_folder
+from sweeps.study import dashboard_command, entry, study_folder
 from tests.commands import Call, assert_one_sentence
-
-
-def entry() -> None:
-    plain_command(OWN, main)()
 
 
 @pytest.fixture

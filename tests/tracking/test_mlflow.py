@@ -17,7 +17,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build, check_node
+from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.folder import RunFolder
@@ -292,8 +292,8 @@ def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
     assert tracker.links()[0][0] == "MLflow later"
 
     uri = f"sqlite:///{runs_dir / 'mlflow.db'}"
-    assert sync.main([f"run={folder.path}", f"uri={uri}"]) == 0
-    assert sync.main([f"run={folder.path}"]) == 0, "the store that was asked for is remembered"
+    assert sync.entry.code([f"run={folder.path}", f"uri={uri}"]) == 0
+    assert sync.entry.code([f"run={folder.path}"]) == 0, "the requested store is remembered"
     sent = read_sent(folder)
     assert sent is not None
     assert sent.uri == uri
@@ -312,7 +312,7 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     assert tracker.links() == []
     assert read_sent(folder) is None
     shutil.rmtree(runs_dir / "dead", ignore_errors=True)  # has no reachable store if it ran alone
-    assert sync.main([f"runs_dir={runs_dir}"]) == 0
+    assert sync.entry.code([f"runs_dir={runs_dir}"]) == 0
     output = capsys.readouterr().out
     assert f"{folder.path}  ->  MLflow run " in output
     assert "mlflow ui --workers 1 --backend-store-uri sqlite:///" in output
@@ -328,11 +328,11 @@ def test_sync_of_all_folders_goes_on_behind_a_damaged_one(
     for key in ("a", "b"):
         begin(RunFolder(tmp_path / key), NoTracking())
     (tmp_path / "a" / name).write_text("{\n")
-    assert sync.main([f"runs_dir={tmp_path}"]) == 1
+    assert sync.entry.code([f"runs_dir={tmp_path}"]) == 1
     output = capsys.readouterr()
     assert f"rgbt: {tmp_path / 'a'} was not sent ({tmp_path / 'a' / name} is damaged" in output.err
     assert f"{tmp_path / 'b'}  ->  MLflow run " in output.out
-    assert sync.main([f"run={tmp_path / 'a'}"]) == 2
+    assert sync.entry.code([f"run={tmp_path / 'a'}"]) == 2
 
 
 def test_a_damaged_log_is_no_failure_of_the_store(
@@ -363,7 +363,7 @@ def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
     assert said.count("cannot be used") == 1
     assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
     assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
-    assert sync.main([f"run={folder.path}"]) == 0
+    assert sync.entry.code([f"run={folder.path}"]) == 0
     assert run_id(folder)
 
 
@@ -431,7 +431,7 @@ def test_artifact_table_has_unique_first_column_and_summaries_first() -> None:
 def test_sync_refuses_in_one_sentence(
     words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert sync.main(words) == 2
+    assert sync.entry.code(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("rgbt: ")
     assert sentence in error
@@ -444,7 +444,7 @@ def test_sync_asks_for_a_password_that_is_not_kept(tmp_path: Path) -> None:
         json.dumps({"uri": "postgresql://me:***@host/db", "experiment": "rgbt"})
     )
     with pytest.raises(InputError, match="give uri="):
-        sync.tracking_of(folder, {})
+        sync.tracking_of(folder, sync.Options(run=folder.path))
 
 
 def test_sync_hides_the_password_of_a_store_that_refuses(
@@ -458,7 +458,7 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
         raise ConnectionError(f"API request to {address}/api failed")
 
     monkeypatch.setattr(MlflowTracking, "sync", refuse)
-    assert sync.main([f"run={folder.path}", f"uri={address}"]) == 1
+    assert sync.entry.code([f"run={folder.path}", f"uri={address}"]) == 1
     error = capsys.readouterr().err
     assert "was not sent (API request to http://me:***@127.0.0.1:9/api failed)" in error
     assert "Secret" not in error
@@ -468,7 +468,7 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
 def test_configuration_builds(name: str, kind: type) -> None:
     loaded = OmegaConf.load(CONF / f"{name}.yaml")
     config = OmegaConf.create({"runs_dir": "runs", "tracking": loaded})
-    check_node(config.tracking, "tracking")
+    Component.from_node(config.tracking, "tracking")
     tracker = build(config.tracking)
     assert isinstance(tracker, kind)
     if isinstance(tracker, MlflowTracking):
@@ -505,11 +505,16 @@ def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> 
     folder = RunFolder(tmp_path / "run")
     write_sent(folder, Sent(uri, "e"))
     with pytest.raises(InputError, match=r"give uri=\.\.\. with it"):
-        sync.tracking_of(folder, {})
+        sync.tracking_of(folder, sync.Options(run=folder.path))
     write_sent(folder, Sent("http://h:5000", "e", "sftp://u:***@h/files"))
     with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
-        sync.tracking_of(folder, {})
-    assert sync.tracking_of(folder, {"artifact_uri": "sftp://u:pw@h/files"}).uri == "http://h:5000"
+        sync.tracking_of(folder, sync.Options(run=folder.path))
+    assert (
+        sync.tracking_of(
+            folder, sync.Options(run=folder.path, artifact_uri="sftp://u:pw@h/files")
+        ).uri
+        == "http://h:5000"
+    )
 
 
 @pytest.mark.parametrize(
@@ -534,7 +539,7 @@ def test_many_runs_wait_once_for_a_store_that_is_busy(
     monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
     monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
     with holding(tmp_path / ".mlflow.db.lock"):
-        assert sync.main([f"runs_dir={tmp_path}"]) == 1
+        assert sync.entry.code([f"runs_dir={tmp_path}"]) == 1
     said = capsys.readouterr().err
     assert said.count("waiting for process") == 1
     assert said.count("was not sent") == 3

@@ -10,7 +10,7 @@ from rgbt.checks import InputError
 from rgbt.tracking.folder import Description, RunFolder, find_run, runs_in
 from rgbt.tracking.mlflow_store import NoTracking
 from rgbt.tracking.replaced import description_of, replace_finished, runs_dir_of, set_aside
-from rgbt.tracking.sync import folders_of
+from rgbt.tracking.sync import Options, folders_of
 
 TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}
 
@@ -53,7 +53,7 @@ def test_a_replaced_run_is_no_run_of_the_folder_but_is_sent(tmp_path: Path) -> N
     replace_finished(finished(tmp_path), NoTracking())
     present = finished(tmp_path)
     assert [run.path for run in runs_in(tmp_path)] == [present.path]
-    sent = folders_of({"runs_dir": str(tmp_path)})
+    sent = folders_of(Options(runs_dir=tmp_path))
     assert [run.path for run in sent] == [present.path, tmp_path / "replaced" / "abc-1"]
     assert {runs_dir_of(run) for run in sent} == {tmp_path}
 

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.figures.__main__ import OF_FIGURES, OWN, main
+from analysis.figures import __main__ as figures
+from analysis.figures.__main__ import entry
 from analysis.figures.catalogue import FIGURES
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.statistics.data import SpatialStatistics
-from rgbt.config.command import plain_command
+from rgbt.config.options import types_of
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from tests.analysis.figures.drawn import counts, statistics, strips
@@ -23,7 +24,6 @@ from tests.analysis.robust_runs import SCORES, write_levels
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call
 
-ENTRY = plain_command(OWN, main)
 NAMES = [f"{index:05d}{'DN'[index % 2]}" for index in range(12)]
 
 
@@ -138,7 +138,7 @@ SAID = {
 def test_every_figure_is_drawn(call: Call, made: Path, tmp_path: Path, figure: str) -> None:
     out = tmp_path / "drawn" / "figure.svg"
     words = [*arguments(figure, made), *MORE.get(figure, ())]
-    code, said, err = call(ENTRY, f"figure={figure}", f"out={out}", *words)
+    code, said, err = call(entry, f"figure={figure}", f"out={out}", *words)
     assert (code, said.split()[:1]) == (0, [str(out)]), err
     drawn = out.read_text()
     assert "<svg" in drawn[:1000]
@@ -149,7 +149,7 @@ def test_largest_difference_takes_the_images_that_differ_most(
     call: Call, made: Path, tmp_path: Path
 ) -> None:
     words = arguments("spatialseg/fig8", made)
-    _, _, err = call(ENTRY, "figure=spatialseg/fig8", f"out={tmp_path / 'f.png'}", *words)
+    _, _, err = call(entry, "figure=spatialseg/fig8", f"out={tmp_path / 'f.png'}", *words)
     lines = [line for line in err.splitlines() if "mIoU" in line]
     # Method b is wrong in as many columns as the number in the name.
     assert [line.split()[1] for line in lines] == ["00011N:", "00010D:"]
@@ -157,17 +157,17 @@ def test_largest_difference_takes_the_images_that_differ_most(
 
 
 def test_lists_every_figure_with_what_it_needs(call: Call) -> None:
-    code, out, _ = call(ENTRY)
+    code, out, _ = call(entry)
     assert code == 0
-    for name, entry in FIGURES.items():
+    for name, each in FIGURES.items():
         (line,) = [line for line in out.splitlines() if line.split()[:1] == [name]]
-        assert entry.shows in line
+        assert each.shows in line
         assert entry.needs in line
 
 
 def test_keys_of_figures_are_keys_of_the_command() -> None:
     used = {key for entry in FIGURES.values() for key in entry.keys}
-    assert used == set(OF_FIGURES)
+    assert used == set(types_of(figures.Options)) - {"figure", "out"}
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
     ],
 )
 def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentence: str) -> None:
-    code, out, err = call(ENTRY, *words)
+    code, out, err = call(entry, *words)
     assert (code, out) == (2, "")
     assert sentence in err
     assert "Traceback" not in err
@@ -267,7 +267,7 @@ def test_input_that_does_not_fit(
     call: Call, made: Path, tmp_path: Path, figure: str, change: list[str], sentence: str
 ) -> None:
     words = [*arguments(figure, made), *(word.format(folder=made) for word in change)]
-    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
+    code, _, err = call(entry, f"figure={figure}", f"out={tmp_path / 'f.svg'}", *words)
     assert code == 2
     assert sentence in " ".join(err.split())
 
@@ -275,7 +275,7 @@ def test_input_that_does_not_fit(
 @pytest.mark.parametrize("figure", ["spatialseg/fig1", "spatialseg/fig4"])
 def test_maps_are_of_one_split(call: Call, made: Path, tmp_path: Path, figure: str) -> None:
     words = [f"figure={figure}", f"out={tmp_path / 'f.svg'}", f"maps={made / 'a'}", "split=val"]
-    code, _, err = call(ENTRY, *words)
+    code, _, err = call(entry, *words)
     assert code == 2
     assert "is of split 'test' already" in " ".join(err.split())
 
@@ -287,7 +287,7 @@ def test_commas_in_brackets_belong_to_the_name(call: Call, made: Path, tmp_path:
     (folder / "counts_ring5.npz").write_bytes((made / "a" / "counts_ring5.npz").read_bytes())
     out, other = tmp_path / "f.svg", made / "b" / "counts_ring5.npz"
     runs = f"CRM [1,2]:{folder}, {other}"
-    code, _, err = call(ENTRY, "figure=regions/heat", f"out={out}", f"runs={runs}")
+    code, _, err = call(entry, "figure=regions/heat", f"out={out}", f"runs={runs}")
     assert code == 0, err
     assert "CRM [1,2]" in out.read_text()
 
@@ -302,7 +302,7 @@ def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Pa
     runs = ",".join(f"ours:{tmp_path / name}.npz" for name in ("s0", "s1"))
     out = tmp_path / "f.svg"
     words = [f"runs={runs}", f"out={out}", "resamples=100", "blocks=none"]
-    code, _, err = call(ENTRY, "figure=regions/profile", *words)
+    code, _, err = call(entry, "figure=regions/profile", *words)
     assert code == 0, err
     assert "2 seeds, 20 images" in out.read_text()
 
@@ -310,9 +310,8 @@ def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Pa
 def test_help_does_not_wait_for_heavy_libraries() -> None:
     script = (
         "import sys; sys.argv = ['x', '--help']\n"
-        "from analysis.figures.__main__ import OWN, main\n"
-        "from rgbt.config.command import plain_command\n"
-        "try:\n    plain_command(OWN, main)()\nexcept SystemExit:\n    pass\n"
+        "from analysis.figures.__main__ import entry\n"
+        "try:\n    entry()\nexcept SystemExit:\n    pass\n"
         "print([m for m in ('torch', 'matplotlib', 'mlflow', 'pandas', 'cv2') if m in sys.modules])"
     )
     done = subprocess.run(
@@ -332,7 +331,7 @@ def test_methods_on_other_images_are_not_shown_together(
         counts = Counts.load(path)
         replace(counts.select(counts.names[:-1]), split="val").save(other / path.name)
     words = [word.replace(f"B:{made / 'b'}", f"B:{other}") for word in arguments(figure, made)]
-    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
+    code, _, err = call(entry, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
     assert code == 2
     assert "'A' was scored on 12 images of split 'test', such as " in err
     assert "'B' on 11 of 'val'" in err
@@ -341,7 +340,7 @@ def test_methods_on_other_images_are_not_shown_together(
 def test_a_file_in_the_place_of_a_folder_is_told_before_drawing(call: Call, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "f.pdf"
-    code, _, err = call(ENTRY, "figure=multihead/fig3", f"out={out}")
+    code, _, err = call(entry, "figure=multihead/fig3", f"out={out}")
     assert code == 2
     assert "is a file; give a folder" in err
 
@@ -354,6 +353,6 @@ def test_statistics_of_another_data_set_are_refused(
     other.save(tmp_path / "statistics.npz")
     words = [word for word in arguments(figure, made) if not word.startswith("statistics")]
     words.append(f"statistics={tmp_path}")
-    code, _, err = call(ENTRY, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
+    code, _, err = call(entry, f"figure={figure}", f"out={tmp_path / 'f.pdf'}", *words)
     assert code == 2
     assert "the scores of another data set" in err

@@ -10,16 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.figures.__main__ import OWN, main
+from analysis.figures.__main__ import entry
 from analysis.figures.robustness import MISSING, Curve, draw, numbers, panels
 from analysis.robustness import Training, levels_of
 from rgbt.checks import InputError
-from rgbt.config.command import plain_command
 from tests.analysis.figures.drawn import letters, texts
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
 
-ENTRY = plain_command(OWN, main)
 Scores = dict[tuple[str, str, str, float], int]
 
 
@@ -164,7 +162,7 @@ def test_the_command_draws_groups_and_writes_the_numbers(call: Call, tmp_path: P
     out = tmp_path / "drawn" / "robustness.svg"
     words = (f"runs_dir={runs}", f"out={out}", "degradations=noise, rgb_removed")
     code, said, err = call(
-        ENTRY, "figure=robustness", "runs=crm masker=none,mine:k0", *words, "absent=exclude"
+        entry, "figure=robustness", "runs=crm masker=none,mine:k0", *words, "absent=exclude"
     )
     assert code == 0, err
     assert said.split() == [str(out.with_suffix(suffix)) for suffix in (".svg", ".md", ".csv")]
@@ -183,6 +181,6 @@ def test_the_command_draws_groups_and_writes_the_numbers(call: Call, tmp_path: P
     ],
 )
 def test_bad_input(call: Call, tmp_path: Path, words: list[str], sentence: str) -> None:
-    code, out, err = call(ENTRY, *words, f"out={tmp_path / 'f.pdf'}", f"runs_dir={tmp_path}")
+    code, out, err = call(entry, *words, f"out={tmp_path / 'f.pdf'}", f"runs_dir={tmp_path}")
     assert (code, out) == (2, "")
     assert sentence in err

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from analysis.report import collect, page
-from analysis.report.__main__ import OWN, main
+from analysis.report.__main__ import entry
 from analysis.report.data import ReportData
-from rgbt.config.command import plain_command
 from rgbt.tracking.mlflow_store import MlflowTracking
 from tests.commands import Call, assert_one_sentence
 
@@ -28,10 +27,6 @@ EMPTY = ReportData(
     differences=(),
     remarks=tuple(f"Remark {number}." for number in range(7)),
 )
-
-
-def entry() -> None:
-    plain_command(OWN, main)()
 
 
 @pytest.fixture
@@ -102,8 +97,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(call: Call, tmp_path: Path
 def test_help_does_not_wait_for_libraries() -> None:
     code = (
         "import sys; sys.argv = ['report', '--help']; import analysis.report.__main__ as m\n"
-        "from rgbt.config.command import plain_command\n"
-        "try: plain_command(m.OWN, m.main)()\n"
+        "try: m.entry()\n"
         "except SystemExit: pass\n"
         "print({'torch', 'mlflow', 'matplotlib', 'pandas'} & set(sys.modules))"
     )

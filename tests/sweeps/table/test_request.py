@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import pytest
-from sweeps.asked import wanted_of
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.options import Options, request_of
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.worker.point_list import Outcome
@@ -155,9 +155,9 @@ def test_no_seeds(text: str) -> None:
 
 
 def test_rows_of_different_networks_take_weights_of_their_own() -> None:
-    arguments = {"scale": "paper", "seeds": "1"}
+    options = Options(table="spatialseg/table7", scale="paper")
     given = ("weights.mask2former_swin_t=/w/t=1.pth", "weights.mask2former_swin_b=b.pth", "x=1")
-    wanted = wanted_of("spatialseg/table7", arguments, given)
+    wanted = request_of(options.table, options, given)
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
     )
@@ -165,4 +165,4 @@ def test_rows_of_different_networks_take_weights_of_their_own() -> None:
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
     assert wanted.typed() == ("x=1", *given[:2])
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
-        wanted_of("spatialseg/table7", arguments, ("weights.mask2former_swinb=x",))
+        request_of(options.table, options, ("weights.mask2former_swinb=x",))

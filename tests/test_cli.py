@@ -1,0 +1,190 @@
+"""The command `rgbt`: every command's help and mistakes, completion, folders that shadow ours."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rgbt.__main__ import help_text
+from rgbt.config.commands import COMMANDS
+from rgbt.config.completion import OF_HYDRA, candidates
+from rgbt.config.shells import BASH, SCRIPTS
+from tests.commands import assert_one_sentence
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def python(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A Python with our packages installed, in a folder of the user's."""
+    lines = f"import sys\nsys.path.append({str(ROOT)!r})\n"
+    (folder / "site").mkdir(exist_ok=True)
+    (folder / "site" / "sitecustomize.py").write_text(lines)
+    variables = {**os.environ, "PYTHONPATH": str(folder / "site"), **environment}
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True)
+
+
+def rgbt(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """The console script."""
+    script = folder / "site" / "rgbt"
+    script.parent.mkdir(exist_ok=True)
+    script.write_text("from rgbt.__main__ import main\nif __name__ == '__main__':\n    main()\n")
+    return python(folder, str(script), *words)
+
+
+@pytest.fixture
+def shadowed(tmp_path: Path) -> Path:
+    """A folder that holds packages of the user's called as ours, and a masker of the user's."""
+    for name in ("sweeps", "analysis"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").touch()
+    text = "from rgbt.maskers.masker import Masker\nclass Mine(Masker):\n    pass\n"
+    (tmp_path / "my_masks.py").write_text(text)
+    return tmp_path
+
+
+def test_help_lists_every_command_and_its_module_exists() -> None:
+    shown = help_text()
+    for name, entry in COMMANDS.items():
+        assert f"\n  {name} " in shown
+        assert len(f"  {name:<13}{entry.about}") <= 80
+        path = ROOT / entry.module.replace(".", "/")
+        text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+        assert 'if __name__ == "__main__"' in text, entry.module
+
+
+def test_help_loads_neither_torch_nor_hydra(tmp_path: Path) -> None:
+    code = "import sys, rgbt.__main__ as m; sys.argv = ['rgbt', '--help']\ntry: m.main()\n"
+    code += "except SystemExit: print(sorted({'torch', 'hydra', 'omegaconf'} & set(sys.modules)))"
+    assert python(tmp_path, "-c", code).stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_command_explains_itself_and_refuses_a_wrong_option(name: str, tmp_path: Path) -> None:
+    shown = rgbt(tmp_path, name, "--help")
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert f"rgbt {name}" in shown.stdout
+    words = {"weights": ("inspect", "x.pth"), "reproduce": ("table=spatialseg/table3",)}
+    wrong = rgbt(tmp_path, name, *words.get(name, ()), "spilt=1")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert_one_sentence(wrong.stderr, "'spilt'")
+    assert "known: " in wrong.stderr or "did you mean" in wrong.stderr
+
+
+def test_unknown_command_names_the_nearest(tmp_path: Path) -> None:
+    wrong = python(tmp_path, "-m", "rgbt", "evaluat", "run=x")
+    assert wrong.returncode == 2
+    assert_one_sentence(wrong.stderr, "'evaluat' is not a command; did you mean 'evaluate'?")
+
+
+@pytest.mark.parametrize("group", ["experiment", "search", "debug"])
+def test_added_group_without_plus_says_to_add_it(group: str, tmp_path: Path) -> None:
+    wrong = rgbt(tmp_path, "run", f"{group}=grbm")
+    assert wrong.returncode == 2
+    assert_one_sentence(wrong.stderr, f"'{group}=grbm' needs a plus: +{group}=grbm.")
+
+
+# Folders of the user's.
+
+GRID = ("-m", "+experiment=grbm", "seed=0,1", "tracking=none", "hydra.sweeper.dry_run=true")
+
+
+def test_python_m_says_which_folder_shadows_sweeps(shadowed: Path) -> None:
+    wrong = python(shadowed, "-m", "rgbt.run", *GRID)
+    assert wrong.returncode == 2
+    assert_one_sentence(wrong.stderr, f"{shadowed}/sweeps is imported instead of rgbt's own")
+    assert "type `rgbt ...`" in wrong.stderr
+
+
+def test_console_script_is_not_shadowed(shadowed: Path) -> None:
+    right = rgbt(shadowed, "run", *GRID, "masker._target_=my_masks.Mine")
+    assert right.returncode == 0, right.stderr
+    assert "seed=1" in right.stdout
+    assert rgbt(shadowed, "reproduce", "new", "--help").returncode == 0
+    assert rgbt(shadowed, "report", "--help").returncode == 0
+    assert python(shadowed, "-m", "rgbt", "compare", "--help").returncode == 0
+
+
+@pytest.mark.slow
+def test_trials_of_the_console_script_are_not_shadowed(shadowed: Path) -> None:
+    short = ("trainer.max_steps=1", "trainer.eval_every=1", "trainer.accelerator=cpu")
+    words = (*GRID[:-1], "trainer.threads=1", *short, "masker._target_=my_masks.Mine")
+    right = rgbt(shadowed, "run", *words)
+    assert right.returncode == 0, right.stdout + right.stderr
+    assert len(list(shadowed.glob("runs/*/result.json"))) == 2
+
+
+# Completion.
+
+
+@pytest.mark.parametrize(
+    ("line", "some"),
+    [
+        ("rgbt ", {"run ", "evaluate ", "--help "}),
+        ("rgbt ev", {"evaluate "}),
+        ("rgbt evaluate sp", {"split="}),
+        ("rgbt compare missing=", {"missing=refuse ", "missing=leave_out "}),
+        ("rgbt cache remove=t", {"remove=true "}),
+        ("rgbt score datas", {"dataset=", "dataset."}),
+        ("rgbt score dataset=synth dataset.num", {"dataset.num_train="}),
+        ("rgbt weights ", {"inspect ", "export "}),
+        ("rgbt weights export fo", {"format="}),
+        ("rgbt reproduce n", {"new "}),
+        ("rgbt reproduce new exp", {"experiment="}),
+        ("rgbt run +experiment=gr", {"+experiment=grbm"}),
+        ("rgbt run +experiment=grbm,c", {"+experiment=grbm,crm"}),
+        ("rgbt run +experiment=grbm masker.si", {"masker.sigma_div="}),
+        ("rgbt run -m mod", {"model=", "model."}),
+        ("rgbt run -", {"-m", "--multirun"}),
+        ("rgbt check data", {"dataset=", "dataset."}),
+    ],
+)
+def test_completion_offers_what_fits_the_word(line: str, some: set[str]) -> None:
+    found = candidates(line)
+    assert some <= set(found)
+    last = "" if line.endswith(" ") else line.split()[-1]
+    assert all(each.startswith(last) for each in found)
+
+
+@pytest.mark.parametrize("line", ["rgbt nothing x", "rgbt compare dat", "rgbt sync runs_dir=a u=b"])
+def test_completion_offers_nothing_where_nothing_fits(line: str) -> None:
+    assert candidates(line) == []
+
+
+def test_commands_of_hydra_are_those_without_options() -> None:
+    for name, entry in COMMANDS.items():
+        path = ROOT / entry.module.replace(".", "/")
+        text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+        assert ("@command(" in text) == (name in OF_HYDRA), name
+
+
+def test_scripts_complete_rgbt_and_leave_python_alone() -> None:
+    for shell, script in SCRIPTS.items():
+        assert "rgbt --complete" in script
+        assert "python" not in script, shell
+
+
+@pytest.mark.parametrize(
+    ("line", "replies"),
+    [
+        ("rgbt ev", ["evaluate "]),
+        ("rgbt run +experiment=grbm_r", ["grbm_released"]),
+        ("rgbt compare a=x missing=l", ["leave_out "]),
+    ],
+)
+def test_bash_completes_behind_the_last_word_break(
+    line: str, replies: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "rgbt").write_text(f'#!/bin/sh\ncd {ROOT}; exec {sys.executable} -m rgbt "$@"\n')
+    (tmp_path / "rgbt").chmod(0o755)
+    asked = (
+        f"COMP_LINE='{line}' COMP_POINT={len(line)}; _rgbt; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    )
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    command = ["bash", "-c", f"{BASH}\n{asked}\n{shown}"]
+    done = subprocess.run(command, env=path, capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:-1] == replies
