@@ -1,5 +1,6 @@
-"""Tables, grids and searches: what is missing of them is run, each point in a process of its own.
+"""Tables, grids and searches: unfinished runs are executed, each in a process of its own.
 
-``python -m sweeps.reproduce table=spatialseg/table3`` and ``python -m rgbt.run -m ...`` stand on
-one mechanism: points in an Optuna study (`trial_store`), worked off by any number of drivers (`driver`).
+``python -m sweeps.reproduce table=spatialseg/table3`` and ``python -m rgbt.run -m ...`` share one
+mechanism: trials of an Optuna study (`worker.trial_store`), executed by any number of drivers
+(`worker.driver`).
 """

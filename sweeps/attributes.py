@@ -1,4 +1,4 @@
-"""Names of what is noted beside trials and studies in Optuna's storage."""
+"""Names of the user attributes of trials and studies in Optuna's storage."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ OVERRIDES = "rgbt.overrides"
 
 LABEL = "rgbt.label"
 OWNER = "rgbt.owner"
-"""Who works on the trial: host, process, start of the process, see `sweeps.worker.owner`."""
+"""Driver of the trial: host, process, start of the process, see `sweeps.worker.owner`."""
 
 HEARTBEAT = "rgbt.beat"
-"""Seconds since 1970 at which the owner last said that it is alive."""
+"""Time of the owner's last heartbeat, seconds since 1970."""
 
 TOKEN = "rgbt.token"
-"""Random text by which a driver finds the trial that it has added."""
+"""Random text that identifies the trial that a driver has added."""
 
 REASON = "rgbt.reason"
 """Why the trial failed, was pruned or dropped, in one sentence."""
 
 DROPPED = "rgbt.dropped"
-"""True: the trial does not count, another one stands for the same point."""
+"""True: the trial does not count, another one has the same point."""
 
 SECONDS = "rgbt.seconds"
-"""How long the point's runs took, all processes together."""
+"""Duration of the point's runs, all processes together."""
 
 RESULTS = "rgbt.results"
 """"val/..." and "test/..." scores of the point, mean over its seeds; percent, Var as it is."""
@@ -40,10 +40,10 @@ KIND = "rgbt.kind"
 """Of a study: "search", "grid" or "list"."""
 
 SIGNATURE = "rgbt.signature"
-"""Of a study: hash of what must not change, its space and its objectives."""
+"""Of a study: hash of its space and objectives, which must not change."""
 
 METRICS = "rgbt.metrics"
 """Of a study: names of the objectives, in order."""
 
 COMMAND = "rgbt.command"
-"""Of a study: the command that began it."""
+"""Of a study: the command that created it."""

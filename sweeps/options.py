@@ -167,9 +167,9 @@ def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequ
         InputError: no such table, scale or metric; no seeds.
     """
     from rgbt.config.compose import conf_dir
+    from sweeps.table.load_table import load_table
     from sweeps.table.request import TableRequest, seeds_of
     from sweeps.table.scoring import check_metrics
-    from sweeps.table.table import load_table
     from sweeps.worker.storage import NAME
 
     scales = [path.stem for path in (conf_dir() / "scale").glob("*.yaml")]
@@ -177,7 +177,7 @@ def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequ
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
         name = f"{table.paper}/{Path(name).stem}"
-    check_metrics(table, (row for row in table.rows if table.runnable(row)))
+    check_metrics(table)
     if not re.fullmatch(NAME, name):
         raise InputError(
             f"table={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone; "
@@ -204,7 +204,7 @@ def _weights(word: str) -> tuple[str, str]:
 def runs_of(workspace: Workspace) -> RunStore:
     """Where finished runs are found, as the overrides of the tracker say."""
     from rgbt.config.compose import compose
-    from sweeps.worker.run_store import open_run_store
+    from sweeps.run_specs import open_run_store
 
     with composing(workspace.base):
         config = compose([*workspace.base, f"fresh={str(workspace.fresh).lower()}"])

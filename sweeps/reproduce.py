@@ -63,7 +63,7 @@ def _preview_all(
 ) -> int:
     from rgbt.tracking.terminal import rich_table, show
     from sweeps.rendering.preview import tables_grid
-    from sweeps.table.table import table_names
+    from sweeps.table.load_table import table_names
     from sweeps.worker.point_list import preview_points
 
     if not settings.dry_run:
@@ -78,13 +78,13 @@ def _preview_all(
 
 
 def _reproduce(wanted: TableRequest, workspace: Workspace, settings: SweepSettings) -> int:
-    from sweeps.rendering.publish import finish
+    from sweeps.rendering.publish import publish_table
     from sweeps.worker.point_list import run_points
 
     runs = runs_of(workspace)
     points = point_list(wanted, workspace, runs)
     outcomes = run_points(points, settings) if points.points else []
-    return finish(wanted, outcomes, workspace.folder(wanted), runs.tracking)
+    return publish_table(wanted, outcomes, workspace.folder(wanted), runs.tracking)
 
 
 entry = CommandGroup(__doc__, {"new": NEW}, default=PlainCommand(Options, main))

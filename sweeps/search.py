@@ -1,4 +1,4 @@
-"""A search: a sampler chooses the points, bad ones are pruned, any number of drivers share it."""
+"""A search: a sampler chooses the points, a pruner stops bad ones, drivers share the study."""
 
 from __future__ import annotations
 
@@ -12,32 +12,31 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import tell
 from sweeps import attributes as names
-from sweeps.point import Point
+from sweeps.run_specs import PlannedRun, plan_run, specify_run
 from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_links, study_folder
-from sweeps.worker.driver import Driver
+from sweeps.worker.driver import drive
 from sweeps.worker.owner import Owner
-from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.point_list import make_executor
+from sweeps.worker.planner import Planner
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
+from sweeps.worker.sampler_source import SamplerSource
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_source import SamplerSource
-from sweeps.worker.trial_store import TrialStore, counted
+from sweeps.worker.trial_store import TrialStore, counted_trials
 
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched.
+    """A search to run.
 
     Attributes:
         study: name of the study.
         fixed: overrides that all trials share.
         parameters: the space.
-        runs: where finished runs are found.
-        identity: what of `fixed` must not change in a study: all but where things lie.
+        runs: finished runs.
+        identity: overrides of `fixed` that must not change in a study: all but paths.
     """
 
     study: str
@@ -48,7 +47,7 @@ class Search:
 
 
 def search(wanted: Search, settings: SweepSettings) -> None:
-    """Run trials until the budget is spent, then show what was found.
+    """Run trials until the budget is spent, then report the study.
 
     Raises:
         InputError: settings that do not fit, or a study of that name with another space.
@@ -60,49 +59,55 @@ def search(wanted: Search, settings: SweepSettings) -> None:
         )
     if settings.retry == "failed":
         raise InputError(
-            "retry=failed is for grids and tables; a search goes on with other points: give it "
-            "more trials, or retries=1 to try each failed point again at once."
+            "retry=failed is for grids and tables; a search continues with other points: give it "
+            "more trials, or retries=1 to retry each failed point at once."
         )
     sampler, pruner = _sampler_and_pruner(settings)
     if settings.dry_run:
         _preview(wanted, settings)
         return
-    probe = _probe(wanted)
-    _check_consistency(probe, settings)
+    probe = _probe(wanted, settings)
     storage = open_storage(settings.storage, wanted.runs.runs_dir)
-    wanted.runs.touch()
+    wanted.runs.create_tables()
     attributes = {
         names.KIND: "search",
         names.SIGNATURE: signature(
             wanted.parameters,
             settings.objectives,
             settings.replicates,
-            [*wanted.identity, probe.runs[0].dataset],
+            [*wanted.identity, probe.dataset],
         ),
     }
     study = open_study(wanted.study, storage, settings.objectives, attributes, sampler, pruner)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
-    store = TrialStore(study, storage, Owner.me())
-    tell(f"study {wanted.study}: the same command on other machines takes part in it.")
+    store = TrialStore(study, storage, Owner.this_process())
+    tell(f"study {wanted.study}: run the same command on other machines to share it.")
     _drive(wanted, settings, store)
-    _check_end(store, wanted.study)
+    _check_result(store, wanted.study)
     runs_dir = wanted.runs.runs_dir
     links = report(study, study_folder(runs_dir, wanted.study), wanted.runs.tracking)
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
 
 
-def _probe(wanted: Search) -> PlannedPoint:
-    """The lowest point of the space, checked with the highest one before the first trial.
+def _probe(wanted: Search, settings: SweepSettings) -> PlannedRun:
+    """The run at the lowest point of the space; the highest one is checked too.
 
     Raises:
-        InputError: an end that a setting does not take, a point that cannot be composed, or no
-            data set.
+        InputError: an end of a range that a setting does not accept, a point that cannot be
+            composed, a missing data set, or an objective that the runs do not measure.
     """
-    planner = Planner()
-    planner.spec((*wanted.fixed, *_end_of(wanted.parameters, "high")))
-    lowest = (*wanted.fixed, *_end_of(wanted.parameters, "low"))
-    return planner.plan(Point(label="probe", overrides=lowest))
+    specify_run((*wanted.fixed, *_end_of(wanted.parameters, "high")))
+    lowest = plan_run((*wanted.fixed, *_end_of(wanted.parameters, "low")), {})
+    for objective in settings.objectives:
+        split = objective.metric.partition("/")[0]
+        if objective.is_consistency and split not in lowest.consistency_splits:
+            splits = ",".join(dict.fromkeys((split, "test")))
+            raise InputError(
+                f"objective '{objective.metric}': the runs do not measure it; add "
+                f"consistency=views 'consistency.splits=[{splits}]'."
+            )
+    return lowest
 
 
 def _end_of(parameters: tuple[Parameter, ...], end: Literal["low", "high"]) -> list[str]:
@@ -115,42 +120,15 @@ def _end_of(parameters: tuple[Parameter, ...], end: Literal["low", "high"]) -> l
     return list(as_overrides(suggest(FixedTrial(values), parameters)))
 
 
-def _check_consistency(probe: PlannedPoint, settings: SweepSettings) -> None:
-    """Refuse an objective of two frames that the runs would not measure.
-
-    Raises:
-        InputError: the split is not among those of ``conf/consistency``.
-    """
-    for objective in filter(lambda each: each.is_consistency, settings.objectives):
-        views = Planner().spec(probe.runs[0].overrides).consistency.values
-        split = objective.metric.partition("/")[0]
-        if not views["sets"] or split not in views["splits"]:
-            splits = ",".join(dict.fromkeys((split, "test")))
-            raise InputError(
-                f"objective '{objective.metric}': the runs do not measure it; add "
-                f"consistency=views 'consistency.splits=[{splits}]'."
-            )
-
-
 def _drive(wanted: Search, settings: SweepSettings, store: TrialStore) -> None:
-    def done() -> int:
+    def num_done() -> int:
         return sum(trial.state.is_finished() for trial in store.trials())
 
-    view = ProgressView(wanted.study, settings.trials, settings.workers, done)
+    view = ProgressView(wanted.study, settings.trials, settings.workers, num_done)
     source = SamplerSource(
-        wanted.fixed, wanted.parameters, store, Planner(), settings, view.refused
+        wanted.fixed, wanted.parameters, store, Planner(), settings, view.rejected
     )
-    driver = Driver(
-        store=store,
-        source=source,
-        runs=wanted.runs,
-        executor=make_executor(settings, wanted.runs.runs_dir),
-        settings=settings,
-        view=view,
-        metrics=[objective.metric for objective in settings.objectives],
-    )
-    with view:
-        driver.run()
+    drive(view, source, store, wanted.runs, settings)
 
 
 def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
@@ -160,10 +138,10 @@ def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
     if settings.pruner is None:
         return sampler, build_pruner("none", {}, count)
     kind, _, options = _chosen(settings.pruner, "pruner")
-    if not settings.objectives[0].is_followed:
+    if not settings.objectives[0].is_reported:
         raise InputError(
             f"pruner: trials are compared while they train, but {settings.objectives[0].metric} is "
-            "known at the end alone; follow val/mIoU or take hydra.sweeper.pruner=null."
+            "known at the end alone; choose val/mIoU or hydra.sweeper.pruner=null."
         )
     return sampler, build_pruner(kind, options, count)
 
@@ -181,7 +159,7 @@ def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any
 def _preview(wanted: Search, settings: SweepSettings) -> None:
     """Say what would be searched, and what there is; write nothing."""
     study = find_study(wanted.study, settings.storage, wanted.runs.runs_dir)
-    trials = [] if study is None else counted(study)
+    trials = [] if study is None else counted_trials(study)
     states = Counter(trial.state.name.lower() for trial in trials)
     sys.stdout.write(f"study {wanted.study}: {dict(states) or 'not begun'}\n")
     for parameter in wanted.parameters:
@@ -194,7 +172,7 @@ def _preview(wanted: Search, settings: SweepSettings) -> None:
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
 
 
-def _check_end(store: TrialStore, name: str) -> None:
+def _check_result(store: TrialStore, name: str) -> None:
     trials = store.trials()
     states = Counter(trial.state.name for trial in trials)
     failed = [trial for trial in trials if trial.state.name == "FAIL"]

@@ -29,7 +29,7 @@ AT_THE_END = tuple(
 
 @dataclass(frozen=True)
 class Objective:
-    """One number that a search follows.
+    """One number that a search optimizes.
 
     Attributes:
         metric: "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
@@ -61,8 +61,8 @@ class Objective:
         return self.metric.partition("/")[2] in AT_THE_END
 
     @property
-    def is_followed(self) -> bool:
-        """Whether a run tells it while it trains."""
+    def is_reported(self) -> bool:
+        """Whether a run reports it while it trains."""
         return self.metric.startswith("val/") and not self.is_consistency
 
 
@@ -105,17 +105,8 @@ class SweepSettings:
             )
 
 
-EXECUTION = (
-    *("storage", "workers", "gpus", "executor", "submitit", "retries", "retry"),
-    *("timeout_minutes", "max_failures", "wait", "dry_run"),
-)
-"""Keys that say how points are run; the others say which."""
-
-
-EXPLAINED = "conf/hydra/sweeper/study.yaml"
-
-AS_WRITTEN: dict[str, type] = {"space": dict, "params": dict, "points": list}
-"""Keys whose interpolations (``${px:64}``) are for the runs and not for the sweep to resolve."""
+UNRESOLVED: dict[str, type] = {"space": dict, "params": dict, "points": list}
+"""Keys whose interpolations (``${px:64}``) are resolved by the runs, not by the sweep."""
 
 
 def read_settings(node: DictConfig) -> SweepSettings:
@@ -134,14 +125,16 @@ def read_settings(node: DictConfig) -> SweepSettings:
             )
     for key in known:
         if key not in raw:
-            raise InputError(f"'hydra.sweeper.{key}' has no value; see {EXPLAINED}.")
-    for key, kind in AS_WRITTEN.items():
+            raise InputError(
+                f"'hydra.sweeper.{key}' has no value; see conf/hydra/sweeper/study.yaml."
+            )
+    for key, kind in UNRESOLVED.items():
         raw[key] = kind() if raw[key] is None else raw[key]
         if not isinstance(raw[key], kind):
             what = "mapping" if kind is dict else "list"
             raise InputError(f"'hydra.sweeper.{key!s}' must be a {what}, got {raw[key]!r}.")
-    values = {key: node[key] for key in known if key not in AS_WRITTEN}
-    empty = {key: kind() for key, kind in AS_WRITTEN.items()}
+    values = {key: node[key] for key in known if key not in UNRESOLVED}
+    empty = {key: kind() for key, kind in UNRESOLVED.items()}
     own = {"_target_": "sweeps.settings.SweepSettings", **values, **empty}
     settings: SweepSettings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
     for point in raw["points"]:

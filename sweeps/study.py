@@ -150,7 +150,7 @@ def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
 
 def metrics(data: StudyData) -> dict[str, float]:
     """What MLflow shows of a study: the best of each objective, trials by state, steps saved."""
-    from sweeps.report.study_data import pruning
+    from sweeps.report.study_data import pruning_savings
     from sweeps.report.tables import WORDS
 
     found = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
@@ -158,7 +158,7 @@ def metrics(data: StudyData) -> dict[str, float]:
         values = [trial.values[index] for trial in data.complete]
         if values:
             found[f"best/{metric}"] = max(values) if data.maximize[index] else min(values)
-    saved = pruning(data)
+    saved = pruning_savings(data)
     if saved is not None:
         found["steps_saved"] = 100.0 * saved.share
     return found

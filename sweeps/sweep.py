@@ -21,12 +21,14 @@ from rgbt.tracking.terminal import rich_table, show, tell
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
+from sweeps.run_specs import open_run_store
 from sweeps.search import Search, search
 from sweeps.settings import SweepSettings, read_settings
 from sweeps.space.grid import GridPoint, SweptValues, distributions, grid_points, list_points, split
 from sweeps.space.merge import merge_space
 from sweeps.space.space import as_overrides
 from sweeps.worker.point_list import (
+    UNFINISHED,
     Outcome,
     PointList,
     estimated_seconds,
@@ -35,14 +37,14 @@ from sweeps.worker.point_list import (
     run_points,
 )
 from sweeps.worker.progress import duration
-from sweeps.worker.run_store import RunStore, open_run_store
+from sweeps.worker.run_store import RunStore
 
-PLACES = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
+PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""
 
 
 def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:
-    """Run what the overrides of ``-m`` ask for.
+    """Run the grid, list or search that the overrides of ``-m`` describe.
 
     Args:
         arguments: the task's overrides as typed.
@@ -50,11 +52,11 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         loader: of Hydra.
 
     Raises:
-        InputError: settings, space or points that do not fit.
+        InputError: invalid settings, space or points.
         RunError: points failed; all others were run.
     """
     settings = read_settings(config.hydra.sweeper)
-    # A word to the sweep, which decides for each point: no setting of its runs.
+    # `fresh` is for the sweep, which decides for each point: no setting of its runs.
     arguments = [word for word in arguments if word.partition("=")[0] != "fresh"]
     typed = [*_params(settings), *arguments]
     fixed, swept, intervals = split(typed, loader)
@@ -65,12 +67,12 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         taken = {parameter.key for parameter in parameters}
         shared = (*base, *(word for word in fixed if word.partition("=")[0] not in taken))
         if settings.points:
-            raise InputError("points and a search do not go together; give each its own command.")
+            raise InputError("points and a search cannot be combined; give each its own command.")
         identity = (sorted(shared), parameters, settings.objectives, settings.replicates)
         name = settings.study or _name(config, [p.key for p in parameters], identity)
         search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
         return
-    _refuse_what_is_for_searches(settings)
+    _refuse_search_settings(settings)
     points = _points(settings, fixed, swept)
     if len(points) == 1:
         tell("no list of values was given (such as seed=0,1,2): this is one point.")
@@ -86,7 +88,7 @@ def _params(settings: SweepSettings) -> list[str]:
     return [*(f"{key}={value}" for key, value in typed.items()), *as_overrides(others)]
 
 
-def _refuse_what_is_for_searches(settings: SweepSettings) -> None:
+def _refuse_search_settings(settings: SweepSettings) -> None:
     given = {
         "trials": settings.trials is not None,
         "hours": settings.hours is not None,
@@ -104,11 +106,11 @@ def _points(settings: SweepSettings, fixed: Sequence[str], swept: SweptValues) -
     grid = grid_points(fixed, swept)
     if not settings.points:
         return grid
-    found = []
-    for each in grid:
-        for own in list_points(settings.points, each.overrides):
-            found.append(GridPoint({**each.params, **own.params}, own.overrides))
-    return found
+    return [
+        GridPoint({**each.params, **own.params}, own.overrides)
+        for each in grid
+        for own in list_points(settings.points, each.overrides)
+    ]
 
 
 def _point_list(
@@ -128,72 +130,71 @@ def _point_list(
 
 
 def _label(point: GridPoint) -> str:
-    """What is particular to a point, values as typed: "sigma_div=1 seed=0"."""
+    """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
     names = short_names([key.lstrip("+") for key in point.params])
     return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
 def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
-    """The command that draws a study, without passwords; what is the default is left out."""
+    """The command that reports a study, without passwords and default values."""
     words = ["python", "-m", "sweeps.study", f"name={study}"]
     words += [f"runs_dir={runs_dir}"] if runs_dir != Path("runs") else []
     words += [f"storage={without_passwords(storage)}"] if storage else []
     return shlex.join(words)
 
 
-def _grid(wanted: PointList, settings: SweepSettings) -> None:
+def _grid(points: PointList, settings: SweepSettings) -> None:
+    outcomes = preview_points(points, settings)
     if settings.dry_run:
-        outcomes = preview_points(wanted, settings)
-        show(rich_table(grid_table(wanted, outcomes)))
+        show(rich_table(grid_table(points, outcomes)))
         seconds = estimated_seconds(outcomes, settings.workers)
-        missing = sum(outcome.state in ("waiting", "failed") for outcome in outcomes)
+        missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
         guess = "" if seconds is None else f", about {duration(seconds)}"
         tell(f"{missing} of {len(outcomes)} points would be run{guess}.")
-        _tell_other_code(outcomes)
+        _warn_other_code(outcomes)
         return
-    outcomes = preview_points(wanted, settings)
     wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
     if wrong:
-        # Nothing was run yet: a typing mistake is told before hours are spent on the other points.
+        # Before anything is run: a typing error should not cost hours of other runs.
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
-    outcomes = run_points(wanted, settings)
-    show(rich_table(group_grid(wanted.title, outcomes)))
+    outcomes = run_points(points, settings)
+    show(rich_table(group_grid(points.title, outcomes)))
     unfinished = unfinished_grid(outcomes)
     if unfinished.rows:
         show(rich_table(unfinished))
-    _tell_other_code(outcomes)
-    command = study_command(wanted.study, wanted.runs.runs_dir, settings.storage)
-    tell(f"study {wanted.study}; its figures: {command}")
+    _warn_other_code(outcomes)
+    command = study_command(points.study, points.runs.runs_dir, settings.storage)
+    tell(f"study {points.study}; its figures: {command}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(
             f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
-            f"{failed[0].reason} (hydra.sweeper.retry=failed tries them again)."
+            f"{failed[0].reason} (hydra.sweeper.retry=failed retries them)."
         )
 
 
-def _tell_other_code(outcomes: Sequence[Outcome]) -> None:
+def _warn_other_code(outcomes: Sequence[Outcome]) -> None:
     line = other_code_line(outcomes)
     if line:
         tell(line)
 
 
-def grid_table(wanted: PointList, outcomes: Sequence[Outcome]) -> Grid:
-    """A preview, one row per point: what it is, its scores on the test split, its state."""
+def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> Grid:
+    """A preview, one row per point: its label, its scores on the test split, its state."""
     metrics = (names.MIOU, names.VAR)
     rows = []
     for outcome in outcomes:
-        scores: Mapping[str, float] = outcome.found[0].scores() if outcome.found else {}
+        scores: Mapping[str, float] = outcome.results[0].scores() if outcome.results else {}
         shown = [f"test/{metric}" for metric in metrics]
         values = [number(scores[name]) if name in scores else ABSENT for name in shown]
         key = outcome.keys[0] if outcome.keys else ABSENT
         state = outcome.reason[:80] if outcome.reason else outcome.state
         rows.append((outcome.point.label, *values, key, state))
-    return Grid(wanted.title, ("point", *metrics, "run", "state"), tuple(rows))
+    return Grid(points.title, ("point", *metrics, "run", "state"), tuple(rows))
 
 
 def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:
-    """A name that the same command gives again: method, what varies, a hash of everything."""
+    """A reproducible name: the method, the varied keys, a hash of everything."""
     text = json.dumps(_plain(identity), sort_keys=True, default=vars)
     digest = hashlib.sha256(text.encode()).hexdigest()[:6]
     varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
@@ -201,17 +202,17 @@ def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """`value` without the overrides that only say where things lie."""
+    """`value` without the overrides that are only paths."""
     if isinstance(value, str):
         key = value.partition("=")[0].lstrip("+")
-        return None if key in PLACES or key.startswith("tracking.") else value
+        return None if key in PATHS or key.startswith("tracking.") else value
     if isinstance(value, list | tuple):
         return [plain for plain in map(_plain, value) if plain is not None]
     return value
 
 
 def _forwarded(config: DictConfig) -> list[str]:
-    """Overrides of Hydra itself that a run needs too, and what keeps it from being a sweep."""
+    """Overrides of Hydra itself that a run needs too; without a sweep of its own."""
     given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
     is_search = "search" in config.hydra.runtime.choices
     return [*given, *(["hydra.mode=RUN"] if is_search else [])]

@@ -16,7 +16,7 @@ from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import describe
 from rgbt.spec.specify import specify
-from sweeps.worker.run_store import RunResult
+from rgbt.tracking.run_result import RunResult
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, train
 from tests.conftest import pair, write_png
 from tests.test_consistency import ALIGNED, RELEASED, TEMPORAL, copied, measure
@@ -152,10 +152,10 @@ def test_what_is_measured_later_is_the_runs(
 
 
 def test_a_search_finds_what_was_added(call: Call, plain: Path) -> None:
-    assert "val/TC/aligned" not in RunResult(plain.name, plain).scores()
+    assert "val/TC/aligned" not in RunResult(plain).scores()
     code, _, err = measure(call, f"run={plain}", "split=val")
     assert code == 0, err
-    found = RunResult(plain.name, plain).scores()
+    found = RunResult(plain).scores()
     result = read(plain, "result.json")["val"]
     for name in SCORES:
         assert found[f"val/{name}"] == pytest.approx(100 * result[name])

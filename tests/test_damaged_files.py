@@ -317,9 +317,9 @@ def follow(path: Path) -> Any:
 
 
 def found(path: Path) -> Any:
-    from sweeps.worker.run_store import RunResult
+    from rgbt.tracking.run_result import RunResult
 
-    run = RunResult("key", path.parent)
+    run = RunResult(path.parent)
     return plain((run.dataset, run.commit, run.scores()))
 
 

@@ -20,9 +20,10 @@ from analysis.report.tables_files import (
 from analysis.report.tables_intervals import Intervals, Track
 from analysis.report.tables_scored import RescoredTable, asked_of, changed, score_again
 from rgbt.checks import InputError
+from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
 from sweeps.table.scoring import score
-from sweeps.table.table import Table, load_table, table_names
+from sweeps.table.table import Table
 
 
 def table_entries(

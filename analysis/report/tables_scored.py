@@ -12,9 +12,8 @@ from analysis.report.tables_intervals import OWN, CountsSource, counts_of
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import (
-    Place,
+    CellId,
     TableCell,
     derived,
     evaluation_of,
@@ -37,9 +36,9 @@ class _Opened:
     commit: str | None
     run: ReportRun
 
-    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
+    def counts(self, path: str = OWN) -> Counts:
         """Counts of an evaluation."""
-        return counts_of(self.run, OWN if evaluation is None else evaluation.path)
+        return counts_of(self.run, path)
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class _Outcome:
 
     state: str
     reason: str = ""
-    found: tuple[_Opened, ...] = ()
+    results: tuple[_Opened, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def score_again(
     return score(recorded.name, table, places, scale=recorded.scale, sizes=sizes)
 
 
-def _sizes(recorded: RecordedTable, table: Table) -> dict[Place, TableCell]:
+def _sizes(recorded: RecordedTable, table: Table) -> dict[CellId, TableCell]:
     """Columns of parameters as recorded: a network is not known here."""
     names = {column.name for column in table.columns if column.parameters}
     labels = {row.label for row in table.rows}
@@ -106,7 +105,7 @@ def _by_seed(
 def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     if run is None:
         return _Outcome("missing", f"run {key} is not in the store")
-    return _Outcome("finished", found=(_Opened(key, run.entry.commit or None, run),))
+    return _Outcome("finished", results=(_Opened(key, run.entry.commit or None, run),))
 
 
 def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from rgbt.tracking.csv_files import csv_text
 from sweeps.rendering.rendered_table import RenderedTable
-from sweeps.rendering.text_cell import Text
+from sweeps.rendering.text_cell import TextCell
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, published
 
@@ -28,54 +28,54 @@ LATEX_SPECIAL = {
 }
 
 
-def markdown(sheet: RenderedTable) -> str:
+def markdown(rendered: RenderedTable) -> str:
     """The table in Markdown, with title, footnotes and remarks."""
 
-    def shown(text: Text) -> str:
+    def shown(text: TextCell) -> str:
         escaped = text.whole.replace("|", "\\|")
         mark = ("", "**", "<u>")[text.rank]
         numbers = ", ".join(map(str, text.notes))
         notes = f"<sup>{numbers}</sup>" if numbers else ""
         return f"{mark}{escaped}{mark.replace('<', '</')}{notes}"
 
-    rule = ["---", *("---:" if text.text else "---" for text in sheet.header)]
-    rows = [[shown(text) for text in (Text(), *sheet.header)], rule]
-    rows += [[shown(text) for text in (line.label, *line.fields)] for line in sheet.lines]
+    rule = ["---", *("---:" if text.text else "---" for text in rendered.header)]
+    rows = [[shown(text) for text in (TextCell(), *rendered.header)], rule]
+    rows += [[shown(text) for text in (line.label, *line.fields)] for line in rendered.lines]
     lines = ["| " + " | ".join(row) + " |" for row in rows]
-    notes = [f"{index}. {note}" for index, note in enumerate(sheet.notes, start=1)]
-    remarks = [f"- {remark}" for remark in sheet.remarks_with(LEGEND)]
-    blocks = [[f"**{shown(sheet.title)}**"], lines, notes, remarks]
+    notes = [f"{index}. {note}" for index, note in enumerate(rendered.notes, start=1)]
+    remarks = [f"- {remark}" for remark in rendered.remarks_with(LEGEND)]
+    blocks = [[f"**{shown(rendered.title)}**"], lines, notes, remarks]
     return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
 
 
-def latex(sheet: RenderedTable) -> str:
+def latex(rendered: RenderedTable) -> str:
     """A LaTeX table that needs the package booktabs: ours and published, best bold.
 
     The differences and the comparison of orders are left to the other forms.
     """
 
-    def shown(text: Text) -> str:
+    def shown(text: TextCell) -> str:
         command = ("", r"\textbf", r"\underline")[text.rank]
         escaped = _escaped(text.whole)
         notes = f"$^{{{','.join(map(str, text.notes))}}}$" if text.notes else ""
         return f"{command}{{{escaped}}}{notes}" if command else f"{escaped}{notes}"
 
-    def row(texts: Iterable[Text]) -> str:
+    def row(texts: Iterable[TextCell]) -> str:
         return " & ".join(map(shown, texts)) + r" \\"
 
-    sides = "".join("r" if text.text else "l" for text in sheet.header)
-    lines = [line for line in sheet.lines if line.kind not in NOT_IN_PAPERS]
-    below = [f"$^{{{i}}}$ {_escaped(note)}" for i, note in enumerate(sheet.notes, start=1)]
-    below += [_escaped(remark) for remark in sheet.remarks_with(LEGEND)]
+    sides = "".join("r" if text.text else "l" for text in rendered.header)
+    lines = [line for line in rendered.lines if line.kind not in NOT_IN_PAPERS]
+    below = [f"$^{{{i}}}$ {_escaped(note)}" for i, note in enumerate(rendered.notes, start=1)]
+    below += [_escaped(remark) for remark in rendered.remarks_with(LEGEND)]
     return "\n".join(
         [
             "% needs \\usepackage{booktabs}",
             r"\begin{table}",
             r"\centering",
-            rf"\caption{{{shown(sheet.title)}}}",
+            rf"\caption{{{shown(rendered.title)}}}",
             rf"\begin{{tabular}}{{l{sides}}}",
             r"\toprule",
-            row((Text(), *sheet.header)),
+            row((TextCell(), *rendered.header)),
             r"\midrule",
             *(row((line.label, *line.fields)) for line in lines),
             r"\bottomrule",

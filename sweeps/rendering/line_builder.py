@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rgbt.tracking.tables import number
-from sweeps.rendering.text_cell import Footnotes, TableLine, Text
+from sweeps.rendering.text_cell import Footnotes, TableLine, TextCell
 from sweeps.table.cells import NO_VALUE, TableCell, is_counted, is_of_runs, metric_of
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
@@ -55,21 +55,21 @@ class LineBuilder:
         spread = any(cell.seeds > 1 for cell in self.scored.cells.values())
         return len(self.columns) > WITH_SD and spread
 
-    def header(self, columns: Sequence[Text]) -> tuple[Text, ...]:
+    def header(self, columns: Sequence[TextCell]) -> tuple[TextCell, ...]:
         """Above the fields of a line, from the names of the columns."""
         if not self.beside:
-            return (Text(), Text("seeds"), *columns)
-        words = tuple(map(Text, BESIDE_OURS))
+            return (TextCell(), TextCell("seeds"), *columns)
+        words = tuple(map(TextCell, BESIDE_OURS))
         named = zip(self.columns, columns, strict=True)
         beside = [(text, *(words if column.printed else ())) for column, text in named]
-        return (Text("seeds"), *(text for texts in beside for text in texts))
+        return (TextCell("seeds"), *(text for texts in beside for text in texts))
 
     def row(self, row: Row) -> list[TableLine]:
         """The lines of one row: all in one where they fit beside each other."""
         printed = [column for column in self.columns if published(row, column) is not None]
         runs = any((row.label, column.name) in self.scored.cells for column in self.columns)
-        label = Text(row.label, notes=self.notes(*self._label_notes(row)))
-        kinds: dict[str, Callable[[Row, Column], Text]] = {}
+        label = TextCell(row.label, notes=self.notes(*self._label_notes(row)))
+        kinds: dict[str, Callable[[Row, Column], TextCell]] = {}
         if runs:
             kinds["ours"] = self._ours
         if runs and self.sd_apart:
@@ -83,10 +83,10 @@ class LineBuilder:
         lines: list[TableLine] = []
         for kind, text in kinds.items():
             word = "± sd" if kind == "sd" else kind
-            seeds = self._seeds(row) if kind == "ours" else Text()
+            seeds = self._seeds(row) if kind == "ours" else TextCell()
             texts = (text(row, column) for column in self.columns)
             lines.append(
-                TableLine(kind, label if not lines else Text(), (Text(word), seeds, *texts))
+                TableLine(kind, label if not lines else TextCell(), (TextCell(word), seeds, *texts))
             )
         return lines
 
@@ -95,25 +95,27 @@ class LineBuilder:
         orders = [self.scored.orders[column.name] for column in self.columns]
         if not any(order.rows for order in orders):
             return []
-        rhos = [Text(_signed(order.rho)) for order in orders]
-        rows = [Text(str(order.rows)) for order in orders]
+        rhos = [TextCell(_signed(order.rho)) for order in orders]
+        rows = [TextCell(str(order.rows)) for order in orders]
         if self.beside:
             apart = [self._apart(texts) for texts in (rhos, rows)]
-            labels = Text("order of rows: rho"), Text("n")
+            labels = TextCell("order of rows: rho"), TextCell("n")
             pairs = zip(labels, apart, strict=True)
-            return [TableLine("order", label, (Text(), *texts)) for label, texts in pairs]
+            return [TableLine("order", label, (TextCell(), *texts)) for label, texts in pairs]
         return [
-            TableLine("order", Text("order of rows"), (Text("rho"), Text(), *rhos)),
-            TableLine("order", Text(), (Text("n"), Text(), *rows)),
+            TableLine("order", TextCell("order of rows"), (TextCell("rho"), TextCell(), *rhos)),
+            TableLine("order", TextCell(), (TextCell("n"), TextCell(), *rows)),
         ]
 
-    def _apart(self, texts: Sequence[Text]) -> list[Text]:
+    def _apart(self, texts: Sequence[TextCell]) -> list[TextCell]:
         """A text per column, with room for what is published of it."""
         pairs = zip(self.columns, texts, strict=True)
-        apart = [(text, Text(), Text()) if column.printed else (text,) for column, text in pairs]
+        apart = [
+            (text, TextCell(), TextCell()) if column.printed else (text,) for column, text in pairs
+        ]
         return [text for each in apart for text in each]
 
-    def _triples(self, row: Row) -> list[Text]:
+    def _triples(self, row: Row) -> list[TextCell]:
         """Ours, published and difference of every column; ours alone where it is not printed."""
         beside = (self._published, self._difference)
         kinds = [(self._ours, *(beside if column.printed else ())) for column in self.columns]
@@ -140,41 +142,41 @@ class LineBuilder:
         cells = (self.scored.cells.get((row.label, column.name)) for column in self.columns)
         return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
 
-    def _seeds(self, row: Row) -> Text:
+    def _seeds(self, row: Row) -> TextCell:
         """How many seeds the row's values are means of."""
         columns = filter(is_of_runs, self.columns)
         cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
         there = [cell.seeds for cell in cells if cell is not None]
         counts = sorted({seeds for seeds in there if seeds} or set(there))
-        return Text("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
+        return TextCell("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
 
-    def _ours(self, row: Row, column: Column) -> Text:
+    def _ours(self, row: Row, column: Column) -> TextCell:
         place = (row.label, column.name)
         cell = self.scored.cells.get(place)
         if cell is None:
-            return Text(DASH)
+            return TextCell(DASH)
         notes = self.notes(cell.reason and _sentence(cell))
         if math.isnan(cell.mean):
-            return Text(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
+            return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
         spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
         rank = self.scored.ranks_ours.get(place, 0)
-        return Text(f"{cell.mean:.2f}", spread, rank, notes)
+        return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
 
-    def _sd(self, row: Row, column: Column) -> Text:
+    def _sd(self, row: Row, column: Column) -> TextCell:
         cell = self.scored.cells.get((row.label, column.name))
-        return Text(DASH if cell is None else number(cell.sd))
+        return TextCell(DASH if cell is None else number(cell.sd))
 
-    def _published(self, row: Row, column: Column) -> Text:
+    def _published(self, row: Row, column: Column) -> TextCell:
         printed = published(row, column)
         if printed is None:
-            return Text(DASH)
+            return TextCell(DASH)
         doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
         rank = self.scored.ranks_published.get((row.label, column.name), 0)
         notes = self.notes(*doubts)
-        return Text(f"{printed:.{self.decimals}f}", rank=rank, notes=notes)
+        return TextCell(f"{printed:.{self.decimals}f}", rank=rank, notes=notes)
 
-    def _difference(self, row: Row, column: Column) -> Text:
-        return Text(_signed(self.scored.difference(row, column)))
+    def _difference(self, row: Row, column: Column) -> TextCell:
+        return TextCell(_signed(self.scored.difference(row, column)))
 
 
 def _sentence(cell: TableCell) -> str:

@@ -1,4 +1,4 @@
-"""How one panel of a table's figure is drawn: our values and the published ones."""
+"""One panel of a table's figure: our values and the published ones."""
 
 from __future__ import annotations
 

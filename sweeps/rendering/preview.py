@@ -1,4 +1,4 @@
-"""What `dry_run=true` shows of a table: its cells, what is known of them, the time left."""
+"""The preview of a table (`dry_run=true`): its runs with their states, the time left."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from rgbt.tracking.tables import ABSENT, Grid
 from sweeps.table.parameter_counts import SCALE
 from sweeps.table.request import TableRequest
+from sweeps.worker.list_source import State
 from sweeps.worker.point_list import Outcome, estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
-from sweeps.worker.trial_source import State
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
 
 
-def cells_grid(wanted: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
+def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
     """One line per run: state, seconds or the reason why it failed, command."""
     rows = [
         (
@@ -29,27 +29,27 @@ def cells_grid(wanted: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
         )
         for outcome in outcomes
     ]
-    title = f"{wanted.name}, scale={wanted.scale}: runs of the cells"
+    title = f"{request.name}, scale={request.scale}: runs of the cells"
     return Grid(title, ("cell", "state", "seconds", "run", "reason"), tuple(rows))
 
 
-def tables_grid(surveyed: Sequence[tuple[TableRequest, Sequence[Outcome]]], workers: int) -> Grid:
+def tables_grid(previews: Sequence[tuple[TableRequest, Sequence[Outcome]]], workers: int) -> Grid:
     """One line per table: rows, runs by state, estimated time."""
     rows = []
-    for wanted, outcomes in surveyed:
-        runnable = len({label for label, _ in wanted.places()})
+    for request, outcomes in previews:
+        runnable = len({label for label, _ in request.row_seeds()})
         states = Counter(outcome.state for outcome in outcomes)
         counts = (str(states[state]) for state in STATES)
         seconds = estimated_seconds(outcomes, workers)
         known = "unknown" if seconds is None else duration(seconds)
         time = known if outcomes else ABSENT
-        rows.append((wanted.name, f"{runnable} of {len(wanted.table.rows)}", *counts, time))
+        rows.append((request.name, f"{runnable} of {len(request.table.rows)}", *counts, time))
     header = ("table", "rows to run", *STATES, "time left")
     return Grid("Runs of all tables", header, tuple(rows))
 
 
-def summary(wanted: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:
-    """Sentences below the cells: how many, how long, what cannot be run."""
+def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:
+    """Sentences below the runs: numbers, time left, what cannot be run."""
     states = Counter(outcome.state for outcome in outcomes)
     counted = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
     lines = [f"{len(outcomes)} runs: {counted or 'none'}."]
@@ -59,13 +59,13 @@ def summary(wanted: TableRequest, outcomes: Sequence[Outcome], workers: int) -> 
         known = duration(seconds) if seconds is not None else "known once a run is finished"
         lines.append(f"Time left with workers={workers}: {known}.")
     lines += [line for line in (other_code_line(outcomes),) if line]
-    lines += _evaluations(wanted, outcomes)
-    if wanted.table.needs is not None:
-        lines.append(f"The table cannot be run yet; it needs {wanted.table.needs}.")
-    for row in wanted.table.rows:
+    lines += _evaluations(request, outcomes)
+    if request.table.needs is not None:
+        lines.append(f"The table cannot be run yet; it needs {request.table.needs}.")
+    for row in request.table.rows:
         if row.needs is not None:
             lines.append(f"Row '{row.label}' cannot be run yet; it needs {row.needs}.")
-    for column in wanted.table.columns:
+    for column in request.table.columns:
         if column.needs is not None:
             lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
         if column.parameters:
@@ -73,13 +73,13 @@ def summary(wanted: TableRequest, outcomes: Sequence[Outcome], workers: int) -> 
     return lines
 
 
-def _evaluations(wanted: TableRequest, outcomes: Sequence[Outcome]) -> list[str]:
-    """What is made of every run beside its own evaluation, and which runs lack nothing else."""
-    asked = [shlex.join(evaluation.command) for evaluation in wanted.evaluations()]
-    if not outcomes or not asked:
+def _evaluations(request: TableRequest, outcomes: Sequence[Outcome]) -> list[str]:
+    """Further evaluations of every run, and the number of runs that lack nothing else."""
+    commands = [shlex.join(evaluation.command) for evaluation in request.evaluations()]
+    if not outcomes or not commands:
         return []
-    commands = "; ".join(f"python -m {command}" for command in dict.fromkeys(asked))
-    lines = [f"Made of every run that lacks it: {commands}."]
+    shown = "; ".join(f"python -m {command}" for command in dict.fromkeys(commands))
+    lines = [f"Made of every run that lacks it: {shown}."]
     trained = sum(outcome.is_trained for outcome in outcomes)
     if trained:
         lines.append(f"Trained already: {trained}; the time of evaluations is not counted.")

@@ -1,4 +1,4 @@
-"""A finished table: printed, written as files and sent to MLflow."""
+"""Prints a computed table, writes its files and records it in MLflow."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from rgbt.tracking.tracker import Tracking
 
 
-def finish(wanted: TableRequest, outcomes: Sequence[Outcome], out: Path, tracking: Tracking) -> int:
+def publish_table(
+    request: TableRequest, outcomes: Sequence[Outcome], out: Path, tracking: Tracking
+) -> int:
     """Print the table, write its files, record it in MLflow.
 
     Args:
-        wanted: the table.
+        request: the table.
         outcomes: of its points.
         out: folder for table.md, table.csv, table.tex and figure.png.
         tracking: as the configuration builds it.
@@ -37,41 +39,41 @@ def finish(wanted: TableRequest, outcomes: Sequence[Outcome], out: Path, trackin
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs, sizes = wanted.runs(outcomes), parameter_cells(wanted)
-    scored = score(wanted.name, wanted.table, runs, scale=wanted.scale, sizes=sizes)
-    sheet = render_table(scored, wanted.typed())
-    show(terminal(sheet, plain=not sys.stdout.isatty(), width=line_width()))
-    failed = _tell_what_is_missing(scored, outcomes)
+    runs, sizes = request.runs(outcomes), parameter_cells(request)
+    scored = score(request.name, request.table, runs, scale=request.scale, sizes=sizes)
+    rendered = render_table(scored, request.typed_overrides())
+    show(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
+    failed = _report_missing(scored, outcomes)
     try:
-        files = write_files(scored, sheet, out)
+        files = write_files(scored, rendered, out)
     except OSError as error:
         tell(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
         return 1
     links = record(
         tracking,
-        name=f"{wanted.name} {wanted.variant}",
+        name=f"{request.name} {request.variant}",
         kind="table",
         files=files,
         metrics=metrics(scored, outcomes),
         tags={
-            "rgbt.table": wanted.name,
-            "rgbt.scale": wanted.scale,
-            "rgbt.seeds": ", ".join(map(str, wanted.seeds)),
+            "rgbt.table": request.name,
+            "rgbt.scale": request.scale,
+            "rgbt.seeds": ", ".join(map(str, request.seeds)),
         },
-        note=markdown(sheet),
+        note=markdown(rendered),
     )
-    places = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
-    show(place_lines(places))
+    links = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
+    show(place_lines(links))
     return 1 if failed else 0
 
 
-def write_files(scored: ScoredTable, sheet: RenderedTable, out: Path) -> list[Path]:
+def write_files(scored: ScoredTable, rendered: RenderedTable, out: Path) -> list[Path]:
     """Write the table in every form, and its figure where there is something to draw."""
     out.mkdir(parents=True, exist_ok=True)
     texts = {
-        "table.md": markdown(sheet),
+        "table.md": markdown(rendered),
         "table.csv": tidy_csv(scored),
-        "table.tex": latex(sheet),
+        "table.tex": latex(rendered),
     }
     for name, text in texts.items():
         write_atomic(out / name, text.encode())
@@ -88,20 +90,20 @@ def metrics(scored: ScoredTable, outcomes: Sequence[Outcome]) -> dict[str, float
     return counts | {name: rho for name, rho in rhos.items() if math.isfinite(rho)}
 
 
-def _tell_what_is_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:
+def _report_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:
     """Lines on stderr; whether a cell failed or has no value."""
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     others = [outcome for outcome in outcomes if outcome.state in ("running", "waiting")]
     empty = any(cell.mark == NO_VALUE for cell in scored.cells.values())
     if failed:
         tell(
-            f"{len(failed)} of {len(outcomes)} runs failed, see the footnotes; the same command "
-            "with retry=failed tries them again."
+            f"{len(failed)} of {len(outcomes)} runs failed, see the footnotes; rerun the command "
+            "with retry=failed to retry them."
         )
     if others:
         tell(
-            f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them or "
-            "have not begun; the same command later completes the table, wait=true stays for it."
+            f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them, or "
+            "they have not begun; rerun the command later, or with wait=true."
         )
     if empty:
         tell("some cells have no value although nothing is missing, see the footnotes.")

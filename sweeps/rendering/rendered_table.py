@@ -1,4 +1,4 @@
-"""A computed table as lines of text with footnotes, before it becomes any kind of file."""
+"""A computed table as lines of text with footnotes, the source of all file formats."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sweeps.rendering.line_builder import LineBuilder
-from sweeps.rendering.text_cell import Footnotes, TableLine, Text
+from sweeps.rendering.text_cell import Footnotes, TableLine, TextCell
 from sweeps.table.parameter_counts import SCALE
 from sweeps.table.scoring import ScoredTable
 from sweeps.table.table import Column
@@ -26,30 +26,30 @@ PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and with
 
 @dataclass(frozen=True)
 class RenderedTable:
-    """What is shown.
+    """The text of a table.
 
     Attributes:
         title: number and caption.
         header: above the fields of a line; the column of labels has none.
-        lines: those of a row follow each other.
+        lines: in the order of the rows.
         notes: footnotes, 1 first.
-        remarks: sentences below the table that no mark refers to.
+        remarks: sentences below the table without a footnote mark.
     """
 
-    title: Text
-    header: tuple[Text, ...]
+    title: TextCell
+    header: tuple[TextCell, ...]
     lines: tuple[TableLine, ...]
     notes: tuple[str, ...]
     remarks: tuple[str, ...]
 
     def remarks_with(self, legend: str) -> list[str]:
-        """The remarks, with the legend of the marks if there are any."""
+        """The remarks, with the legend where a cell is ranked."""
         marked = any(text.rank for line in self.lines for text in line.fields)
         return [*self.remarks, *([legend] if marked else [])]
 
 
 def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTable:
-    """Lay a table out.
+    """Format a computed table.
 
     Args:
         scored: the table.
@@ -57,12 +57,14 @@ def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTabl
     """
     table, notes = scored.table, Footnotes()
     builder = LineBuilder(scored, notes)
-    title = Text(f"{table.paper}, {table.number}: {table.caption}")
+    title = TextCell(f"{table.paper}, {table.number}: {table.caption}")
     title_notes = notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
-    columns = [Text(column.name, notes=notes(*_column_notes(column))) for column in table.columns]
+    columns = [
+        TextCell(column.name, notes=notes(*_column_notes(column))) for column in table.columns
+    ]
     lines = [line for row in table.rows for line in builder.row(row)] + builder.order()
     return RenderedTable(
-        title=Text(title.text, notes=title_notes),
+        title=TextCell(title.text, notes=title_notes),
         header=builder.header(columns),
         lines=tuple(lines),
         notes=tuple(notes.sentences),
@@ -71,7 +73,7 @@ def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTabl
 
 
 def _column_notes(column: Column) -> list[str]:
-    """Footnotes of a column: that the paper does not have it, that it cannot be computed."""
+    """Footnotes of a column: not in the paper, not computed."""
     ours = [] if column.printed else [NOT_PRINTED]
     return ours + ([f"Not computed: {column.needs}"] if column.needs else [])
 

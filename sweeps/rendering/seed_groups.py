@@ -1,4 +1,4 @@
-"""The end of a grid: one row per configuration, mean and spread over its seeds."""
+"""The result of a grid: one row per configuration, mean and spread over its seeds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps.point import Point
-from sweeps.rendering.text_cell import Text
+from sweeps.rendering.text_cell import TextCell
 from sweeps.table.cells import TableCell, Value, over_seeds
 from sweeps.worker.point_list import Outcome
 
@@ -52,7 +52,7 @@ def unfinished_grid(outcomes: Sequence[Outcome]) -> Grid:
 
 
 def configuration(point: Point) -> str:
-    """What the seeds of a point share: its label without the seed, else its experiment."""
+    """The label of a point without its seed, else its experiment."""
     label = " ".join(word for word in point.label.split(" ") if not word.startswith("seed="))
     named = (word.partition("=") for word in point.overrides)
     return label or next((value for key, _, value in named if key == "+experiment"), ABSENT)
@@ -60,7 +60,7 @@ def configuration(point: Point) -> str:
 
 def _metrics(outcomes: Sequence[Outcome]) -> list[str]:
     """Names of the columns: mIoU, Var and the regions that some run has."""
-    known = {name for outcome in outcomes for run in outcome.found for name in run.scores()}
+    known = {name for outcome in outcomes for run in outcome.results for name in run.scores()}
     regions = map(names.region, range(1, MOST_REGIONS))
     return [names.MIOU, names.VAR, *(name for name in regions if f"test/{name}" in known)]
 
@@ -68,7 +68,9 @@ def _metrics(outcomes: Sequence[Outcome]) -> list[str]:
 def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
     values: dict[int, Value] = {}
     for index, outcome in enumerate(members):
-        scores = outcome.found[0].scores() if outcome.state == "finished" and outcome.found else {}
+        scores = (
+            outcome.results[0].scores() if outcome.state == "finished" and outcome.results else {}
+        )
         values[index] = scores.get(f"test/{metric}", outcome.reason or outcome.state)
     return over_seeds(values)
 
@@ -79,4 +81,4 @@ def _seeds(cell: TableCell, members: Sequence[Outcome]) -> str:
 
 def _shown(cell: TableCell) -> str:
     spread = number(cell.sd) if cell.seeds > 1 else ""
-    return Text(number(cell.mean), spread).whole
+    return TextCell(number(cell.mean), spread).whole

@@ -11,7 +11,7 @@ from rgbt.tracking.fit import SHORTEST, blocks, shortened
 from rgbt.tracking.terminal import WIDTH
 from sweeps.rendering.line_builder import BESIDE_OURS, WITH_SD
 from sweeps.rendering.rendered_table import RenderedTable
-from sweeps.rendering.text_cell import Text
+from sweeps.rendering.text_cell import TextCell
 
 STYLES = ("", "bold", "underline")
 SIGNS = ("", "*", "_")
@@ -26,34 +26,34 @@ WIDE = WITH_SD + 2
 LEGENDS = ("Bold: best, underlined: second best.", "*: best, _: second best.")
 
 
-def terminal(sheet: RenderedTable, *, plain: bool = False, width: int = WIDTH) -> RichText:
+def terminal(rendered: RenderedTable, *, plain: bool = False, width: int = WIDTH) -> RichText:
     """The table for `rgbt.tracking.terminal.show`.
 
     Args:
-        sheet: the table.
+        rendered: the table.
         plain: mark the best with signs, where neither bold nor underline would be shown.
         width: of a line; labels are shortened and columns folded to it, numbers never cut.
     """
-    header = [(Text(), *line) for line in _stacked(sheet.header)]
-    rows = [*header, *((line.label, *line.fields) for line in sheet.lines)]
+    header = [(TextCell(), *line) for line in _stacked(rendered.header)]
+    rows = [*header, *((line.label, *line.fields) for line in rendered.lines)]
     fields = _fields(rows, plain=plain)
     if sum(_widths(fields)) + GAP * (len(fields[0]) - 1) > width:
         fields = _fields(_with_short_labels(rows, max(SHORTEST, width // 3)), plain=plain)
     widths = _widths(fields)
     # The labels: of the row, of the line where a row has several, and the number of seeds.
-    first = 2 if any(line.kind == "all" for line in sheet.lines) else 3
+    first = 2 if any(line.kind == "all" for line in rendered.lines) else 3
     starts = [n for n, text in enumerate(header[-1]) if n >= first and text.text not in BESIDE_OURS]
     shown: list[RichText] = []
     for part in blocks(widths, width, gap=GAP, first=first, starts=starts):
         shown += [RichText()] if shown else []
-        shown += _block(sheet, [[row[n].copy() for n in part] for row in fields])
-    title = RichText(f"{sheet.title.text}{_bracketed(sheet.title)}", "bold")
-    below = [f"[{index}] {note}" for index, note in enumerate(sheet.notes, start=1)]
-    below += sheet.remarks_with(LEGENDS[plain])
+        shown += _block(rendered, [[row[n].copy() for n in part] for row in fields])
+    title = RichText(f"{rendered.title.text}{_bracketed(rendered.title)}", "bold")
+    below = [f"[{index}] {note}" for index, note in enumerate(rendered.notes, start=1)]
+    below += rendered.remarks_with(LEGENDS[plain])
     return RichText("\n").join([title, *shown, *map(RichText, below)])
 
 
-def _fields(rows: Sequence[Sequence[Text]], *, plain: bool) -> list[list[RichText]]:
+def _fields(rows: Sequence[Sequence[TextCell]], *, plain: bool) -> list[list[RichText]]:
     columns = list(zip(*rows, strict=True))
     tails = [max(len(_tail(text)) for text in column) for column in columns]
     return [
@@ -66,7 +66,9 @@ def _widths(fields: Sequence[Sequence[RichText]]) -> list[int]:
     return [max(field.cell_len for field in column) for column in zip(*fields, strict=True)]
 
 
-def _with_short_labels(rows: Sequence[Sequence[Text]], limit: int) -> list[tuple[Text, ...]]:
+def _with_short_labels(
+    rows: Sequence[Sequence[TextCell]], limit: int
+) -> list[tuple[TextCell, ...]]:
     labels = [row[0].text for row in rows]
     short = shortened(labels, [limit] * len(labels))
     return [
@@ -75,20 +77,20 @@ def _with_short_labels(rows: Sequence[Sequence[Text]], limit: int) -> list[tuple
     ]
 
 
-def _block(sheet: RenderedTable, fields: Sequence[Sequence[RichText]]) -> list[RichText]:
+def _block(rendered: RenderedTable, fields: Sequence[Sequence[RichText]]) -> list[RichText]:
     """Header and lines of some columns, between rules."""
-    widths, height = _widths(fields), len(fields) - len(sheet.lines)
+    widths, height = _widths(fields), len(fields) - len(rendered.lines)
     numeric = [
         any(text.plain.strip() for text in column) for column in zip(*fields[:height], strict=True)
     ]
     lines = [_aligned(row, widths, numeric) for row in fields]
-    for line, row in zip(sheet.lines, lines[height:], strict=True):
+    for line, row in zip(rendered.lines, lines[height:], strict=True):
         row.stylize("dim" if line.kind in ("sd", "difference") else "")
     rule = RichText("─" * (sum(widths) + GAP * (len(widths) - 1)))
     return [*lines[:height], rule, *lines[height:], rule]
 
 
-def _stacked(header: Sequence[Text]) -> list[tuple[Text, ...]]:
+def _stacked(header: Sequence[TextCell]) -> list[tuple[TextCell, ...]]:
     """The header in one line; of a wide table in several, names broken at underscores."""
     if len(header) <= WIDE:
         return [tuple(header)]
@@ -115,7 +117,7 @@ def _aligned(row: Sequence[RichText], widths: Sequence[int], numeric: Sequence[b
     return line
 
 
-def _rich(text: Text, tail_width: int, *, plain: bool) -> RichText:
+def _rich(text: TextCell, tail_width: int, *, plain: bool) -> RichText:
     """A field whose tail takes `tail_width` characters, so that numbers stand below each other."""
     sign = SIGNS[text.rank] if plain else ""
     tail = _tail(text).ljust(tail_width)
@@ -123,10 +125,10 @@ def _rich(text: Text, tail_width: int, *, plain: bool) -> RichText:
     return RichText().append(f"{sign}{text.text}", STYLES[text.rank]).append(tail)
 
 
-def _tail(text: Text) -> str:
+def _tail(text: TextCell) -> str:
     """What stands behind the number: spread and footnotes."""
     return text.whole.removeprefix(text.text) + _bracketed(text)
 
 
-def _bracketed(text: Text) -> str:
+def _bracketed(text: TextCell) -> str:
     return "".join(f"[{index}]" for index in text.notes)

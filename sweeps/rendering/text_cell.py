@@ -1,4 +1,4 @@
-"""Fields and lines of a table as text, and their footnotes."""
+"""Cells and lines of a table as text, and their footnotes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Text:
-    """One field.
+class TextCell:
+    """One cell.
 
     Attributes:
         text: without marks.
-        spread: what stands behind the sign ±, or "".
+        spread: standard deviation, or "".
         rank: 1 best of the column, 2 second best, 0 neither.
         notes: numbers of its footnotes.
     """
@@ -32,13 +32,13 @@ class TableLine:
     """One line: "ours", "sd", "published", "difference" or "all" of a row; "order" below all."""
 
     kind: str
-    label: Text
-    fields: tuple[Text, ...]
+    label: TextCell
+    fields: tuple[TextCell, ...]
 
 
 @dataclass
 class Footnotes:
-    """Numbers footnotes in the order in which they are first needed."""
+    """Numbers footnotes in the order of their first use."""
 
     sentences: list[str] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""The figures of a study as PNGs, or a sentence why one cannot be drawn."""
+"""The figures of a study as PNGs, or the reason why one cannot be drawn."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,8 @@ from sweeps.report.study_data import Importances, StudyData
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FEWEST_FOR_CONTOUR = 4
-"""Trials with both parameters from which a surface between them says anything."""
+MIN_CONTOUR_TRIALS = 4
+"""Fewest trials with both parameters from which a surface is drawn."""
 
 
 CONTOUR_STYLE: Any = {
@@ -46,11 +47,10 @@ class StudyFigure:
 
 
 def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure]:
-    """Write ``<name>.png`` of every figure that suits the study.
+    """Write ``<name>.png`` of every figure for this kind of study.
 
-    A list has points without parameters, hence no figures of a search; a grid has those that do
-    not speak of a search that goes on. A figure of an earlier call that cannot be drawn any more is
-    removed.
+    The points of a list have no parameters, hence no figures; a grid has those that do not show
+    the course of a search. A figure of an earlier call that can no longer be drawn is removed.
 
     Args:
         data: the study.
@@ -58,107 +58,83 @@ def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure
         folder: where the files go; it exists.
     """
     pictures = []
-    for name, title, make in _figures(data, shares):
-        made = make()
+    for name, title, reason, make in _figures(data, shares):
         path = folder / f"{name}.png"
-        if isinstance(made, str):
+        if reason:
             path.unlink(missing_ok=True)
-            pictures.append(StudyFigure(name, title, None, made))
+            pictures.append(StudyFigure(name, title, None, reason))
         else:
-            made.suptitle(f"{data.name}: {title}", fontsize=10)
-            made.savefig(path)
+            figure = make()
+            figure.suptitle(f"{data.name}: {title}", fontsize=10)
+            figure.savefig(path)
             pictures.append(StudyFigure(name, title, path))
     return pictures
 
 
-Made = tuple[str, str, Callable[[], "Figure | str"]]
+FigureMaker = tuple[str, str, str, "Callable[[], Figure]"]
 
 
-def _figures(data: StudyData, shares: Importances) -> Iterator[Made]:
-    """(file name, title, how it is made) of the figures that suit this kind of study."""
+def _figures(data: StudyData, shares: Importances) -> Iterator[FigureMaker]:
+    """(file name, title, why it cannot be drawn or "", function) for this kind of study."""
     if data.kind == "list":
         return
+    incomplete = "" if data.complete else "no trial is complete yet."
     if data.kind == "search":
-        yield "history", "Objectives by trial", lambda: _history(data)
-        yield "intermediate", "Validation while training", lambda: _intermediate(data)
-    yield "importances", "Importance of the parameters", lambda: _importances(data, shares)
+        history = partial(drawing.history, data)
+        yield "history", "Objectives by trial", incomplete, history
+        intermediate = partial(drawing.intermediate, data)
+        reason = _without_reports(data)
+        yield "intermediate", "Validation while training", reason, intermediate
+    unimportant = "" if shares.shares else shares.remark
+    bars = partial(drawing.importance_bars, data, shares)
+    yield "importances", "Importance of the parameters", unimportant, bars
     if len(data.metrics) > 1:
-        yield "pareto", "Pareto front", lambda: _pareto(data)
-    yield "parallel", "Parallel coordinates, dark lines are best", lambda: _parallel(data)
+        yield "pareto", "Pareto front", incomplete, partial(drawing.pareto, data)
+    no_values = incomplete
+    if data.complete and not used_parameters(data):
+        no_values = "the complete trials have no parameters."
+    lines = partial(drawing.parallel, data)
+    yield "parallel", "Parallel coordinates, dark lines are best", no_values, lines
     for index, metric in enumerate(data.metrics):
         end = "" if len(data.metrics) == 1 else "_" + re.sub(r"\W+", "_", metric)
-        yield f"slices{end}", f"{metric} over each parameter", _bound(_slices, data, index)
-        yield f"contour{end}", f"{metric} over two parameters", _contour_of(data, shares, index)
+        slices = partial(drawing.slices, data, index)
+        yield f"slices{end}", f"{metric} over each parameter", no_values, slices
+        names = _most_important(shares, index)
+        reason = _without_contour(data, shares, names, index)
+        contour = partial(_contour, data, names, index)
+        yield f"contour{end}", f"{metric} over two parameters", reason, contour
 
 
-def _bound(
-    make: Callable[[StudyData, int], Figure | str], data: StudyData, index: int
-) -> Callable[[], Figure | str]:
-    return lambda: make(data, index)
+def _most_important(shares: Importances, index: int) -> list[str]:
+    """The two most important parameters for one objective."""
+    return sorted(shares.shares, key=lambda name: -shares.shares[name][index])[:2]
 
 
-def _contour_of(data: StudyData, shares: Importances, index: int) -> Callable[[], Figure | str]:
-    return lambda: _contour(data, shares, index)
-
-
-def _history(data: StudyData) -> Figure | str:
-    return drawing.history(data) if data.complete else _NONE_COMPLETE
-
-
-_NONE_COMPLETE = "no trial is complete yet."
-
-
-def _without_values(data: StudyData) -> str:
-    """Why parameters cannot be drawn against objectives, or ""."""
-    if not data.complete:
-        return _NONE_COMPLETE
-    has_parameters = bool(used_parameters(data))
-    return "" if has_parameters else "the complete trials have no parameters."
-
-
-def _intermediate(data: StudyData) -> Figure | str:
+def _without_reports(data: StudyData) -> str:
     if len(data.metrics) > 1:
         return "trials with several objectives report no values while they train."
-    if not any(trial.intermediate_values for trial in data.trials):
-        return "no trial has reported a value while it trained."
-    return drawing.intermediate(data)
+    has_reports = any(trial.intermediate_values for trial in data.trials)
+    return "" if has_reports else "no trial has reported a value while it trained."
 
 
-def _importances(data: StudyData, shares: Importances) -> Figure | str:
-    return drawing.importance_bars(data, shares) if shares.shares else shares.remark
-
-
-def _pareto(data: StudyData) -> Figure | str:
-    return drawing.pareto(data) if data.complete else _NONE_COMPLETE
-
-
-def _parallel(data: StudyData) -> Figure | str:
-    return _without_values(data) or drawing.parallel(data)
-
-
-def _slices(data: StudyData, index: int) -> Figure | str:
-    return _without_values(data) or drawing.slices(data, index)
-
-
-def _contour(data: StudyData, shares: Importances, index: int) -> Figure | str:
-    """The surface over the two most important parameters of this objective."""
-    if not shares.shares:
+def _without_contour(data: StudyData, shares: Importances, names: list[str], index: int) -> str:
+    """Why there is no surface over the two most important parameters of an objective, or ""."""
+    if not names:
         return f"it shows the two most important parameters: {shares.remark}"
-    if len(shares.shares) < 2:
+    if len(names) < 2:
         return "only one parameter took two values."
     if math.isnan(next(iter(shares.shares.values()))[index]):
         return f"{data.metrics[index]} has the same value in all trials."
-    names = sorted(shares.shares, key=lambda name: -shares.shares[name][index])[:2]
     both = [trial for trial in data.complete if all(name in trial.params for name in names)]
-    if len(both) < FEWEST_FOR_CONTOUR:
+    if len(both) < MIN_CONTOUR_TRIALS:
         return f"only {len(both)} complete trials have both {names[0]} and {names[1]}."
     for name in names:
         if len({trial.params[name] for trial in both}) < 2:
             return f"{name} has one value in the trials that have {' and '.join(names)}."
-    return _optunas_contour(data, names, index)
+    return ""
 
 
-def _optunas_contour(data: StudyData, names: list[str], index: int) -> Figure:
+def _contour(data: StudyData, names: list[str], index: int) -> Figure:
     import optuna
     from matplotlib import pyplot
 

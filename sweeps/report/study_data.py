@@ -1,4 +1,4 @@
-"""What a study has found, read once from Optuna's storage: also while the study still runs."""
+"""The trials of a study, read once from Optuna's storage, and what follows from them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 STATES = ("COMPLETE", "PRUNED", "FAIL", "RUNNING", "WAITING")
 
-FEWEST = 10
+MIN_TRIALS = 10
 """Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth."""
 
 ADVISED = 50
@@ -36,8 +36,8 @@ class StudyData:
         kind: "search", "grid" or "list".
         metrics: names of the objectives.
         maximize: whether more is better, by objective.
-        trials: those that count, by number; dropped duplicates are left out.
-        command: that began the study, or "".
+        trials: by number, without dropped duplicates.
+        command: that created the study, or "".
     """
 
     name: str
@@ -54,22 +54,22 @@ class StudyData:
     @cached_property
     def complete(self) -> list[FrozenTrial]:
         """Trials whose objectives are all known and finite, by number."""
-        found = self.of_state("COMPLETE")
-        return [trial for trial in found if all(map(math.isfinite, trial.values))]
+        complete = self.of_state("COMPLETE")
+        return [trial for trial in complete if all(map(math.isfinite, trial.values))]
 
     def counts(self) -> dict[str, int]:
         """Number of trials by state, those of `STATES` in order."""
-        found = Counter(trial.state.name for trial in self.trials)
-        return {state: found[state] for state in STATES}
+        counter = Counter(trial.state.name for trial in self.trials)
+        return {state: counter[state] for state in STATES}
 
     @cached_property
     def distributions(self) -> Mapping[str, BaseDistribution]:
         """Each parameter's distribution, in the order in which the trials first have them."""
-        found: dict[str, BaseDistribution] = {}
+        distributions: dict[str, BaseDistribution] = {}
         for trial in self.trials:
             for name, distribution in trial.distributions.items():
-                found.setdefault(name, distribution)
-        return found
+                distributions.setdefault(name, distribution)
+        return distributions
 
     @cached_property
     def front(self) -> list[FrozenTrial]:
@@ -81,8 +81,8 @@ class StudyData:
         return sorted(best, key=self.rank)
 
     @cached_property
-    def standing(self) -> list[FrozenTrial]:
-        """The last trial of each point: earlier ones failed and were tried again."""
+    def latest(self) -> list[FrozenTrial]:
+        """The latest trial of each point: earlier ones failed and were retried."""
         last = {t.user_attrs.get(attributes.KEY, t.number): t for t in self.trials}
         return sorted(last.values(), key=lambda trial: trial.number)
 
@@ -101,19 +101,19 @@ class StudyData:
         return study
 
     def shown(self, value: object) -> str:
-        """A parameter's value for people."""
+        """A parameter's value as shown."""
         factors = {trial.user_attrs.get(attributes.PIXELS) for trial in self.trials}
         return shown(value, factors.pop() if len(factors) == 1 else None)
 
     def label(self, trial: FrozenTrial) -> str:
-        """What a person sees of a trial: its label, else its parameters, else its number."""
+        """How a trial is shown: its label, else its parameters, else its number."""
         short = short_names(self.distributions)
         pairs = [f"{short[name]}={self.shown(value)}" for name, value in trial.params.items()]
         return str(trial.user_attrs.get(attributes.LABEL) or " ".join(pairs) or trial.number)
 
 
 def read(study: optuna.Study) -> StudyData:
-    """Read a study whole."""
+    """Read a study."""
     notes = study.user_attrs
     names = notes.get(attributes.METRICS) or study.metric_names
     count = len(study.directions)
@@ -130,7 +130,7 @@ def read(study: optuna.Study) -> StudyData:
 
 
 def short_names(names: Collection[str]) -> dict[str, str]:
-    """Dotted keys cut to their last part where that says enough: "masker.sigma_div": "sigma_div".
+    """Dotted keys cut to their last part where that is unique: "masker.sigma_div": "sigma_div".
 
     Example:
         >>> short_names(["optimizer.lr", "head.lr", "masker.alpha"])["masker.alpha"]
@@ -141,7 +141,7 @@ def short_names(names: Collection[str]) -> dict[str, str]:
 
 
 def shown(value: object, pixel_factor: float | None = None) -> str:
-    """A parameter's value for people: four significant digits; ``${px:64}`` as its value.
+    """A parameter's value as shown: four significant digits; ``${px:64}`` as its value.
 
     Args:
         value: of a trial.
@@ -161,7 +161,7 @@ class Importances:
     Attributes:
         shares: parameter -> share by objective, which sum to 1 over the parameters; NaN for an
             objective that has one value only. Most important for the first objective first.
-        remark: why there are none, what was left out, or how rough they are; "" if nothing.
+        remark: why there are none, what was left out, or how uncertain they are; "" if nothing.
     """
 
     shares: Mapping[str, tuple[float, ...]]
@@ -176,18 +176,18 @@ def importances(data: StudyData) -> Importances:
     count = len(data.complete)
     if data.kind == "list":
         return Importances({}, "")
-    if count < FEWEST:
-        return Importances({}, f"they need {FEWEST} complete trials, and there are {count}.")
+    if count < MIN_TRIALS:
+        return Importances({}, f"they need {MIN_TRIALS} complete trials, and there are {count}.")
     varied = [name for name in data.distributions if _is_varied(data, name)]
     if not varied:
         return Importances({}, "no parameter took two values.")
-    found = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
-    said = " ".join(_remarks(data, varied, found))
-    shares = {name: tuple(shares[name] for shares in found) for name in varied}
+    by_objective = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
+    remark = " ".join(_remarks(data, varied, by_objective))
+    shares = {name: tuple(shares[name] for shares in by_objective) for name in varied}
     if all(math.isnan(share) for of_objectives in shares.values() for share in of_objectives):
-        return Importances({}, said)
+        return Importances({}, remark)
     ordered = dict(sorted(shares.items(), key=lambda item: _descending(item[1])))
-    return Importances(ordered, said)
+    return Importances(ordered, remark)
 
 
 def _is_varied(data: StudyData, name: str) -> bool:
@@ -229,8 +229,8 @@ def _remarks(data: StudyData, varied: list[str], found: list[dict[str, float]]) 
 
 
 @dataclass(frozen=True)
-class Pruning:
-    """What pruning saved.
+class PruningSavings:
+    """Training steps saved by pruning.
 
     Attributes:
         trials: pruned ones that reported.
@@ -241,11 +241,11 @@ class Pruning:
     share: float
 
 
-def pruning(data: StudyData) -> Pruning | None:
-    """Training steps saved; None where it cannot be told (no complete trial reported its steps).
+def pruning_savings(data: StudyData) -> PruningSavings | None:
+    """Training steps saved; None where no complete trial reported its steps.
 
-    A pruned trial saves what lies between its last report and the last step of complete trials, and
-    all steps of its further seeds, which are not begun.
+    A pruned trial saves the steps between its last report and the last step of complete trials,
+    and all steps of its further seeds, which never begin.
     """
     full = max((step for trial in data.complete for step in trial.intermediate_values), default=0)
     pruned = [trial for trial in data.of_state("PRUNED") if trial.intermediate_values]
@@ -253,7 +253,7 @@ def pruning(data: StudyData) -> Pruning | None:
         return None
     wanted = sum(full * _num_runs(trial) for trial in [*pruned, *data.complete])
     saved = sum(full * _num_runs(t) - max(t.intermediate_values) for t in pruned)
-    return Pruning(len(pruned), max(saved, 0) / wanted)
+    return PruningSavings(len(pruned), max(saved, 0) / wanted)
 
 
 def _num_runs(trial: FrozenTrial) -> int:

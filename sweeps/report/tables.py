@@ -9,7 +9,7 @@ from rgbt.metrics import names as metric_names
 from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import ABSENT, Grid, number
 from sweeps import attributes
-from sweeps.report.study_data import Importances, StudyData, pruning, short_names
+from sweeps.report.study_data import Importances, StudyData, pruning_savings, short_names
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -45,7 +45,7 @@ def tables(data: StudyData, shares: Importances) -> list[Grid]:
 def counts_grid(data: StudyData) -> Grid:
     """Number of trials by state, and the share of training steps that pruning saved."""
     counts = data.counts()
-    saved = pruning(data)
+    saved = pruning_savings(data)
     header = ["trials", *WORDS.values()]
     row = [str(sum(counts.values())), *(str(counts[state]) for state in WORDS)]
     if saved is not None and saved.trials:
@@ -61,7 +61,7 @@ def trials_grid(data: StudyData) -> Grid:
     the points in their order.
     """
     if data.kind != "search":
-        points = data.standing
+        points = data.latest
         rest = len(points) - POINTS
         more = f" (the first {POINTS}; {rest} more in trials.csv)" if rest > 0 else ""
         return _grid(data, f"Points{more}", points[:POINTS], with_label=True)
@@ -76,7 +76,7 @@ def trials_grid(data: StudyData) -> Grid:
 
 def failed_grid(data: StudyData) -> Grid:
     """Failed trials with their reasons; not those whose point a later trial stands for."""
-    failed = [trial for trial in data.standing if trial.state.name == "FAIL"]
+    failed = [trial for trial in data.latest if trial.state.name == "FAIL"]
     again = data.counts()["FAIL"] - len(failed)
     title = "Failed trials" + (f" ({again} more were tried again)" if again else "")
     rows = [

@@ -1,6 +1,6 @@
-"""Search ranges: what a search may choose, read from a file, asked of Optuna, said to Hydra.
+"""Search spaces: read from a file, sampled by Optuna, passed to Hydra as overrides.
 
-A space maps keys of the configuration to what they may be, as in ``conf/search``::
+A space maps keys of the configuration to their ranges or choices, as in ``conf/search``::
 
     masker.sigma_div: {type: float, low: 0.5, high: 32, log: true}
     masker.patch_size: {type: categorical, choices: ["${px:8}", "${px:64}"]}
@@ -33,17 +33,17 @@ def parse_space(space: Mapping[str, Any]) -> tuple[Parameter, ...]:
     """The parameters of a space, in the order of the file.
 
     Args:
-        space: key -> entry, see `sweeps.space.parameter.read_parameter`. Of a node of a configuration the
-            text of interpolations is kept: ``${px:64}`` is resolved by the run that gets it.
+        space: key -> entry, see `sweeps.space.parameter.read_parameter`. Interpolations are kept as
+            text: ``${px:64}`` is resolved by the run that gets it.
 
     Raises:
         InputError: the first mistake: an unknown type or key, a range that is none, no choices, a
-            condition on a parameter that is not above, or a part that is yet to be built.
+            condition on a parameter that is not above it.
     """
-    found: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     for key, entry in plain_space(space).items():
-        found[str(key)] = read_parameter(str(key), entry, found)
-    return tuple(found.values())
+        parameters[str(key)] = read_parameter(str(key), entry, parameters)
+    return tuple(parameters.values())
 
 
 def plain_space(space: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def plain_space(space: Mapping[str, Any]) -> dict[str, Any]:
 def suggest(trial: BaseTrial, parameters: tuple[Parameter, ...]) -> dict[str, Choice]:
     """Values of a trial, by key: of those parameters whose conditions hold.
 
-    Choices that are lists are known to Optuna by their text, as its storages hold plain values.
+    Optuna gets lists among the choices as text, because its storages hold plain values.
     """
     values: dict[str, Choice] = {}
     for parameter in parameters:
@@ -111,11 +111,11 @@ def _reads_back(text: str) -> bool:
 
 
 def signature(parameters: tuple[Parameter, ...], *more: Any) -> str:
-    """12 hexadecimal digits that name the space, in whatever order it is written.
+    """Hash of a space (12 hexadecimal digits), independent of the order of its parameters.
 
     Args:
         parameters: the space.
-        more: what else a study must not change, such as its objectives: plain values, dataclasses.
+        more: other constants of a study, such as its objectives: plain values, dataclasses.
     """
     ordered = sorted((asdict(parameter) for parameter in parameters), key=lambda one: one["key"])
     text = json.dumps([ordered, more], sort_keys=True, default=asdict)

@@ -1,10 +1,9 @@
-"""What the types of a table file do not say: names that must exist, and names that must differ."""
+"""Checks of a table file beyond its types: names that must exist, names that must differ."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
@@ -12,44 +11,42 @@ from rgbt.checks import InputError, check_choice
 from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
 from rgbt.metrics.named import OF_PAIRS
-
-if TYPE_CHECKING:
-    from sweeps.table.table import Column, Factor, Row, Table
+from sweeps.table.table import Column, Factor, Row, Table
 
 
-def check_table(table: Table, place: str) -> None:
+def check_table(table: Table, where: str) -> None:
     """Refuse a table whose parts do not fit.
 
     Args:
         table: with the right types.
-        place: its file, for messages.
+        where: its file, for messages.
 
     Raises:
         InputError: an experiment, scale or regions that the configuration does not know; a column
-            that no column has; a label or name that stands twice; an `x` without an axis.
+            that no column has; a label or name that is used twice; an `x` without an axis.
     """
     names = [column.name for column in table.columns]
-    _check_distinct(names, f"{place}, columns")
-    _check_distinct([row.label for row in table.rows], f"{place}, rows")
+    _check_distinct(names, f"{where}, columns")
+    _check_distinct([row.label for row in table.rows], f"{where}, rows")
     if table.regions != "as trained":
-        check_choice(f"{place}, regions", table.regions, _files("metric"))
-    _check_scales(table.at, place)
+        check_choice(f"{where}, regions", table.regions, _files("metric"))
+    _check_scales(table.at, where)
     for index, column in enumerate(table.columns):
         before = table.columns[:index]
-        _check_column(column, table, before, f"{place}, column '{column.name}'")
+        _check_column(column, table, before, f"{where}, column '{column.name}'")
     for row in table.rows:
-        _check_row(row, table, f"{place}, row '{row.label}'")
+        _check_row(row, table, f"{where}, row '{row.label}'")
 
 
-def _check_distinct(names: list[str], place: str) -> None:
+def _check_distinct(names: list[str], where: str) -> None:
     for index, name in enumerate(names):
         if name in names[:index]:
-            raise InputError(f"{place}: '{name}' stands twice; give each its own name.")
+            raise InputError(f"{where}: '{name}' is used twice; give each its own name.")
 
 
-def _check_scales(at: Iterable[str], place: str) -> None:
+def _check_scales(at: Iterable[str], where: str) -> None:
     for scale in at:
-        check_choice(f"{place}, at", scale, _files("scale"))
+        check_choice(f"{where}, at", scale, _files("scale"))
 
 
 def _files(group: str) -> list[str]:
@@ -57,116 +54,116 @@ def _files(group: str) -> list[str]:
 
 
 KINDS = ("metric", "minus", "mean", "parameters", "needs")
-"""Keys of a column of which one says where its values come from."""
+"""Keys of a column that define its values; a column has one of them."""
 
 
-def _check_column(column: Column, table: Table, before: Sequence[Column], place: str) -> None:
+def _check_column(column: Column, table: Table, before: Sequence[Column], where: str) -> None:
     given = [key for key in KINDS if getattr(column, key) not in (None, False)]
     if len(given) != 1:
         got = " and ".join(given) or "none"
         known = f"{', '.join(KINDS[:-1])} and {KINDS[-1]}"
-        raise InputError(f"{place}: expected one of {known}, got {got}.")
+        raise InputError(f"{where}: expected one of {known}, got {got}.")
     for other in column.sources:
-        check_choice(f"{place}, {given[0]}", other, [each.name for each in table.columns])
-    _check_frames(column, place)
-    _check_head(column, place)
-    _check_degradation(column, place)
-    _check_sources(column, table, before, f"{place}, {given[0]}")
+        check_choice(f"{where}, {given[0]}", other, [each.name for each in table.columns])
+    _check_frames(column, where)
+    _check_head(column, where)
+    _check_degradation(column, where)
+    _check_sources(column, table, before, f"{where}, {given[0]}")
 
 
-def _check_sources(column: Column, table: Table, before: Sequence[Column], place: str) -> None:
-    """Refuse a difference or mean of what is not known when it is computed, or is no score."""
+def _check_sources(column: Column, table: Table, before: Sequence[Column], where: str) -> None:
+    """Refuse a difference or mean of columns that are computed later, or are no scores."""
     if column.mean is not None and len(set(column.mean)) != max(2, len(column.mean)):
         got = ", ".join(column.mean) or "none"
-        raise InputError(f"{place}: expected two or more different columns, got {got}.")
+        raise InputError(f"{where}: expected two or more different columns, got {got}.")
     for other in (each for each in table.columns if each.name in column.sources):
         if other.sources and other not in before:
             raise InputError(
-                f"{place}: '{other.name}' is computed from other columns itself; move it in front "
+                f"{where}: '{other.name}' is computed from other columns itself; move it in front "
                 f"of '{column.name}', or name the columns that it is computed from."
             )
         if other.parameters:
             raise InputError(
-                f"{place}: '{other.name}' counts parameters and is no score; leave it."
+                f"{where}: '{other.name}' counts parameters and is no score; remove it."
             )
 
 
-def _check_head(column: Column, place: str) -> None:
+def _check_head(column: Column, where: str) -> None:
     """Refuse a head for what is not predicted, or not by a head that can be chosen."""
     if column.head != "as trained" and (column.metric is None or column.frames is not None):
         raise InputError(
-            f"{place}: 'head' is for scores of single frames alone; remove head: {column.head}."
+            f"{where}: 'head' is for scores of single frames alone; remove head: {column.head}."
         )
 
 
-def _check_degradation(column: Column, place: str) -> None:
+def _check_degradation(column: Column, where: str) -> None:
     """Refuse a degradation of what is not predicted, an unknown one, or a severity it has not."""
     if column.degradation is None:
         if column.severity is not None:
             raise InputError(
-                f"{place}: 'severity' is of a degradation; add degradation: NAME, or remove it."
+                f"{where}: 'severity' is of a degradation; add degradation: NAME, or remove it."
             )
         return
     if column.metric is None or column.frames is not None:
         raise InputError(
-            f"{place}: 'degradation' is for scores of single frames alone; remove degradation: "
+            f"{where}: 'degradation' is for scores of single frames alone; remove degradation: "
             f"{column.degradation}."
         )
-    check_choice(f"{place}, degradation", column.degradation, _files("degradation"))
+    check_choice(f"{where}, degradation", column.degradation, _files("degradation"))
     # Below its key, as in a configuration: sentences about it name degradation.severities.
     file = conf_dir() / "degradation" / f"{column.degradation}.yaml"
     kind = build(OmegaConf.create({"degradation": OmegaConf.load(file)}).degradation)
     if column.severity is None and len(kind.severities) > 1:
         known = ", ".join(f"{each:g}" for each in kind.severities)
-        raise InputError(f"{place}: {kind.title} needs a severity ({kind.unit}); one of {known}.")
+        raise InputError(f"{where}: {kind.title} needs a severity ({kind.unit}); one of {known}.")
     if column.severity is not None:
         try:
             kind.check(column.severity)
         except InputError as error:
-            raise InputError(f"{place}: {error}") from None
+            raise InputError(f"{where}: {error}") from None
 
 
-def _check_frames(column: Column, place: str) -> None:
+def _check_frames(column: Column, where: str) -> None:
     """Refuse a consistency metric without frames, and frames of anything else."""
     is_consistency = (column.metric or "").rpartition("/")[2] in OF_PAIRS
     if is_consistency and column.frames is None:
         raise InputError(
-            f"{place}: {column.metric} compares two frames; add frames: aligned, released or next."
+            f"{where}: {column.metric} compares two frames; add frames: aligned, released or next."
         )
     if column.frames is not None and not is_consistency:
         raise InputError(
-            f"{place}: 'frames' is for {', '.join(OF_PAIRS)} alone; remove it, or choose one of "
+            f"{where}: 'frames' is for {', '.join(OF_PAIRS)} alone; remove it, or choose one of "
             "these."
         )
     if column.frames is not None and column.modality != "default":
         raise InputError(
-            f"{place}: consistency is counted from what the network is made for; remove "
+            f"{where}: consistency is counted from what the network is made for; remove "
             f"modality: {column.modality}."
         )
 
 
-def _check_row(row: Row, table: Table, place: str) -> None:
+def _check_row(row: Row, table: Table, where: str) -> None:
     names = [column.name for column in table.columns]
     if row.experiment is not None:
-        check_choice(f"{place}, experiment", row.experiment, _files("experiment"))
-    _check_scales(row.at, place)
+        check_choice(f"{where}, experiment", row.experiment, _files("experiment"))
+    _check_scales(row.at, where)
     for name in row.without:
-        check_choice(f"{place}, without", name, names)
+        check_choice(f"{where}, without", name, names)
     for name in (*row.values, *row.doubtful):
-        check_choice(f"{place}, column", name, names)
+        check_choice(f"{where}, column", name, names)
         if not table.columns[names.index(name)].printed:
             raise InputError(
-                f"{place}: column '{name}' is not printed (printed: false); remove its value."
+                f"{where}: column '{name}' is not printed (printed: false); remove its value."
             )
     for column in table.columns:
         for key in re.findall(r"{(\w+)}", column.metric or ""):
-            check_choice(f"{place}, '{key}' of metric {column.metric}", key, row.settings)
+            check_choice(f"{where}, '{key}' of metric {column.metric}", key, row.settings)
     if row.x is not None:
-        _check_x(row.x, table.factor, place)
+        _check_x(row.x, table.factor, where)
 
 
-def _check_x(x: float, factor: Factor | None, place: str) -> None:
+def _check_x(x: float, factor: Factor | None, where: str) -> None:
     if factor is None:
-        raise InputError(f"{place}: 'x' has no effect without 'factor' of the table; add one.")
+        raise InputError(f"{where}: 'x' has no effect without 'factor' of the table; add one.")
     if factor.axis == "log" and x <= 0:
-        raise InputError(f"{place}: 'x' must be > 0 on a log axis, got {x:g}.")
+        raise InputError(f"{where}: 'x' must be > 0 on a log axis, got {x:g}.")

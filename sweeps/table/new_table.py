@@ -1,4 +1,4 @@
-"""One's own ablation as a table file: ``python -m sweeps.reproduce new table=my/ablation ...``."""
+"""Writes an ablation as a table file: ``python -m sweeps.reproduce new table=my/ablation ...``."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Annotated, Any
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
-from rgbt.config.compose import PIXELS, compose
+from rgbt.config.compose import PIXELS
 from rgbt.config.options import Help
 from rgbt.files.atomic import write_atomic
-from rgbt.spec.specify import specify
-from sweeps.table.table import OWN as FOLDER
-from sweeps.table.table import PUBLISHED, load_table
+from sweeps.run_specs import specify_run
+from sweeps.table.load_table import OWN as FOLDER
+from sweeps.table.load_table import PUBLISHED, load_table
 
 RINGS = 5
 END = "\n..."
@@ -54,8 +54,8 @@ rows:
 
 
 @dataclass(frozen=True)
-class Factor:
-    """One override that is varied, or not: its key and values as text."""
+class VariedOverride:
+    """An override with one value, or several to vary: its key and values as text."""
 
     key: str
     values: tuple[str, ...]
@@ -64,10 +64,10 @@ class Factor:
     def numbers(self) -> tuple[float, ...] | None:
         """The values, where it is varied and all are numbers."""
         try:
-            found = tuple(float(value) for value in self.values)
+            numbers = tuple(float(value) for value in self.values)
         except ValueError:
             return None
-        return found if len(found) > 1 and all(map(math.isfinite, found)) else None
+        return numbers if len(numbers) > 1 and all(map(math.isfinite, numbers)) else None
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         name: e.g. "my/ablation".
         experiment: a file of ``conf/experiment``.
         overrides: of `python -m rgbt.run`; comma lists are varied, all with all.
-        folder: where one's own tables lie.
+        folder: of the user's tables.
 
     Returns:
         the file.
 
     Raises:
-        InputError: the file is there already, nothing is varied, or a row does not fit.
+        InputError: the file exists already, nothing is varied, or a row does not fit.
     """
     path = folder / f"{name}.yaml"
     _check_name(name, path)
@@ -114,15 +114,14 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         if factor.key == "seed":
             raise InputError("seed=...: seeds are chosen when the table is run, seeds=3.")
         if factor.key == "runs_dir":
-            raise InputError("runs_dir=...: where runs lie is said when the table is run.")
+            raise InputError("runs_dir=...: the folder of runs is chosen when the table is run.")
     if not any(len(factor.values) > 1 for factor in factors):
         raise InputError("nothing is varied; give a comma list, such as masker.sigma_div=1,2,4.")
     points = list(itertools.product(*(factor.values for factor in factors)))
     for point in points:
         chosen = [f"{f.key}={value}" for f, value in zip(factors, point, strict=True)]
         every = [f"+experiment={experiment}", *chosen]
-        with composing(every):
-            specify(compose(every))
+        specify_run(every)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, _text(name, experiment, factors, points).encode())
     return path
@@ -130,14 +129,14 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
 
 def _check_name(name: str, path: Path) -> None:
     if path.exists():
-        raise InputError(f"{path} is there already; edit it, or choose another name.")
+        raise InputError(f"{path} exists already; edit it, or choose another name.")
     if (PUBLISHED / f"{name}.yaml").exists():
         raise InputError(f"table={name} is a published table; choose another name.")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
         raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
 
 
-def _factor(override: str) -> Factor:
+def _factor(override: str) -> VariedOverride:
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     with composing([override]):
@@ -147,11 +146,11 @@ def _factor(override: str) -> Factor:
         else:
             values = (override.partition("=")[2],)
     key, _, _ = override.partition("=")
-    return Factor(key, values)
+    return VariedOverride(key, values)
 
 
 def _text(
-    name: str, experiment: str, factors: Sequence[Factor], points: Sequence[Sequence[str]]
+    name: str, experiment: str, factors: Sequence[VariedOverride], points: Sequence[Sequence[str]]
 ) -> str:
     """The file."""
     varied = [factor for factor in factors if len(factor.values) > 1]
@@ -174,7 +173,10 @@ def _text(
 
 
 def _row(
-    experiment: str, factors: Sequence[Factor], point: Sequence[str], axis: Factor | None
+    experiment: str,
+    factors: Sequence[VariedOverride],
+    point: Sequence[str],
+    axis: VariedOverride | None,
 ) -> str:
     varied = [factor for factor in factors if len(factor.values) > 1]
     pairs = list(zip(factors, point, strict=True))
@@ -188,14 +190,14 @@ def _row(
     return "  - " + textwrap.indent("".join(lines), "    ").lstrip()
 
 
-def _short(key: str, varied: Sequence[Factor]) -> str:
-    """The last part of a key where that says enough."""
+def _short(key: str, varied: Sequence[VariedOverride]) -> str:
+    """The last part of a key where that is unique."""
     last = key.lstrip("+").rpartition(".")[2]
     ends = [factor.key.lstrip("+").rpartition(".")[2] for factor in varied]
     return last if ends.count(last) == 1 else key.lstrip("+")
 
 
-def _axis(factor: Factor) -> str:
+def _axis(factor: VariedOverride) -> str:
     numbers = factor.numbers or ()
     spread = min(numbers) > 0 and max(numbers) / min(numbers) >= LOG_FROM
     return "log" if spread else "linear"

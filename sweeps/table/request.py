@@ -1,4 +1,4 @@
-"""The runs that a table needs, as points: one per row and seed, rows that are the same run once."""
+"""The runs that a table needs, as points: one per row and seed; rows of the same run share one."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from sweeps.worker.point_list import Outcome
 
 DEFAULT_SCALE = "demo"
-"""What a run is without ``scale=...``."""
+"""The scale of a run without ``scale=...``."""
 
 TAG = "rgbt.table/"
-"""Beginning of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
+"""Prefix of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
 
-BETWEEN = " | "
+SEPARATOR = " | "
 TAG_LENGTH = 5000
 
 
 @dataclass(frozen=True)
 class TableRequest:
-    """A table that is asked for.
+    """A table to compute.
 
     Attributes:
         name: of the table.
@@ -55,65 +55,61 @@ class TableRequest:
         weights = _weights_of(others, self.weights)
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
-    def places(self) -> list[tuple[str, int]]:
-        """(label, seed) of every cell that can be run; all rows of a seed before the next seed.
+    def row_seeds(self) -> list[tuple[str, int]]:
+        """(label, seed) of every run; all rows of a seed before the next seed.
 
-        None where no column is counted: parameters are, without any run.
+        Empty where no column is a score: parameters are counted without any run.
         """
         if not any(map(is_counted, self.table.columns)):
             return []
-        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        rows = self.table.runnable_rows
         return [(row.label, seed) for seed in self.seeds for row in rows]
 
     def points(self) -> list[Point]:
-        """What is to be run; rows with equal overrides share a point."""
+        """The points; rows with equal overrides share one."""
         sharing: dict[tuple[str, ...], list[str]] = {}
-        for label, seed in self.places():
+        for label, seed in self.row_seeds():
             sharing.setdefault(self.overrides(label, seed), []).append(label)
         return [
             Point(
                 label=f"{_short(labels)} {overrides[-1]}",
                 overrides=overrides,
-                tags={TAG + self.name: BETWEEN.join(labels)[:TAG_LENGTH]},
+                tags={TAG + self.name: SEPARATOR.join(labels)[:TAG_LENGTH]},
                 evaluations=self.evaluations(labels),
             )
             for overrides, labels in sharing.items()
         ]
 
     def evaluations(self, labels: Collection[str] | None = None) -> tuple[ExtraEvaluation, ...]:
-        """What the runs of the rows `labels` are evaluated with beside their own evaluation.
-
-        Args:
-            labels: of the rows; None: of all that are run.
-        """
-        rows = [row for row in self.table.rows if self.table.runnable(row)]
+        """Further evaluations of the runs of the rows `labels`; None: of all rows that are run."""
+        rows = self.table.runnable_rows
         named = [row for row in rows if labels is None or row.label in labels]
         names = {column.name for row in named for column in self.table.columns_of(row)}
         counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
-        asked = (evaluation_of(column, self.table) for column in counted)
-        return tuple(dict.fromkeys(each for each in asked if each is not None))
+        evaluations = (evaluation_of(column, self.table) for column in counted)
+        return tuple(dict.fromkeys(each for each in evaluations if each is not None))
 
     def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
-        """The outcome of every cell."""
+        """The outcome of every row and seed."""
         by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
-        return {place: by_overrides[self.overrides(*place)] for place in self.places()}
+        return {run: by_overrides[self.overrides(*run)] for run in self.row_seeds()}
 
-    def typed(self) -> tuple[str, ...]:
-        """What was asked for beside the table itself, as it was typed."""
+    def typed_overrides(self) -> tuple[str, ...]:
+        """Further overrides, as they were typed."""
         return (*self.extra, *(f"weights.{model}={file}" for model, file in self.weights.items()))
 
     @property
     def variant(self) -> str:
         """The scale; with a short hash where further overrides make it another table."""
-        shown = [word for word in self.typed() if not word.startswith("dataset.root=")]
+        shown = [word for word in self.typed_overrides() if not word.startswith("dataset.root=")]
         digest = hashlib.sha256("\n".join(sorted(shown)).encode()).hexdigest()[:6]
         return f"{self.scale}-{digest}" if shown else self.scale
 
     def models(self) -> set[str]:
-        """Networks that the rows name."""
-        rows = [row for row in self.table.rows if self.table.runnable(row)]
-        named = (_model_of(self.table.overrides(row, self.scale)) for row in rows)
-        return {name for name in named if name is not None}
+        """Networks (`model=...`) of the rows."""
+        rows = self.table.runnable_rows
+        models = (_model_of(self.table.overrides(row, self.scale)) for row in rows)
+        return {model for model in models if model is not None}
 
 
 def _model_of(overrides: Sequence[str]) -> str | None:

@@ -1,30 +1,27 @@
 """A table computed: mean and spread over seeds, beside the printed values.
 
-Rows that cannot be run, and columns that cannot be computed, have no cells; of a table that was not
-run, columns of parameters alone have some.
+Rows that cannot be run and columns that cannot be computed have no cells; without any run only
+columns of parameters have some.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from rgbt.metrics.named import parse
-from sweeps.table.cells import CellRun, Place, TableCell, is_counted, metric_of, row_cells
-
-if TYPE_CHECKING:
-    from sweeps.table.table import Column, Row, Table
+from sweeps.table.cells import CellId, CellRun, TableCell, is_counted, metric_of, row_cells
+from sweeps.table.table import Column, Row, Table
 
 MIN_ROWS = 3
-"""Rows below which two orders are not compared: two rows agree or not by chance."""
+"""Fewest rows whose order is compared: two rows agree or not by chance."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """Whether the rows stand in the printed order: Spearman's rank correlation.
+    """Whether the rows have the printed order: Spearman's rank correlation.
 
     Attributes:
         rho: -1..1; NaN for fewer than `MIN_ROWS` rows, or where all values are equal.
@@ -43,8 +40,8 @@ class ScoredTable:
         name: e.g. "spatialseg/table3".
         table: the file.
         scale: "demo" or "paper".
-        seeds: that were asked for.
-        cells: by place; only rows that were run, and columns of parameters.
+        seeds: of the runs.
+        cells: only rows that were run, and columns of parameters.
         orders: by name of the column.
         ranks_ours: 1 best, 2 second best of the column among our means.
         ranks_published: the same among the printed values.
@@ -55,10 +52,10 @@ class ScoredTable:
     table: Table
     scale: str
     seeds: tuple[int, ...]
-    cells: Mapping[Place, TableCell]
+    cells: Mapping[CellId, TableCell]
     orders: Mapping[str, Order]
-    ranks_ours: Mapping[Place, int]
-    ranks_published: Mapping[Place, int]
+    ranks_ours: Mapping[CellId, int]
+    ranks_published: Mapping[CellId, int]
     commits: Mapping[str, int]
 
     def difference(self, row: Row, column: Column) -> float:
@@ -70,18 +67,20 @@ class ScoredTable:
 
 def published(row: Row, column: Column) -> float | None:
     """The printed value, or None where there is none or a dash."""
-    found = row.values.get(column.name)
-    return None if found is None else float(found)
+    printed = row.values.get(column.name)
+    return None if printed is None else float(printed)
 
 
-def check_metrics(table: Table, rows: Iterable[Row]) -> None:
+def check_metrics(table: Table) -> None:
     """Refuse a misspelt metric before anything is run.
 
     Raises:
         InputError: naming the metric and the nearest known one.
     """
-    asked = {metric_of(column, row) for row in rows for column in filter(is_counted, table.columns)}
-    for metric in sorted(asked):
+    columns = list(filter(is_counted, table.columns))
+    for metric in sorted(
+        {metric_of(column, row) for row in table.runnable_rows for column in columns}
+    ):
         parse(metric)
 
 
@@ -91,29 +90,29 @@ def score(
     runs: Mapping[tuple[str, int], CellRun],
     *,
     scale: str,
-    sizes: Mapping[Place, TableCell] | None = None,
+    sizes: Mapping[CellId, TableCell] | None = None,
 ) -> ScoredTable:
     """Compute every cell of the rows that were run.
 
     Args:
         name: of the table.
         table: its file.
-        runs: (label of the row, seed) -> what became of the run.
+        runs: (label of the row, seed) -> the run.
         scale: "demo" or "paper".
         sizes: cells of the columns of parameters, see `sweeps.table.parameter_counts`.
     """
     seeds = sorted({seed for _, seed in runs})
     ran = {label for label, _ in runs}
-    cells: dict[Place, TableCell] = {}
+    cells: dict[CellId, TableCell] = {}
     for row in table.rows:
         if row.label in ran:
             outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
             cells |= row_cells(table, row, outcomes)
-    # A mean over fewer seeds is no fair rival: it is shown, and takes no part in marks and orders.
-    whole = {place: cell for place, cell in cells.items() if cell.seeds == len(seeds)}
+    # A mean over fewer seeds is shown, but has no rank and no part in the order of the rows.
+    whole = {cell_id: cell for cell_id, cell in cells.items() if cell.seeds == len(seeds)}
     cells |= sizes or {}
     whole |= sizes or {}
-    found = {run.key: run.commit for outcome in runs.values() for run in outcome.found}
+    made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
         table=table,
@@ -121,37 +120,37 @@ def score(
         seeds=tuple(seeds),
         cells=cells,
         orders={column.name: _order(table, column, whole) for column in table.columns},
-        ranks_ours=_ranks(table, {place: cell.mean for place, cell in whole.items()}),
+        ranks_ours=_ranks(table, {cell_id: cell.mean for cell_id, cell in whole.items()}),
         ranks_published=_ranks(table, _printed(table)),
-        commits=Counter(commit for commit in found.values() if commit is not None),
+        commits=Counter(commit for commit in made_by.values() if commit is not None),
     )
 
 
-def _printed(table: Table) -> dict[Place, float]:
+def _printed(table: Table) -> dict[CellId, float]:
     pairs = (((row.label, c.name), published(row, c)) for row in table.rows for c in table.columns)
-    return {place: found for place, found in pairs if found is not None}
+    return {cell_id: printed for cell_id, printed in pairs if printed is not None}
 
 
-def _ranks(table: Table, values: Mapping[Place, float]) -> dict[Place, int]:
+def _ranks(table: Table, values: Mapping[CellId, float]) -> dict[CellId, int]:
     """1 and 2 for the best and second best of every column.
 
-    Values that are shown alike share a rank. Where all are alike none is the best.
+    Values that are equal as shown share a rank. Where all are equal none has one.
     """
-    ranks: dict[Place, int] = {}
+    ranks: dict[CellId, int] = {}
     for column in table.columns:
         shown = {
-            place: round(found, 2)
-            for place, found in values.items()
-            if place[1] == column.name and not math.isnan(found)
+            cell_id: round(value, 2)
+            for cell_id, value in values.items()
+            if cell_id[1] == column.name and not math.isnan(value)
         }
         if column.best == "none" or len(set(shown.values())) < 2:
             continue
         best = sorted(set(shown.values()), reverse=column.best == "highest")[:2]
-        ranks |= {place: best.index(each) + 1 for place, each in shown.items() if each in best}
+        ranks |= {cell_id: best.index(each) + 1 for cell_id, each in shown.items() if each in best}
     return ranks
 
 
-def _order(table: Table, column: Column, cells: Mapping[Place, TableCell]) -> Order:
+def _order(table: Table, column: Column, cells: Mapping[CellId, TableCell]) -> Order:
     pairs = []
     for row in table.rows:
         cell, printed = cells.get((row.label, column.name)), published(row, column)

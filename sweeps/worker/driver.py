@@ -1,8 +1,8 @@
-"""Works off points: some at a time, each in a process of its own, failures isolated.
+"""Executes the trials of a study: some at a time, each in a process of its own.
 
-Any number of drivers, on any number of machines, may work on one study. None runs a point that
-another one runs, each takes over what a dead one left, and a driver that is started again finds
-everything that is finished.
+Any number of drivers, on any number of machines, may share a study. Each point is run by one
+driver; trials of a dead driver are executed by another one; a driver that is started again resumes
+the study. A failure ends one trial only.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rgbt.metrics.names import CA, TC
 from rgbt.spec.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
-from sweeps.worker.executors import Executor, Job
+from sweeps.worker.executors import Executor, Job, LocalExecutor, check_gpus
 from sweeps.worker.owner import HEARTBEAT_S
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
@@ -38,26 +38,27 @@ from sweeps.worker.trial_source import ClaimedTrial, TrialSource
 from sweeps.worker.trial_store import TrialStore
 
 POLL_S = 0.2
-AWAY_S = 600.0
-"""How long a storage that cannot be reached is waited for."""
+RECONNECT_S = 600.0
+"""How long a driver waits for a storage that cannot be reached."""
 
 PAUSE_S = 5.0
-LOOK_S = 2.0
-"""Seconds between two looks at the storage for work that others left or gave up."""
+CLAIM_S = 2.0
+"""Seconds between two searches for trials to claim, after one without result."""
 
 
 @dataclass
 class Driver:
-    """One process that works on one study.
+    """One process that executes trials of one study.
 
     Attributes:
-        ledger: the study.
-        source: gives the work.
-        runs: where finished runs are found.
-        executor: makes processes.
-        settings: workers, GPUs, budget.
-        view: what a person sees.
-        metrics: names of the study's objectives.
+        store: the study.
+        source: claims trials.
+        runs: finished runs.
+        executor: starts processes.
+        settings: objectives, workers, GPUs, budget.
+        view: the progress.
+        running: trials in progress, by slot.
+        failures: number of failed trials.
     """
 
     store: TrialStore
@@ -66,99 +67,97 @@ class Driver:
     executor: Executor
     settings: SweepSettings
     view: ProgressView
-    metrics: Sequence[str]
-    works: dict[int, RunningTrial] = field(default_factory=dict)
+    running: dict[int, RunningTrial] = field(default_factory=dict)
     failures: int = 0
     _began: float = field(default_factory=time.monotonic)
-    _looked: float = -math.inf
-    _beaten: float = field(default_factory=time.monotonic)
-    _away_since: float = 0.0
-    _tries: Counter[str] = field(default_factory=Counter)
+    _last_claim: float = -math.inf
+    _last_heartbeat: float = field(default_factory=time.monotonic)
+    _unreachable_since: float = 0.0
+    _attempts: Counter[str] = field(default_factory=Counter)
 
     def run(self) -> None:
-        """Work until nothing is left to do; on Ctrl-C or SIGTERM give back what is not done."""
+        """Execute trials until none is left; on Ctrl-C or SIGTERM release the unfinished ones."""
         try:
-            while self._patient_round():
+            while self._step_or_wait():
                 time.sleep(POLL_S)
         except BaseException:
-            self._give_back()
+            self._release_all()
             raise
 
-    def _patient_round(self) -> bool:
-        """A round; a storage that cannot be reached is waited for while the runs go on."""
+    def _step_or_wait(self) -> bool:
+        """A step; without access to the storage wait for it, while the runs continue."""
         from optuna.exceptions import StorageInternalError
 
         try:
-            more = self._round()
+            more = self._step()
         except StorageInternalError as error:
             now = time.monotonic()
-            self._away_since = self._away_since or now
-            if now - self._away_since > AWAY_S:
+            self._unreachable_since = self._unreachable_since or now
+            if now - self._unreachable_since > RECONNECT_S:
                 raise RunError(
-                    f"the storage of the study cannot be reached for {AWAY_S / 60:g} minutes "
-                    f"({str(error).splitlines()[0]}); the same command goes on."
+                    f"the storage of the study cannot be reached for {RECONNECT_S / 60:g} minutes "
+                    f"({str(error).splitlines()[0]}); rerun the command to resume."
                 ) from error
             time.sleep(PAUSE_S)
             return True
-        self._away_since = 0.0
+        self._unreachable_since = 0.0
         return more
 
-    def _round(self) -> bool:
-        """Look after everything once; whether there is more to do."""
-        for slot, work in list(self.works.items()):
-            if self._advance(work):
-                del self.works[slot]
-        self._beat()
+    def _step(self) -> bool:
+        """Advance all trials and claim new ones; whether there is more to do."""
+        for slot, trial in list(self.running.items()):
+            if self._advance(trial):
+                del self.running[slot]
+        self._send_heartbeat()
         now = time.monotonic()
-        free = self.settings.workers - len(self.works)
-        due = now - self._looked > LOOK_S
+        free = self.settings.workers - len(self.running)
+        due = now - self._last_claim > CLAIM_S
         if free > 0 and due:
-            self._take_up(free)
-        self.view.update(list(self.works.values()))
-        if self.works or not due:
+            self._claim(free)
+        self.view.update(list(self.running.values()))
+        if self.running or not due:
             return True
         return not (self._is_over() or self.source.is_exhausted(wait=self.settings.wait))
 
-    def _beat(self) -> None:
-        """Say now and then that this driver is alive."""
+    def _send_heartbeat(self) -> None:
         now = time.monotonic()
-        if now - self._beaten > HEARTBEAT_S:
-            self._beaten = now
-            self.store.beat([work.number for work in self.works.values()])
+        if now - self._last_heartbeat > HEARTBEAT_S:
+            self._last_heartbeat = now
+            self.store.send_heartbeat([trial.number for trial in self.running.values()])
 
-    def _take_up(self, free: int) -> None:
-        """Begin as many points as there are free slots."""
-        mine = {work.number for work in self.works.values()}
-        for trial in self.store.stale_trials(mine):
-            self.store.release(trial.number, "its driver was gone", again=self.source.again)
+    def _claim(self, free: int) -> None:
+        """Begin as many trials as there are free slots."""
+        executing = {trial.number for trial in self.running.values()}
+        for stale in self.store.stale_trials(executing):
+            self.store.release(stale.number, "its driver was gone", requeue=self.source.requeues)
         while free > 0 and not self._is_over():
-            task = self.source.next()
-            if task is None:
-                self._looked = time.monotonic()
+            claimed = self.source.next()
+            if claimed is None:
+                self._last_claim = time.monotonic()
                 return
-            slot = min(set(range(self.settings.workers)) - set(self.works))
-            self.works[slot] = self._begin(task, slot)
-            # What is finished elsewhere needs no process and gives the slot back at once.
-            if self._advance(self.works[slot]):
-                del self.works[slot]
+            slot = min(set(range(self.settings.workers)) - set(self.running))
+            self.running[slot] = self._begin(claimed, slot)
+            # A point that was finished elsewhere needs no process: its slot is free at once.
+            if self._advance(self.running[slot]):
+                del self.running[slot]
             else:
                 free -= 1
-            self._beat()
+            self._send_heartbeat()
 
     def _is_over(self) -> bool:
         """Whether the budget of this call is spent."""
         most, hours = self.settings.max_failures, self.settings.hours
         spent = hours is not None and time.monotonic() - self._began > 3600 * hours
-        failures = self.failures + self.source.refused
+        failures = self.failures + self.source.rejected
         return spent or (most is not None and failures >= most)
 
-    def _begin(self, task: ClaimedTrial, slot: int) -> RunningTrial:
-        start = partial(self._start, slot=slot, tags=task.plan.point.tags)
+    def _begin(self, claimed: ClaimedTrial, slot: int) -> RunningTrial:
+        start = partial(self._start, slot=slot, tags=claimed.plan.point.tags)
         minutes = self.settings.timeout_minutes
         context = ExecutionContext(self.runs, start, None if minutes is None else 60 * minutes)
-        work = RunningTrial(task.plan, task.number, context, task.report)
-        self.view.began(work)
-        return work
+        trial = RunningTrial(claimed.plan, claimed.number, context, claimed.report)
+        self.view.began(trial)
+        return trial
 
     def _start(
         self, command: Sequence[str], log: Path, *, slot: int, tags: Mapping[str, str]
@@ -169,50 +168,75 @@ class Driver:
             environment |= {"CUDA_VISIBLE_DEVICES": str(gpu)}
         return self.executor.start(command, environment, log)
 
-    def _advance(self, work: RunningTrial) -> bool:
-        """Whether the work is done with, well or badly; the study is told."""
-        notes = {names.SECONDS: round(work.seconds, 1)}
+    def _advance(self, trial: RunningTrial) -> bool:
+        """Whether the trial has ended; its end is recorded in the study."""
+        notes = {names.SECONDS: round(trial.seconds, 1)}
         try:
-            found = work.advance()
-            if found is None:
+            results = trial.advance()
+            if results is None:
                 return False
-            scores = mean_scores(found)
-            values = [_finite(name, scores) for name in self.metrics]
+            scores = mean_scores(results)
+            values = [_finite(each.metric, scores) for each in self.settings.objectives]
         except TrialPruned as reason:
-            self.store.prune(work.number, str(reason), notes)
-            for run in work.plan.runs:
-                self.runs.stopped(run.key, str(reason))
-            self.view.ended(work, "pruned", str(reason))
+            self.store.prune(trial.number, str(reason), notes)
+            for run in trial.plan.runs:
+                self.runs.mark_stopped(run.key, str(reason))
+            self.view.ended(trial, "pruned", str(reason))
         except TrialError as error:
-            self._failed(work, str(error), notes)
+            self._fail(trial, str(error), notes)
         else:
-            self.store.complete(work.number, values, {**notes, names.RESULTS: dict(scores)})
-            self.view.ended(work, "finished", "")
+            self.store.complete(trial.number, values, {**notes, names.RESULTS: dict(scores)})
+            self.view.ended(trial, "finished", "")
         return True
 
-    def _failed(self, work: RunningTrial, reason: str, notes: Mapping[str, Any]) -> None:
-        """Book a failure; a search tries the same point again while `retries` allow."""
-        key = work.plan.key
-        if self.source.again and self._tries[key] < self.settings.retries:
-            self.store.release(work.number, f"tried again: {reason}", again=True)
+    def _fail(self, trial: RunningTrial, reason: str, notes: Mapping[str, Any]) -> None:
+        """Record a failure; a search retries the same point as often as `retries` allow."""
+        key = trial.plan.key
+        if self.source.requeues and self._attempts[key] < self.settings.retries:
+            self.store.release(trial.number, f"tried again: {reason}", requeue=True)
         else:
-            self.store.fail(work.number, reason, notes)
+            self.store.fail(trial.number, reason, notes)
             self.failures += 1
-        self._tries[key] += 1
-        self.view.ended(work, "failed", reason)
+        self._attempts[key] += 1
+        self.view.ended(trial, "failed", reason)
 
-    def _give_back(self) -> None:
-        """Stop all processes and give the trials back; their runs continue at the next call."""
+    def _release_all(self) -> None:
+        """Stop all processes and release their trials; the next call resumes their runs."""
         from optuna.exceptions import StorageInternalError
 
-        for work in self.works.values():
-            work.stop()
-        while not all(work.is_stopped() for work in self.works.values()):
+        trials = self.running.values()
+        for trial in trials:
+            trial.stop()
+        while not all(trial.is_stopped() for trial in trials):
             time.sleep(POLL_S)
-        # Where the storage is away they are orphans, which the next driver takes up as well.
+        # Without access to the storage they are stale trials, which the next driver releases.
         with suppress(StorageInternalError):
-            for work in self.works.values():
-                self.store.release(work.number, "its driver was stopped", again=self.source.again)
+            for trial in trials:
+                requeue = self.source.requeues
+                self.store.release(trial.number, "its driver was stopped", requeue=requeue)
+
+
+def drive(
+    view: ProgressView,
+    source: TrialSource,
+    store: TrialStore,
+    runs: RunStore,
+    settings: SweepSettings,
+) -> None:
+    """Execute the trials of `source` with the executor of the settings, and show the progress."""
+    executor = make_executor(settings, runs.runs_dir)
+    with view:
+        Driver(store, source, runs, executor, settings, view).run()
+
+
+def make_executor(settings: SweepSettings, runs_dir: Path) -> Executor:
+    """The executor that `executor` and its options name."""
+    if settings.executor == "local":
+        check_gpus(settings.gpus)
+        return LocalExecutor(settings.workers)
+    from sweeps.worker.submitit_executor import SubmititExecutor
+
+    return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
 
 
 def _finite(name: str, scores: Mapping[str, float]) -> float:

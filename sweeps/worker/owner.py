@@ -1,4 +1,4 @@
-"""Who works on a trial, and whether that driver is still there."""
+"""The driver that executes a trial, and whether it is still alive."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HEARTBEAT_S = 20.0
-"""Seconds between two signs of life of a driver."""
+"""Seconds between two heartbeats of a driver."""
 
 STALE_S = 180.0
-"""A driver on another machine that was silent for so long is taken for dead."""
+"""A driver on another machine is dead after so many seconds without a heartbeat."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Owner:
     Attributes:
         host: name of the machine.
         pid: number of the process.
-        started: when the process began, in ticks since the machine did; tells it from a later
-            process with the same number.
+        started: when the process began, in ticks since the machine did; distinguishes it from a
+            later process with the same number.
     """
 
     host: str
@@ -30,13 +30,13 @@ class Owner:
     started: str
 
     @classmethod
-    def me(cls) -> Owner:
+    def this_process(cls) -> Owner:
         """This process."""
         return cls(os.uname().nodename, os.getpid(), _started(os.getpid()))
 
     @classmethod
     def unknown(cls) -> Owner:
-        """A driver that did not say who it is: only its last sign counts."""
+        """A driver without a name: only its last heartbeat counts."""
         return cls("?", 0, "")
 
     @classmethod
@@ -48,19 +48,20 @@ class Owner:
     def __str__(self) -> str:
         return f"{self.host}:{self.pid}:{self.started}"
 
-    def is_alive(self, beat: float) -> bool:
-        """Whether the driver still works.
+    def is_alive(self, heartbeat: float) -> bool:
+        """Whether the driver is still running.
 
         Args:
-            beat: seconds since 1970 at which it last said so; all that counts on another machine.
+            heartbeat: time of its last heartbeat, seconds since 1970; all that counts on another
+                machine.
         """
         if self.host == os.uname().nodename:
             return _started(self.pid) == self.started
-        return time.time() - beat < STALE_S
+        return time.time() - heartbeat < STALE_S
 
 
 def _started(pid: int) -> str:
-    """Start of a process as the kernel tells it; "" for one that is not there or a zombie."""
+    """Start of a process according to the kernel; "" if it does not exist or is a zombie."""
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""From points to run keys: the configuration of every run of a point, composed and checked."""
+"""From points to run keys: every run of a point is composed and checked."""
 
 from __future__ import annotations
 
@@ -6,59 +6,39 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-from rgbt.checks import InputError
-from rgbt.config.command import composing
-from rgbt.config.component import Component
-from rgbt.config.compose import compose, with_pixels
-from rgbt.spec.run_spec import RunSpec
-from rgbt.spec.specify import specify
+from rgbt.config.compose import with_pixels
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run of a point.
-
-    Attributes:
-        key: config key, which names its folder.
-        dataset: fingerprint of its data set.
-        overrides: of `python -m rgbt.run`.
-        steps: optimiser steps it takes.
-        pixel_factor: size of its images relative to the paper's.
-    """
-
-    key: str
-    dataset: str
-    overrides: tuple[str, ...]
-    steps: int
-    pixel_factor: float = 1.0
+from sweeps.run_specs import PlannedRun, plan_run
 
 
 @dataclass(frozen=True)
 class PlannedPoint:
-    """A point with the runs it is made of.
+    """A point with its runs.
 
     Attributes:
         point: the point.
-        key: names the point in a study: the key of its run, or a hash where there is more to it.
+        key: identifies the point in a study: the key of its run; of several runs or with further
+            evaluations, a hash.
         runs: one, or one per seed.
-        pixel_factor: size of its images relative to the paper's.
     """
 
     point: Point
     key: str
     runs: tuple[PlannedRun, ...]
-    pixel_factor: float = 1.0
+
+    @property
+    def pixel_factor(self) -> float:
+        """Size of its images relative to the paper's."""
+        return self.runs[0].pixel_factor
 
 
 class Planner:
-    """Plans points; every data set is looked at once.
+    """Plans points; the fingerprint of every data set is computed once.
 
     Args:
-        base: overrides that all runs have, e.g. where runs and data lie.
+        base: overrides that all runs have, e.g. the folders of runs and data.
     """
 
     def __init__(self, base: Sequence[str] = ()) -> None:
@@ -71,55 +51,27 @@ class Planner:
         Raises:
             InputError: a configuration or a data set that does not fit, in one sentence.
         """
-        runs = tuple(self._run(overrides) for overrides in point.runs())
+        runs = tuple(
+            plan_run((*self.base, *overrides), self._fingerprints) for overrides in point.runs()
+        )
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            # Attributes that came later are left out where they say what older studies did.
-            plain = vars(ExtraEvaluation())
-            asked = [
-                {
-                    name: value
-                    for name, value in vars(each).items()
-                    if name in ("modality", "regions") or value != plain[name]
-                }
-                for each in point.evaluations
-            ]
-            parts = [[run.key for run in runs], asked]
+            evaluations = [_identity(evaluation) for evaluation in point.evaluations]
+            parts = [[run.key for run in runs], evaluations]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
-        factor = runs[0].pixel_factor
-        return PlannedPoint(
-            replace(point, label=with_pixels(point.label, factor)), key, runs, factor
-        )
+        label = with_pixels(point.label, runs[0].pixel_factor)
+        return PlannedPoint(replace(point, label=label), key, runs)
 
-    def spec(self, overrides: Sequence[str]) -> RunSpec:
-        """The specification of one run.
 
-        Raises:
-            InputError: see `plan`; what Hydra refuses is told in the words of the command line.
-        """
-        with composing(overrides):
-            return specify(compose(overrides), overrides)
+def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:
+    """The attributes of an evaluation that keys of points hold.
 
-    def _run(self, overrides: tuple[str, ...]) -> PlannedRun:
-        every = (*self.base, *overrides)
-        spec = self.spec(every)
-        return PlannedRun(
-            key=spec.key,
-            dataset=self._fingerprint(spec.dataset),
-            overrides=every,
-            steps=spec.trainer.max_steps,
-            pixel_factor=spec.scale.pixel_factor,
-        )
-
-    def _fingerprint(self, component: Component) -> str:
-        text = json.dumps(component.plain, sort_keys=True)
-        if text not in self._fingerprints:
-            dataset: Any = component.build()
-            if not any(dataset.has(split) for split in dataset.splits):
-                paths = ", ".join(dict.fromkeys(dataset.splits.values()))
-                raise InputError(
-                    f"{dataset.root} holds none of the lists or files {paths} of the data set; "
-                    "name its folder with dataset.root=..."
-                )
-            self._fingerprints[text] = dataset.fingerprint()
-        return self._fingerprints[text]
+    Attributes that came after the first studies are left out at their defaults, so that the keys
+    of older studies stay the same.
+    """
+    defaults = vars(ExtraEvaluation())
+    return {
+        name: value
+        for name, value in vars(evaluation).items()
+        if name in ("modality", "regions") or value != defaults[name]
+    }

@@ -1,71 +1,69 @@
-"""Points known beforehand: what is missing of a grid or a table is run, what there is is found."""
+"""Points known beforehand: a grid, a list, the cells of a table."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
+from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.settings import SweepSettings
-from sweeps.worker.driver import Driver
-from sweeps.worker.executors import Executor, LocalExecutor, check_gpus
+from sweeps.worker.driver import drive
+from sweeps.worker.list_source import (
+    ListSource,
+    PointStatus,
+    State,
+    finished_runs,
+    is_evaluated,
+    reason_of,
+)
 from sweeps.worker.owner import Owner
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_monitor import training_seconds
-from sweeps.worker.run_store import RunResult, RunStore
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_source import (
-    PointListSource,
-    PointStatus,
-    State,
-    is_evaluated,
-    reason_of,
-    trained,
-)
-from sweeps.worker.trial_store import TrialStore, by_key, counted
+from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command would take up."""
+"""States of points that a command runs."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a point.
+    """A point with its state and its finished runs.
 
     Attributes:
         point: the point.
         state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
         reason: why it failed, or "".
-        found: its finished runs; where it waits, those that lack further evaluations alone.
+        results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
     """
 
     point: Point
     state: State
     reason: str = ""
-    found: tuple[RunResult, ...] = ()
+    results: tuple[RunResult, ...] = ()
     keys: tuple[str, ...] = ()
 
     @property
     def is_trained(self) -> bool:
-        """Whether it is not finished, but lacks nothing but further evaluations of its runs."""
-        return self.state in UNFINISHED and bool(self.found)
+        """Whether it lacks further evaluations of its runs only."""
+        return self.state in UNFINISHED and bool(self.results)
 
     @property
     def seconds(self) -> float | None:
-        """How long its runs took, as far as they know."""
-        each = [training_seconds(found.folder) for found in self.found]
+        """Duration of its runs; None where one of them is unknown."""
+        each = [training_seconds(result.folder) for result in self.results]
         return None if not each or None in each else sum(s for s in each if s is not None)
 
 
@@ -75,10 +73,10 @@ class PointList:
 
     Attributes:
         study: name of the study.
-        title: what a person reads above the progress.
+        title: shown above the progress.
         kind: "grid" or "list".
         points: the points.
-        runs: where finished runs are found; the points' overrides name the same folder.
+        runs: finished runs; the points' overrides name the same folder.
         base: overrides that all have.
         distributions: of the parameters of a grid, by name.
     """
@@ -94,38 +92,38 @@ class PointList:
 
 def other_code_line(outcomes: Sequence[Outcome]) -> str:
     """How many runs other code made, in a sentence; "" for none."""
-    found = {run.key: run for outcome in outcomes for run in outcome.found}
-    others = sum(run.is_of_other_code for run in found.values())
+    results = {result.key: result for outcome in outcomes for result in outcome.results}
+    others = sum(result.other_code is not None for result in results.values())
     if not others:
         return ""
     return (
-        f"{others} of {len(found)} runs were made by other code; fresh=true trains these again and "
-        "keeps the old runs."
+        f"{others} of {len(results)} runs were made by other code; fresh=true trains these again "
+        "and keeps the old runs."
     )
 
 
-def preview_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
-    """What is known of the points; nothing is run and nothing written."""
-    prepared = _PlannedPoints(wanted)
-    study = find_study(wanted.study, settings.storage, prepared.runs.runs_dir)
-    trials = by_key(() if study is None else counted(study))
-    return prepared.outcomes(lambda plan: _seen(plan, trials.get(plan.key, []), prepared.runs))
+def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
+    """The present state of the points; nothing is run and nothing written."""
+    planned = _PlannedPoints(points)
+    study = find_study(points.study, settings.storage, points.runs.runs_dir)
+    trials = trials_by_key(() if study is None else counted_trials(study))
+    return planned.outcomes(lambda plan: _status(plan, trials.get(plan.key, []), points.runs))
 
 
-def _seen(plan: PlannedPoint, trials: Sequence[FrozenTrial], runs: RunStore) -> PointStatus:
-    found = trained(plan, runs) or ()
-    if found and is_evaluated(plan, found):
-        return PointStatus("finished", found=found)
+def _status(plan: PlannedPoint, trials: Sequence[FrozenTrial], runs: RunStore) -> PointStatus:
+    results = finished_runs(plan, runs) or ()
+    if results and is_evaluated(plan, results):
+        return PointStatus("finished", results=results)
     states = [trial.state.name for trial in trials]
     if "RUNNING" in states:
         return PointStatus("running")
     if states and states[-1] == "FAIL":
-        return PointStatus("failed", reason_of(trials[-1]), found)
-    return PointStatus("waiting", found=found)
+        return PointStatus("failed", reason_of(trials[-1]), results)
+    return PointStatus("waiting", results=results)
 
 
-def run_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
-    """Run what is missing of the points; failures are isolated and told in the outcomes.
+def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
+    """Run all unfinished points; a failed point does not stop the others.
 
     Returns:
         one outcome per point, in their order.
@@ -133,59 +131,46 @@ def run_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
     Raises:
         InputError: the storage or the executor cannot be used.
     """
-    prepared = _PlannedPoints(wanted)
-    runs = prepared.runs
+    planned = _PlannedPoints(points)
+    runs = points.runs
     storage = open_storage(settings.storage, runs.runs_dir)
-    runs.touch()
-    study = open_study(wanted.study, storage, settings.objectives, {names.KIND: wanted.kind})
-    store = TrialStore(study, storage, Owner.me())
-    plans = list(prepared.plans.values())
-    source = PointListSource(plans, store, runs, settings, dict(wanted.distributions or {}))
+    runs.create_tables()
+    study = open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
+    store = TrialStore(study, storage, Owner.this_process())
+    plans = list(planned.plans.values())
+    source = ListSource(plans, store, runs, settings, points.distributions or {})
 
-    def done() -> int:
-        trials = store.by_key()
-        states = [source.standing(plan, trials).state for plan in source.plans.values()]
-        return sum(state in ("finished", "failed") for state in states)
+    def num_done() -> int:
+        return sum(status.state in ("finished", "failed") for status in source.statuses())
 
-    view = ProgressView(wanted.title, len(source.plans), settings.workers, done)
-    driver = Driver(
-        store=store,
-        source=source,
-        runs=runs,
-        executor=make_executor(settings, runs.runs_dir),
-        settings=settings,
-        view=view,
-        metrics=[objective.metric for objective in settings.objectives],
-    )
-    with view:
-        driver.run()
+    view = ProgressView(points.title, len(source.plans), settings.workers, num_done)
+    drive(view, source, store, runs, settings)
     trials = store.by_key()
-    return prepared.outcomes(lambda plan: source.standing(plan, trials))
+    return planned.outcomes(lambda plan: source.status(plan, trials))
 
 
 class _PlannedPoints:
-    """Points planned; those with a wrong configuration are known to fail."""
+    """The points of a list, planned; those with a wrong configuration have failed."""
 
-    def __init__(self, wanted: PointList) -> None:
-        planner = Planner(wanted.base)
-        self.runs = wanted.runs
-        self.points = wanted.points
+    def __init__(self, points: PointList) -> None:
+        planner = Planner(points.base)
+        self.points = points.points
         self.plans: dict[int, PlannedPoint] = {}
-        self.wrong: dict[int, str] = {}
-        for index, point in enumerate(wanted.points):
+        self.errors: dict[int, str] = {}
+        for index, point in enumerate(self.points):
             try:
                 self.plans[index] = planner.plan(point)
             except InputError as error:
-                self.wrong[index] = str(error)
-        if self.wrong and not self.plans:
-            # What no point can be composed with is a mistake of the call and not of a cell.
-            raise InputError(next(iter(self.wrong.values())))
-        self._share_tags(wanted.study)
+                self.errors[index] = str(error)
+        if self.errors and not self.plans:
+            # An error of every point is one of the command and not of a point.
+            raise InputError(next(iter(self.errors.values())))
+        self._merge_tags(points.study)
 
-    def _share_tags(self, study: str) -> None:
-        """Points that are the same run in other words (1 and 1.0) get the tags of all of them.
+    def _merge_tags(self, study: str) -> None:
+        """Give points of the same run in other words (1 and 1.0) the tags of all of them.
 
-        Every run gets its own colour, and the beginning of its name.
+        Every run gets its own colour, and the keys that vary, which begin its name.
         """
         varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}
@@ -195,36 +180,27 @@ class _PlannedPoints:
                 values = own.setdefault(name, [])
                 values += [] if value in values else [value]
         for index, plan in self.plans.items():
-            shared = {name: " | ".join(each) for name, each in tags.get(plan.key, {}).items()}
-            shared |= {VARIED: varied, COLOUR: colour(study, list(tags).index(plan.key))}
-            self.plans[index] = replace(plan, point=replace(plan.point, tags=shared))
+            merged = {name: " | ".join(each) for name, each in tags[plan.key].items()}
+            merged |= {VARIED: varied, COLOUR: colour(study, list(tags).index(plan.key))}
+            self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
 
-    def outcomes(self, standing: Any) -> list[Outcome]:
+    def outcomes(self, status_of: Callable[[PlannedPoint], PointStatus]) -> list[Outcome]:
         """One outcome per point, in order."""
-        found = []
+        outcomes = []
         for index, point in enumerate(self.points):
-            if index in self.wrong:
-                found.append(Outcome(point, "failed", self.wrong[index]))
+            if index in self.errors:
+                outcomes.append(Outcome(point, "failed", self.errors[index]))
                 continue
             plan = self.plans[index]
-            seen = standing(plan)
+            status = status_of(plan)
             keys = tuple(run.key for run in plan.runs)
-            found.append(Outcome(plan.point, seen.state, seen.reason, seen.found, keys))
-        return found
-
-
-def make_executor(settings: SweepSettings, runs_dir: Path) -> Executor:
-    """What `executor` and its options name."""
-    if settings.executor == "local":
-        check_gpus(settings.gpus)
-        return LocalExecutor(settings.workers)
-    from sweeps.worker.submitit_executor import SubmititExecutor
-
-    return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
+            outcome = Outcome(plan.point, status.state, status.reason, status.results, keys)
+            outcomes.append(outcome)
+        return outcomes
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:
-    """How long the trainings that are missing will take; None where no run tells."""
-    known_ones = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
+    """Estimated duration of the missing trainings; None where no run has finished."""
+    durations = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
     missing = sum(outcome.state in UNFINISHED and not outcome.is_trained for outcome in outcomes)
-    return missing * median(known_ones) / workers if known_ones else None
+    return missing * median(durations) / workers if durations else None

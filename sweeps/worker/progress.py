@@ -1,6 +1,6 @@
-"""What a person sees while points are worked off: one line per worker, and how long it will take.
+"""Progress of a driver: one line per worker, and the time left.
 
-Where stderr is no terminal (a log file of a cluster), a line per point that begins or ends.
+Where stderr is no terminal (a log file of a cluster), a line per trial that begins or ends.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from sweeps.worker.running_trial import RunningTrial
 
 CONSOLE = Console(stderr=True)
 LABEL_WIDTH = 52
-BESIDE = 68
+OTHER_WIDTH = 68
 """Characters of a line beside the label: bar, share, status and score."""
 
 SHORT_S = 5.0
-"""A point that took less was not trained, its result was known."""
+"""A trial that took less was not trained: its runs were finished before."""
 
 
 class ProgressView:
-    """A live view of a driver; use as a context manager.
+    """The progress of a driver; use as a context manager.
 
     Args:
-        title: what is worked on, e.g. the table.
-        total: points in all; None for a search that ends by time.
-        workers: how many work at a time.
-        count: asked now and then for the number of points that are done, also by other drivers.
+        title: e.g. the table.
+        total: number of points; None for a search that ends by time.
+        workers: processes at a time.
+        count: returns the number of points done by all drivers; called every few seconds.
     """
 
     def __init__(
@@ -67,62 +67,67 @@ class ProgressView:
         if self._live is not None:
             self._live.stop()
 
-    def began(self, work: RunningTrial) -> None:
-        """A point is worked on."""
+    def began(self, trial: RunningTrial) -> None:
+        """Show that a trial begins."""
         if self._live is None:
-            self._say(f"begins   {work.plan.point.label}")
+            self._say(f"begins   {trial.plan.point.label}")
 
-    def ended(self, work: RunningTrial, how: str, reason: str) -> None:
-        """A point is done with: "finished", "failed" or "pruned", and why."""
+    def ended(self, trial: RunningTrial, how: str, reason: str) -> None:
+        """Show that a trial ended: "finished", "failed" or "pruned", and why."""
         self._ended[how] += 1
         self._done += 1
-        if how == "finished" and work.seconds > SHORT_S:
-            self._seconds.append(work.seconds)
-        score = "" if math.isnan(work.score) else f"  val mIoU {100 * work.score:.2f}"
+        if how == "finished" and trial.seconds > SHORT_S:
+            self._seconds.append(trial.seconds)
+        score = "" if math.isnan(trial.score) else f"  val mIoU {100 * trial.score:.2f}"
         because = f": {reason}" if reason else ""
-        text = f"{how:<8} {work.plan.point.label}  {work.seconds:.0f} s{score}{because}"
+        text = f"{how:<8} {trial.plan.point.label}  {trial.seconds:.0f} s{score}{because}"
         if how != "finished" or self._live is None:
             self._say(text)
 
-    def refused(self, label: str, reason: str) -> None:
-        """A point could not be begun."""
+    def rejected(self, label: str, reason: str) -> None:
+        """Show that the configuration of a point is wrong."""
         self._ended["failed"] += 1
         self._say(f"failed   {label}: {reason}")
 
-    def update(self, works: Sequence[RunningTrial]) -> None:
-        """Draw the state of the workers."""
+    def update(self, trials: Sequence[RunningTrial]) -> None:
+        """Draw the running trials."""
         if self._live is None:
             return
         now = time.monotonic()
         if now - self._counted > 5:
             self._counted, self._done = now, self._count()
         rows = Table.grid(padding=(0, 2))
-        room = max(SHORTEST, min(LABEL_WIDTH, CONSOLE.width - BESIDE))
-        labels = shortened([work.plan.point.label for work in works], [room] * len(works))
-        for work, label in zip(works, labels, strict=True):
-            score = "" if math.isnan(work.score) else f"val mIoU {100 * work.score:.2f}"
-            bar = ProgressBar(total=1.0, completed=work.done_share, width=24)
+        room = max(SHORTEST, min(LABEL_WIDTH, CONSOLE.width - OTHER_WIDTH))
+        labels = shortened([trial.plan.point.label for trial in trials], [room] * len(trials))
+        for trial, label in zip(trials, labels, strict=True):
+            score = "" if math.isnan(trial.score) else f"val mIoU {100 * trial.score:.2f}"
+            bar = ProgressBar(total=1.0, completed=trial.done_share, width=24)
             rows.add_row(
-                "  ", Text(label), bar, f"{100 * work.done_share:3.0f} %", Text(work.status), score
+                "  ",
+                Text(label),
+                bar,
+                f"{100 * trial.done_share:3.0f} %",
+                Text(trial.status),
+                score,
             )
-        self._live.update(Group(Text(self._headline(works)), rows))
+        self._live.update(Group(Text(self._headline(trials)), rows))
 
-    def _headline(self, works: Sequence[RunningTrial]) -> str:
+    def _headline(self, trials: Sequence[RunningTrial]) -> str:
         of = "" if self._total is None else f" of {self._total}"
         failed = f", {self._ended['failed']} failed" if self._ended["failed"] else ""
         pruned = f", {self._ended['pruned']} pruned" if self._ended["pruned"] else ""
-        left = self._left(works)
-        return f"{self._title}: {self._done}{of} done{failed}{pruned}, {len(works)} running{left}"
+        left = self._left(trials)
+        return f"{self._title}: {self._done}{of} done{failed}{pruned}, {len(trials)} running{left}"
 
-    def _left(self, works: Sequence[RunningTrial]) -> str:
-        """Time left, as far as the points finished so far tell."""
+    def _left(self, trials: Sequence[RunningTrial]) -> str:
+        """Estimated time left, from the trials finished so far."""
         if self._total is None:
             return ""
-        shares = [work.done_share for work in works]
-        each = median(self._seconds) if self._seconds else _projected(works)
+        shares = [trial.done_share for trial in trials]
+        each = median(self._seconds) if self._seconds else _projected(trials)
         if each is None:
             return ""
-        points = max(0, self._total - self._done - len(works)) + sum(1 - share for share in shares)
+        points = max(0, self._total - self._done - len(trials)) + sum(1 - share for share in shares)
         return f", about {duration(points * each / self._workers)} left"
 
     def _say(self, text: str) -> None:
@@ -132,9 +137,9 @@ class ProgressView:
             CONSOLE.print(f"{time.strftime('%H:%M:%S')} {text}", markup=False, soft_wrap=True)
 
 
-def _projected(works: Sequence[RunningTrial]) -> float | None:
-    """Seconds of a point, from how far the running ones have come."""
-    shares = [(work.seconds, work.done_share) for work in works if work.done_share > 0.05]
+def _projected(trials: Sequence[RunningTrial]) -> float | None:
+    """Estimated seconds of a point, from the progress of the running trials."""
+    shares = [(trial.seconds, trial.done_share) for trial in trials if trial.done_share > 0.05]
     return median(seconds / share for seconds, share in shares) if shares else None
 
 

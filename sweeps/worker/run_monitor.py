@@ -1,4 +1,4 @@
-"""What a running run writes: its metric lines as they come, and why it stopped."""
+"""Files of a run in progress: its metrics, its log, its lock."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class MetricsReader:
     def new_lines(self) -> list[MetricLine]:
         """Whole lines since the last call; all of them again where the run has resumed.
 
-        Damaged lines are left out here: the run itself reports them when it resumes.
+        Damaged lines are skipped: the run itself reports them when it resumes.
         """
         try:
             with self._path.open("rb") as file:
@@ -57,51 +57,51 @@ class MetricsReader:
 
 
 def failure_reason(code: int, log: Path, start: int) -> str:
-    """Why a process ended, in one sentence.
+    """Why a process failed, in one sentence.
 
     Args:
         code: exit code; negative for a signal.
         log: file with its output.
         start: where its output begins in that file, bytes.
     """
-    said = _last_words(log, start)
+    message = _last_message(log, start)
     if code >= 0:
-        # What it said went to a file on the disk that may be the reason.
+        # Its output went to a file on the disk that may be the reason.
         is_full = log.parent.exists() and shutil.disk_usage(log.parent).free < FULL
-        unsaid = f"the disk of {log.parent} is full" if is_full else f"see {log}"
-        return said or f"it left with exit code {code} and said nothing; {unsaid}"
+        hint = f"the disk of {log.parent} is full" if is_full else f"see {log}"
+        return message or f"it ended with exit code {code} and no output; {hint}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     hint = f" ({OUT_OF_MEMORY})" if name == "SIGKILL" else ""
     return f"stopped by {name}{hint}"
 
 
-def _last_words(log: Path, start: int) -> str:
-    """The last sentence of ours, or the last line of a traceback."""
+def _last_message(log: Path, start: int) -> str:
+    """The last message of rgbt, or the last line of a traceback."""
     if not log.exists():
         return ""
     with log.open("rb") as file:
         file.seek(start)
         text = file.read().decode(errors="replace")
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
-    # Libraries log tracebacks of what they then survive: the last word counts.
+    # Libraries log tracebacks of errors that they handle: the last message counts.
     traced = "Traceback (most recent call last):" in lines
     error = r"[\w.]+(Error|Exception|Interrupt)\b" if traced else r"(?!)"
-    said = [line for line in lines if line.startswith("rgbt: ") or re.match(error, line)]
-    last = (said or lines or [""])[-1]
+    messages = [line for line in lines if line.startswith("rgbt: ") or re.match(error, line)]
+    last = (messages or lines or [""])[-1]
     return last.removeprefix("rgbt: ")[:300]
 
 
 def signal_lock_holder(folder: Path, number: signal.Signals) -> None:
     """Send a signal to the process that trains in `folder`, if it is on this machine."""
     lock = folder / "lock"
-    said = lock.read_text(errors="replace") if lock.exists() else ""
-    found = re.fullmatch(r"process (\d+) on (\S+)", said)
-    if found and found.group(2) == os.uname().nodename:
-        with suppress(ProcessLookupError):  # it has ended between our two looks
-            os.kill(int(found.group(1)), number)
+    text = lock.read_text(errors="replace") if lock.exists() else ""
+    holder = re.fullmatch(r"process (\d+) on (\S+)", text)
+    if holder and holder.group(2) == os.uname().nodename:
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.kill(int(holder.group(1)), number)
 
 
 def training_seconds(folder: Path) -> float | None:
-    """How long the finished run in `folder` took, as far as its last process knows."""
+    """Duration of the last process of the finished run in `folder`."""
     seconds = (read_result(folder) or {}).get("seconds_of_last_process")
     return None if seconds is None else float(seconds)

@@ -2,138 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
+from typing import TypeVar
 
 from rgbt.checks import InputError, RunError
-from rgbt.config.component import build
-from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.formats import ADVICE, read_provenance, read_result
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.other_code import other_code
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced import replace_finished
+from rgbt.tracking.run_result import RunResult
 from rgbt.tracking.terminal import tell
-from rgbt.tracking.tracker import Tracking
-from sweeps.evaluation import ExtraEvaluation
+from rgbt.tracking.tracker import Status, Tracking
 
 FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
-CHECKPOINT = "best.pt"
-"""What evaluations are made of; other machines do not get it."""
-
 FETCHED = ".fetched"
-"""Folder inside the folder of runs: what was taken from MLflow of runs made elsewhere."""
+"""Folder inside the folder of runs: copies of runs that other machines made, from MLflow."""
 
-
-@dataclass(frozen=True)
-class RunResult:
-    """A finished run.
-
-    Attributes:
-        key: its config key.
-        folder: where its files lie here: the run folder, or copies of what MLflow holds.
-        run_id: its MLflow run where the files came from there, else "".
-    """
-
-    key: str
-    folder: Path
-    run_id: str = ""
-
-    @property
-    def result(self) -> dict[str, Any]:
-        """``result.json`` of the run (see `rgbt.training.train`)."""
-        result = read_result(self.folder)
-        if result is None or "dataset" not in result:
-            raise InputError(
-                f"{self.folder / 'result.json'} is missing or names no data set; {ADVICE}."
-            )
-        return result
-
-    @property
-    def dataset(self) -> str:
-        """Fingerprint of the data set it was made on."""
-        return str(self.result["dataset"])
-
-    @property
-    def commit(self) -> str | None:
-        """Git commit of the code that made it; "+" is added for changes that were not committed."""
-        first = next(iter(read_provenance(self.folder / "provenance.json")), {})
-        commit = first.get("git_commit")
-        return None if commit is None else f"{commit[:10]}{'+' if first.get('git_dirty') else ''}"
-
-    @property
-    def is_of_other_code(self) -> bool:
-        """Whether it was made by other code than that of this process."""
-        return other_code(self.folder) is not None
-
-    def scores(self) -> dict[str, float]:
-        """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
-        result = self.result
-        return {
-            f"{split}/{name}": in_percent(name, value)
-            for split in ("val", "test")
-            for name, value in result.get(split, {}).items()
-            if value is not None
-        }
-
-    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
-        """Counts of the test split.
-
-        Args:
-            evaluation: None: those that the run itself ended with.
-
-        Raises:
-            InputError: the file is missing or not readable.
-        """
-        return Counts.load(self.counts_file(evaluation))
-
-    def has(self, evaluation: ExtraEvaluation) -> bool:
-        """Whether the evaluation is there, of this training and not of an earlier one."""
-        # The checkpoint tells, not the result: a run may have made it itself before that.
-        path, best = self.counts_file(evaluation), self.folder / CHECKPOINT
-        if not path.exists():
-            return False
-        if best.exists() and path.stat().st_mtime < best.stat().st_mtime:
-            return False
-        try:
-            counts = Counts.load(path)
-        except InputError:  # not readable: it is made again
-            return False
-        return counts.dataset == self.dataset and counts.split == "test"
-
-    def counts_file(self, evaluation: ExtraEvaluation | None = None) -> Path:
-        """Where the counts lie, whether they are there yet or not."""
-        if evaluation is None:
-            return self.folder / "counts_test.npz"
-        return self.folder / evaluation.path
-
-
-def open_run_store(config: DictConfig) -> RunStore:
-    """Finished runs where a configuration says that runs lie and how they are tracked."""
-    runs_dir = Path(config.runs_dir).expanduser().resolve()
-    return RunStore(runs_dir, build(config.tracking), fresh=config.fresh)
+Answer = TypeVar("Answer")
 
 
 class RunStore:
-    """All finished runs that can be found from here.
+    """All finished runs that this machine can reach.
 
     Args:
         runs_dir: the folder of runs.
-        tracking: as the configuration builds it; MLflow is asked for runs that have no result here.
-        fresh: finished runs that other code made do not count: they are trained again.
+        tracking: as the configuration builds it; MLflow is searched for runs without a result here.
+        fresh: ignore finished runs that other code made, so that they are trained again.
     """
 
     def __init__(self, runs_dir: Path, tracking: Tracking, *, fresh: bool = False) -> None:
         self.runs_dir = runs_dir
         self.tracking = tracking
         self.fresh = fresh
-        self._is_away = False
+        self._is_unreachable = False
 
     def find(self, key: str, dataset: str) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.
@@ -141,134 +44,126 @@ class RunStore:
         Raises:
             RunError: the run folder is finished, but on other files of the data set.
         """
-        found = self._any(key, dataset)
-        return None if found is not None and self._is_outdated(found) else found
+        result = self._find_any(key, dataset)
+        return None if result is not None and self._is_outdated(result) else result
 
     def replace_outdated(self, key: str) -> None:
-        """Make room for a training of `key` where `find` passes over a finished run of it."""
-        folder = self.runs_dir / key
-        if (folder / "result.json").exists() and self._is_outdated(RunResult(key, folder)):
-            replace_finished(RunFolder(folder), self.tracking)
+        """Move a finished run that `find` ignores out of the way of a new training."""
+        result = RunResult(self.runs_dir / key)
+        if result.is_finished and self._is_outdated(result):
+            replace_finished(RunFolder(result.folder), self.tracking)
 
-    def _is_outdated(self, found: RunResult) -> bool:
-        return self.fresh and found.is_of_other_code
+    def _is_outdated(self, result: RunResult) -> bool:
+        return self.fresh and result.other_code is not None
 
-    def _any(self, key: str, dataset: str) -> RunResult | None:
+    def _find_any(self, key: str, dataset: str) -> RunResult | None:
         """See `find`; whatever code made it."""
-        folder = self.runs_dir / key
-        if not (folder / "result.json").exists():
-            return self._remote(key, dataset)
-        found = RunResult(key, folder)
+        result = RunResult(self.runs_dir / key)
+        if not result.is_finished:
+            return self._find_remote(key, dataset)
         try:
-            made_on = found.dataset
+            trained_on = result.dataset
         except InputError as error:
             raise RunError(str(error)) from error
-        if made_on != dataset:
+        if trained_on != dataset:
             raise RunError(
-                f"{folder} was made on other files of the data set ({made_on[:8]}, now "
+                f"{result.folder} was made on other files of the data set ({trained_on[:8]}, now "
                 f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
             )
-        return found
+        return result
 
-    def tag(self, found: RunResult, tags: Mapping[str, str]) -> None:
+    def tag(self, result: RunResult, tags: Mapping[str, str]) -> None:
         """Add MLflow tags to a finished run that lacks them."""
-        if found.run_id:
-            self._guarded(lambda tracking: _set_tags(tracking, found.run_id, tags))
-            return
-        folder = RunFolder(found.folder)
-        description = folder.description()
-        assert description is not None, "a finished run has its description"
-        if tags.items() <= description.tags.items():
-            return
-        folder.describe(replace(description, tags={**description.tags, **tags}))
-        self._guarded(lambda tracking: tracking.sync(folder, "FINISHED"))
+        if result.run_id:
+            self._with_mlflow(lambda tracking: _set_tags(tracking, result.run_id, tags))
+        elif not tags.items() <= result.tags.items():
+            self._describe(RunFolder(result.folder), tags, "FINISHED")
 
-    def send(self, found: RunResult) -> None:
-        """Bring MLflow up to date with a run folder that has got new files."""
-        self._guarded(lambda tracking: tracking.sync(RunFolder(found.folder), "FINISHED"))
+    def sync(self, result: RunResult) -> None:
+        """Send new files of a run folder to MLflow."""
+        self._with_mlflow(lambda tracking: tracking.sync(RunFolder(result.folder), "FINISHED"))
 
-    def stopped(self, key: str, reason: str) -> None:
-        """Show in MLflow why a run was stopped before its end."""
+    def mark_stopped(self, key: str, reason: str) -> None:
+        """Record in MLflow why a run was stopped before its end."""
         path = self.runs_dir / key
-        if not (path / "run.json").exists() or (path / "result.json").exists():
+        if not (path / "run.json").exists() or RunResult(path).is_finished:
             return  # not begun, or finished while it was being stopped
-        folder = RunFolder(path)
+        self._describe(RunFolder(path), {"rgbt.stopped": reason}, "KILLED")
+
+    def _describe(self, folder: RunFolder, tags: Mapping[str, str], status: Status) -> None:
         description = folder.description()
-        assert description is not None, "run.json exists"
-        folder.describe(replace(description, tags={**description.tags, "rgbt.stopped": reason}))
-        self._guarded(lambda tracking: tracking.sync(folder, "KILLED"))
+        assert description is not None, "a run that has begun has run.json"
+        folder.describe(replace(description, tags={**description.tags, **tags}))
+        self._with_mlflow(lambda tracking: tracking.sync(folder, status))
 
-    def fetch_again(self, found: RunResult, evaluation: ExtraEvaluation) -> bool:
-        """Look for an evaluation that the other machine has made since; whether it is here now."""
-        self._guarded(lambda tracking: _download(tracking, found, ("evaluations",)))
-        return found.has(evaluation)
+    def fetch_counts(self, result: RunResult, path: str) -> bool:
+        """Download evaluations that another machine made since; whether `path` is among them."""
+        self._with_mlflow(lambda tracking: _download(tracking, result, ("evaluations",)))
+        return result.has_counts(path)
 
-    def touch(self) -> None:
-        """Open the store once, before several processes would make its tables at the same time."""
-        self._guarded(lambda tracking: tracking.store())
+    def create_tables(self) -> None:
+        """Open the store once, before several processes create its tables at the same time."""
+        self._with_mlflow(lambda tracking: tracking.store())
 
-    def _remote(self, key: str, dataset: str) -> RunResult | None:
+    def _find_remote(self, key: str, dataset: str) -> RunResult | None:
         copy = self.runs_dir / FETCHED / key
-        known = copy / "run_id"
-        if known.exists():
-            found = RunResult(key, copy, known.read_text(errors="replace"))
-            if found.dataset == dataset:
-                return found
-        fetched: RunResult | None = self._guarded(lambda t: _fetch(t, (key, dataset), copy))
-        return fetched
+        run_id = copy / "run_id"
+        if run_id.exists():
+            result = RunResult(copy, run_id.read_text(errors="replace"))
+            if result.dataset == dataset:
+                return result
+        return self._with_mlflow(lambda tracking: _fetch(tracking, dataset, copy))
 
-    def _guarded(self, work: Any) -> Any:
-        """`work` on MLflow; None without it, and where it cannot be reached, which is told once."""
-        if self._is_away or not isinstance(self.tracking, MlflowTracking):
+    def _with_mlflow(self, action: Callable[[MlflowTracking], Answer]) -> Answer | None:
+        """`action` on MLflow; None without MLflow, and from its first failure on (one warning)."""
+        if self._is_unreachable or not isinstance(self.tracking, MlflowTracking):
             return None
         try:
-            return work(self.tracking)
+            return action(self.tracking)
         except Exception as error:  # The border to a store that may fail in any way.
-            self._is_away = True
-            said = without_passwords(str(error)).splitlines() or [type(error).__name__]
-            reason = said[0][:120]
+            self._is_unreachable = True
+            lines = without_passwords(str(error)).splitlines() or [type(error).__name__]
             tell(
-                f"MLflow cannot be used ({reason}); runs are looked for in {self.runs_dir} alone, "
-                "and `python -m rgbt.tracking.sync` sends them later."
+                f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched in "
+                f"{self.runs_dir} alone. Send new runs later: `python -m rgbt.tracking.sync`."
             )
             return None
 
 
-def _fetch(tracking: MlflowTracking, wanted: tuple[str, str], copy: Path) -> RunResult | None:
-    """Copy what MLflow holds of a finished run; None where it does not know it."""
-    key, dataset = wanted
-    if not is_there(tracking):
+def _fetch(tracking: MlflowTracking, dataset: str, copy: Path) -> RunResult | None:
+    """Copy the files of a finished run from MLflow to `copy`; None where MLflow has no such run."""
+    if not store_exists(tracking):
         return None
     store = tracking.store()
     query = (
-        f"attributes.status = 'FINISHED' and tags.`rgbt.key` = '{key}' "
+        f"attributes.status = 'FINISHED' and tags.`rgbt.key` = '{copy.name}' "
         f"and tags.`rgbt.dataset` = '{dataset}'"
     )
     runs = store.client.search_runs([store.experiment_id], filter_string=query, max_results=1)
     if not runs:
         return None
-    run_id = runs[0].info.run_id
+    result = RunResult(copy, runs[0].info.run_id)
     copy.mkdir(parents=True, exist_ok=True)
-    _download(tracking, RunResult(key, copy, run_id), FETCHED_FILES)
-    if not (copy / "result.json").exists() or not (copy / "counts_test.npz").exists():
+    _download(tracking, result, FETCHED_FILES)
+    if not result.is_finished or not result.counts_path().exists():
         return None
-    # Written last: without it the copy is not whole and is made again.
-    (copy / "run_id").write_text(run_id)
-    return RunResult(key, copy, run_id)
+    # Written last: a copy without it is incomplete and is fetched again.
+    (copy / "run_id").write_text(result.run_id)
+    return result
 
 
-def is_there(tracking: MlflowTracking) -> bool:
-    """Whether the store exists; opening a file of SQLite would make it."""
+def store_exists(tracking: MlflowTracking) -> bool:
+    """Whether the store exists; opening a file of SQLite would create it."""
     scheme, _, path = tracking.uri.partition(":///")
     return scheme != "sqlite" or Path(path).exists()
 
 
-def _download(tracking: MlflowTracking, found: RunResult, wanted: Sequence[str]) -> None:
+def _download(tracking: MlflowTracking, result: RunResult, names: Sequence[str]) -> None:
     client = tracking.store().client
-    there = {item.path for item in client.list_artifacts(found.run_id)}
-    for name in wanted:
-        if name in there:
-            client.download_artifacts(found.run_id, name, str(found.folder))
+    artifacts = {item.path for item in client.list_artifacts(result.run_id)}
+    for name in names:
+        if name in artifacts:
+            client.download_artifacts(result.run_id, name, str(result.folder))
 
 
 def _set_tags(tracking: MlflowTracking, run_id: str, tags: Mapping[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""Where studies are kept: a journal file, SQLite, or PostgreSQL for several machines."""
+"""The storage of studies: a journal file, SQLite, or PostgreSQL for several machines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Opened = TypeVar("Opened")
 
 JOURNAL = "studies.journal"
 NAME = r"[\w\-. :/]+"
-"""What may stand in the name of a study or a table: it is part of MLflow tags."""
+"""Pattern of the name of a study or a table: it is part of MLflow tags."""
 
 SCHEMES = ("sqlite", "postgresql", "postgres")
 ATTEMPTS = 8
@@ -30,13 +30,13 @@ FIXED = {
     names.KIND: "points of another kind",
     names.SIGNATURE: "another space or other overrides",
 }
-"""Attributes of a study that must not change, and how that is told."""
+"""Attributes of a study that must not change, and how messages name a change."""
 
 PAUSE_S = 0.7
 
 
 def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseStorage:
-    """Open the storage, making it where it does not exist.
+    """Open the storage; create it if it does not exist.
 
     Args:
         storage: None for the journal file ``<runs_dir>/studies.journal``; a path that ends in
@@ -54,11 +54,11 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
     if url.endswith(".journal"):
         path = Path(url).expanduser().resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
-        return _replayed(path)
-    return _patiently(lambda: _database(_with_driver(url)), url)
+        return _journal(path)
+    return _retry(lambda: _database(_with_driver(url)), url)
 
 
-def _replayed(path: Path) -> optuna.storages.JournalStorage:
+def _journal(path: Path) -> optuna.storages.JournalStorage:
     import optuna
     from optuna.storages.journal import JournalFileBackend
 
@@ -66,7 +66,7 @@ def _replayed(path: Path) -> optuna.storages.JournalStorage:
         return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # The border to Optuna, which assumes that a journal is whole.
+    except Exception as error:  # The border to Optuna, which assumes a whole journal.
         raise InputError(
             f"storage={path} is damaged ({type(error).__name__}: {one_line(error)}); restore it "
             "from a copy, or remove it: finished runs are reused, other trials start again."
@@ -87,16 +87,16 @@ def _checked(storage: str | None, runs_dir: Path) -> str:
             "sqlite:///FILE or postgresql://USER@HOST/NAME."
         )
     if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).parent.is_dir():
-        raise InputError(f"storage={url}: its folder does not exist; make it first.")
+        raise InputError(f"storage={url}: its folder does not exist; create it first.")
     return url
 
 
-def _database(url: str, *, make: bool = True) -> optuna.storages.RDBStorage:
+def _database(url: str, *, create: bool = True) -> optuna.storages.RDBStorage:
     import optuna
 
     # A firewall may cut a connection that is idle while a run trains for hours.
-    kept_alive = {"pool_pre_ping": True}
-    return optuna.storages.RDBStorage(url, engine_kwargs=kept_alive, skip_table_creation=not make)
+    options = {"pool_pre_ping": True}
+    return optuna.storages.RDBStorage(url, engine_kwargs=options, skip_table_creation=not create)
 
 
 def _with_driver(url: str) -> str:
@@ -105,8 +105,8 @@ def _with_driver(url: str) -> str:
     return f"postgresql+psycopg{mark}{rest}" if scheme in ("postgresql", "postgres") else url
 
 
-def _patiently(opening: Callable[[], Opened], url: str) -> Opened:
-    """Two processes that make the tables of a fresh database at once get in each other's way."""
+def _retry(opening: Callable[[], Opened], url: str) -> Opened:
+    """Retry: of two processes that create the tables of a new database at once, one may fail."""
     import sqlalchemy.exc
 
     shown = without_passwords(url)
@@ -119,7 +119,7 @@ def _patiently(opening: Callable[[], Opened], url: str) -> Opened:
             ) from error
         except sqlalchemy.exc.ArgumentError as error:
             raise InputError(f"storage={shown}: {error}.") from error
-        except Exception as error:  # Whatever the driver raises: a later try finds the tables made.
+        except Exception as error:  # Any error of the driver: a later try finds the tables.
             if attempt == ATTEMPTS - 1 or _is_unreachable(error):
                 reason = str(error).splitlines()[0]
                 raise InputError(f"storage={shown} cannot be opened: {reason}") from error
@@ -147,12 +147,12 @@ def open_study(
     sampler: optuna.samplers.BaseSampler | None = None,
     pruner: optuna.pruners.BasePruner | None = None,
 ) -> optuna.Study:
-    """The study called `name`, made if it does not exist.
+    """The study called `name`, created if it does not exist.
 
     Args:
         name: of the study.
-        storage: where.
-        objectives: what is told of its trials.
+        storage: its storage.
+        objectives: of its trials.
         attributes: of the study; `attributes.SIGNATURE` must not have changed.
         sampler: of a search.
         pruner: of a search.
@@ -166,7 +166,7 @@ def open_study(
         raise InputError(
             f"study={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone."
         )
-    study = _patiently(
+    study = _retry(
         lambda: optuna.create_study(
             study_name=name,
             storage=storage,
@@ -196,7 +196,7 @@ def open_study(
 
 
 def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
-    """The study called `name`; None where it does not exist. Nothing is made.
+    """The study called `name`; None where it does not exist. Nothing is created.
 
     Raises:
         InputError: the storage cannot be reached, or its address is of no known form.
@@ -211,7 +211,7 @@ def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study |
         opened = open_storage(storage, runs_dir)
         return load_study(name, opened) if name in study_names(opened) else None
     try:
-        database = _database(_with_driver(url), make=False)
+        database = _database(_with_driver(url), create=False)
         return load_study(name, database) if name in study_names(database) else None
     except optuna.exceptions.StorageInternalError as error:
         if "connection" in str(error.__cause__).lower():
@@ -225,7 +225,7 @@ def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
     """The study called `name`.
 
     Raises:
-        InputError: there is none; the sentence lists those there are.
+        InputError: there is none; the message lists the existing ones.
     """
     import optuna
 

@@ -1,10 +1,9 @@
 """The trials of one study in Optuna's storage, shared by any number of drivers.
 
-Who works on what is decided by the order of trial numbers, which every storage gives out one by
-one: a driver claims a point by adding a running trial with the point's key, and keeps it unless an
-earlier trial stands for the same key. Nothing needs a lock, and a driver takes up no other points
-than its own, whatever else is in the study. A search asks the sampler; only the trials that a dead
-or interrupted driver left of it wait in Optuna's queue.
+A driver claims a point by adding a running trial with the point's key, and drops it again if a
+trial with a lower number has claimed the same key. Every storage assigns trial numbers one by one,
+so no lock is needed. A search asks the sampler; only trials that a dead or interrupted driver has
+left are enqueued in the study.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial, Trial
 
 CLAIMING_STATES = ("RUNNING", "COMPLETE", "PRUNED")
-"""States of a trial that keep a later one from standing for the same point."""
+"""States of a trial that keep a later one from claiming the same point."""
 
 
 @dataclass(frozen=True)
 class TrialClaim:
-    """What a driver claims.
+    """A point that a driver claims.
 
     Attributes:
         key: of the point.
-        attributes: noted with the trial.
+        attributes: user attributes of the trial.
         params: of a grid, by name.
         distributions: of the parameters.
-        past: numbers of finished trials of the point that do not stand any more (failed ones, and
+        replaced: numbers of earlier trials of the point that the new one replaces (failed ones, and
             those whose runs were deleted).
     """
 
@@ -46,21 +45,21 @@ class TrialClaim:
     attributes: Mapping[str, Any]
     params: Mapping[str, Any] = field(default_factory=dict)
     distributions: Mapping[str, BaseDistribution] = field(default_factory=dict)
-    past: Collection[int] = ()
+    replaced: Collection[int] = ()
 
 
-def counted(study: optuna.Study) -> list[FrozenTrial]:
-    """Trials of a study that count, by number."""
-    every = study.get_trials(deepcopy=False)
-    return [trial for trial in every if not trial.user_attrs.get(names.DROPPED)]
+def counted_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """Trials of a study, by number, without those that were dropped."""
+    trials = study.get_trials(deepcopy=False)
+    return [trial for trial in trials if not trial.user_attrs.get(names.DROPPED)]
 
 
-def by_key(trials: Iterable[FrozenTrial]) -> dict[str, list[FrozenTrial]]:
+def trials_by_key(trials: Iterable[FrozenTrial]) -> dict[str, list[FrozenTrial]]:
     """Trials by the key of their point, earlier ones first."""
-    found: dict[str, list[FrozenTrial]] = {}
+    groups: dict[str, list[FrozenTrial]] = {}
     for trial in trials:
-        found.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
-    return found
+        groups.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
+    return groups
 
 
 class TrialStore:
@@ -68,76 +67,76 @@ class TrialStore:
 
     Args:
         study: the study.
-        storage: where it is kept.
-        me: the driver.
+        storage: of the study.
+        owner: this driver.
     """
 
-    def __init__(self, study: optuna.Study, storage: BaseStorage, me: Owner) -> None:
+    def __init__(self, study: optuna.Study, storage: BaseStorage, owner: Owner) -> None:
         self.study = study
-        self.me = me
+        self.owner = owner
         self._storage = storage
         self._study_id = storage.get_study_id_from_name(study.study_name)
 
     def trials(self) -> list[FrozenTrial]:
         """All trials that count, by number."""
-        return counted(self.study)
+        return counted_trials(self.study)
 
     def by_key(self) -> dict[str, list[FrozenTrial]]:
-        """See the function `by_key`."""
-        return by_key(self.trials())
+        """All trials that count by the key of their point, earlier ones first."""
+        return trials_by_key(self.trials())
 
-    def claim(self, wanted: TrialClaim) -> int | None:
-        """The number of a new running trial of ours; None if an earlier trial stands."""
+    def claim(self, claim: TrialClaim) -> int | None:
+        """The number of a new running trial of ours; None if an earlier trial has the point."""
         from optuna.trial import TrialState, create_trial
 
         token = uuid.uuid4().hex
         attributes = {
-            **wanted.attributes,
-            names.KEY: wanted.key,
+            **claim.attributes,
+            names.KEY: claim.key,
             names.TOKEN: token,
-            **self._sign(),
+            **self._heartbeat(),
         }
-        params, asked = dict(wanted.params), dict(wanted.distributions)
         running = partial(create_trial, state=TrialState.RUNNING, user_attrs=attributes)
+        params, distributions = dict(claim.params), dict(claim.distributions)
         try:
-            self.study.add_trial(running(params=params, distributions=asked))
+            self.study.add_trial(running(params=params, distributions=distributions))
         except ValueError:
-            # A grid that is gone on with by other values: a database keeps to the first choices of
-            # a parameter. The point is run all the same; only figures over parameters lack it.
+            # A grid that is resumed with other values: a database keeps the first choices of a
+            # parameter. The point is run all the same; only figures over parameters lack it.
             self.study.add_trial(running())
-        same = self.by_key()[wanted.key]
+        same = self.by_key()[claim.key]
         (number,) = [trial.number for trial in same if trial.user_attrs.get(names.TOKEN) == token]
-        standing = [
+        earlier = [
             trial.number
             for trial in same
             if trial.number < number
-            and trial.number not in wanted.past
+            and trial.number not in claim.replaced
             and trial.state.name in CLAIMING_STATES
         ]
-        if not standing:
+        if not earlier:
             return number
-        self.drop(number, f"the same point as trial {standing[0]}")
+        self.drop(number, f"the same point as trial {earlier[0]}")
         return None
 
     def ask(self, total: int | None) -> Trial | None:
-        """A trial of a search: one that waits, or a new one while there are less than `total`."""
+        """A trial of a search: an enqueued one, or a new one while there are fewer than `total`."""
         if total is not None and len(self.trials()) >= total and not self._waiting():
             return None
         trial = self.study.ask()
-        self.note(trial.number, self._sign())
+        self.set_attributes(trial.number, self._heartbeat())
         if names.KEY in trial.user_attrs:
-            return trial if self._stands_alone(trial) else None
+            return trial if self._is_only_trial(trial) else None
         before = [other for other in self.trials() if other.number < trial.number]
-        # Two drivers may have asked for the last one at the same time: the lower number has it.
+        # Two drivers may ask for the last one at the same time: the lower number wins.
         if total is not None and len(before) >= total:
-            self.drop(trial.number, f"{total} trials were asked for")
+            self.drop(trial.number, f"{total} trials were requested")
             return None
         return trial
 
-    def _stands_alone(self, trial: Trial) -> bool:
-        """Whether a trial from the queue is the only one of its point; it is dropped if not.
+    def _is_only_trial(self, trial: Trial) -> bool:
+        """Whether an enqueued trial is the only one of its point; it is dropped if not.
 
-        Two drivers may have put what a dead one left into the queue at the same time.
+        Two drivers may enqueue the trial of a dead one at the same time.
         """
         same = self.by_key()[trial.user_attrs[names.KEY]]
         others = [
@@ -153,16 +152,17 @@ class TrialStore:
             self.drop(trial.number, f"the same point as trial {others[0]}")
         return not others
 
-    def note(self, number: int, attributes: Mapping[str, Any]) -> None:
-        """Write attributes of a trial that is not finished."""
+    def set_attributes(self, number: int, attributes: Mapping[str, Any]) -> None:
+        """Write user attributes of an unfinished trial."""
         trial_id = self._storage.get_trial_id_from_study_id_trial_number(self._study_id, number)
         for name, value in attributes.items():
             self._storage.set_trial_user_attr(trial_id, name, value)
 
-    def beat(self, numbers: Iterable[int]) -> None:
-        """Say that this driver still works on these trials."""
+    def send_heartbeat(self, numbers: Iterable[int]) -> None:
+        """Record that this driver is still executing these trials."""
         for number in numbers:
-            self.update_unfinished(number, partial(self.note, number, self._sign()))
+            update = partial(self.set_attributes, number, self._heartbeat())
+            self.update_unfinished(number, update)
 
     def complete(self, number: int, values: Sequence[float], notes: Mapping[str, Any]) -> None:
         """Finish a trial with its values; without effect if another driver has finished it."""
@@ -177,53 +177,53 @@ class TrialStore:
         self._finish(number, "PRUNED", {**notes, names.REASON: reason})
 
     def drop(self, number: int, reason: str) -> None:
-        """Finish a trial that shall not count; see `complete`."""
+        """Finish a trial that does not count; see `complete`."""
         self._finish(number, "FAIL", {names.DROPPED: True, names.REASON: reason})
 
-    def release(self, number: int, reason: str, *, again: bool) -> None:
-        """Give up a running trial, of ours or of a dead driver, so that it counts no more.
+    def release(self, number: int, reason: str, *, requeue: bool) -> None:
+        """Drop a running trial, of this driver or of a dead one.
 
         Args:
             number: of the trial.
             reason: in a few words.
-            again: put its parameters into the queue of a search; before the trial is dropped, so
-                that a crash in between loses nothing.
+            requeue: enqueue its parameters in the study; before the trial is dropped, so that a
+                crash in between loses nothing.
         """
         trial = self.study.get_trials(deepcopy=False)[number]
         if trial.state.name != "RUNNING":  # another driver was first
             return
         key = trial.user_attrs.get(names.KEY)
         waiting = {other.user_attrs.get(names.KEY) for other in self._waiting()}
-        if again and key is not None and key not in waiting:
+        if requeue and key is not None and key not in waiting:
             kept = (names.KEY, names.LABEL, names.OVERRIDES, names.RUNS)
             attributes = {name: trial.user_attrs[name] for name in kept if name in trial.user_attrs}
             self.study.enqueue_trial(dict(trial.params), user_attrs=attributes)
         self.drop(number, reason)
 
-    def stale_trials(self, mine: Collection[int]) -> Iterator[FrozenTrial]:
-        """Running trials whose driver is gone.
+    def stale_trials(self, executing: Collection[int]) -> Iterator[FrozenTrial]:
+        """Running trials whose driver is dead.
 
         Args:
-            mine: numbers that this driver works on; any other of its own was lost, when the storage
-                failed in the middle of a claim.
+            executing: numbers of this driver's trials; any other of its own was lost when the
+                storage failed during a claim.
         """
         for trial in self.trials():
-            if trial.state.name != "RUNNING" or trial.number in mine:
+            if trial.state.name != "RUNNING" or trial.number in executing:
                 continue
             owner = trial.user_attrs.get(names.OWNER)
-            if owner == str(self.me):
+            if owner == str(self.owner):
                 yield trial
                 continue
             if owner is not None:
                 alive = Owner.parse(owner).is_alive(trial.user_attrs[names.HEARTBEAT])
-            else:  # of a search: asked for this moment, or by a driver that died between two lines
+            else:  # of a search: just created, or by a driver that died before its first heartbeat
                 assert trial.datetime_start is not None, "a running trial was started"
                 alive = Owner.unknown().is_alive(trial.datetime_start.timestamp())
             if not alive:
                 yield trial
 
-    def _sign(self) -> dict[str, Any]:
-        return {names.HEARTBEAT: round(time.time(), 1), names.OWNER: str(self.me)}
+    def _heartbeat(self) -> dict[str, Any]:
+        return {names.HEARTBEAT: round(time.time(), 1), names.OWNER: str(self.owner)}
 
     def _waiting(self) -> list[FrozenTrial]:
         return [trial for trial in self.trials() if trial.state.name == "WAITING"]
@@ -238,16 +238,15 @@ class TrialStore:
         from optuna.trial import TrialState
 
         def finish() -> None:
-            self.note(number, notes)
-            told = None if values is None else list(values)
-            self.study.tell(number, told, state=TrialState[state])
+            self.set_attributes(number, notes)
+            self.study.tell(number, values, state=TrialState[state])
 
         self.update_unfinished(number, finish)
 
-    def update_unfinished(self, number: int, work: Callable[[], object]) -> None:
-        """`work` on a trial, unless another driver has finished it while this machine slept."""
+    def update_unfinished(self, number: int, update: Callable[[], object]) -> None:
+        """Call `update` for a trial; no error if another driver has finished it meanwhile."""
         try:
-            work()
+            update()
         except (RuntimeError, ValueError):  # Optuna: UpdateFinishedTrialError is a RuntimeError
             if not self.study.get_trials(deepcopy=False)[number].state.is_finished():
                 raise

@@ -21,17 +21,19 @@ from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
+from sweeps.run_specs import PlannedRun
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
-from sweeps.worker import trial_source
+from sweeps.worker import sampler_source
 from sweeps.worker.driver import Driver
+from sweeps.worker.list_source import ListSource
 from sweeps.worker.owner import STALE_S, Owner
-from sweeps.worker.planner import PlannedPoint, PlannedRun
+from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
+from sweeps.worker.sampler_source import SamplerSource
 from sweeps.worker.storage import open_study
-from sweeps.worker.trial_source import PointListSource, SamplerSource
 from sweeps.worker.trial_store import TrialStore
 
 DATASET = "fingerprint-of-the-data"
@@ -41,7 +43,7 @@ DEADLINE_S = 60.0
 DEAD = Owner("elsewhere", 1, "1")
 """A driver on another machine."""
 
-GONE = Owner(Owner.me().host, 2**22 + 1, "1")
+GONE = Owner(Owner.this_process().host, 2**22 + 1, "1")
 """A process of this machine that cannot exist: a number above the kernel's largest."""
 
 
@@ -288,7 +290,7 @@ class FakeView:
     def __init__(self, look: Callable[[Sequence[RunningTrial]], None] | None = None) -> None:
         self.begun: list[str] = []
         self.ends: list[tuple[str, str, str]] = []
-        self.refusals: list[tuple[str, str]] = []
+        self.rejections: list[tuple[str, str]] = []
         self._look = look
 
     def began(self, work: RunningTrial) -> None:
@@ -297,8 +299,8 @@ class FakeView:
     def ended(self, work: RunningTrial, how: str, reason: str) -> None:
         self.ends.append((work.plan.point.label, how, reason))
 
-    def refused(self, label: str, reason: str) -> None:
-        self.refusals.append((label, reason))
+    def rejected(self, label: str, reason: str) -> None:
+        self.rejections.append((label, reason))
 
     def update(self, works: Sequence[RunningTrial]) -> None:
         if self._look is not None:
@@ -355,12 +357,12 @@ def memory() -> Any:
 
 
 def store_on(
-    storage: Any, me: Owner | None = None, wanted: SweepSettings | None = None, **study: Any
+    storage: Any, owner: Owner | None = None, wanted: SweepSettings | None = None, **study: Any
 ) -> TrialStore:
     """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
     wanted = wanted or settings()
     began = open_study("study", storage, wanted.objectives, {}, **study)
-    return TrialStore(began, storage, me or Owner.me())
+    return TrialStore(began, storage, owner or Owner.this_process())
 
 
 def silent(storage: Any, number: int, seconds: float = 2 * STALE_S) -> None:
@@ -377,15 +379,15 @@ def list_desk(
     *,
     storage: Any = None,
     view: FakeView | None = None,
-    me: Owner | None = None,
+    owner: Owner | None = None,
     **changes: Any,
 ) -> Desk:
     """A driver of a list of points."""
     wanted = settings(**changes)
     storage = memory() if storage is None else storage
-    store = store_on(storage, me, wanted)
+    store = store_on(storage, owner, wanted)
     runs = RunStore(runs_dir, NoTracking())
-    source = PointListSource(points, store, runs, wanted, {})
+    source = ListSource(points, store, runs, wanted, {})
     return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
 
 
@@ -396,7 +398,7 @@ def search_desk(
     space: Mapping[str, Any] | None = None,
     storage: Any = None,
     view: FakeView | None = None,
-    me: Owner | None = None,
+    owner: Owner | None = None,
     planner: Any = None,
     pruner: Any = None,
     **changes: Any,
@@ -407,11 +409,11 @@ def search_desk(
     wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
     storage = memory() if storage is None else storage
     sampler = build_sampler("random", 0, {}, len(wanted.objectives))
-    store = store_on(storage, me, wanted, sampler=sampler, pruner=pruner)
+    store = store_on(storage, owner, wanted, sampler=sampler, pruner=pruner)
     runs = RunStore(runs_dir, NoTracking())
     parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     view = view or FakeView()
-    source = SamplerSource((), parameters, store, planner or FakePlanner(), wanted, view.refused)
+    source = SamplerSource((), parameters, store, planner or FakePlanner(), wanted, view.rejected)
     return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
 
 
@@ -425,10 +427,9 @@ def _desk(
     storage: Any,
 ) -> Desk:
     view = view or FakeView()
-    metrics = [objective.metric for objective in wanted.objectives]
     seen: Any = view
-    driver = Driver(store, source, runs, executor, wanted, seen, metrics)
-    of_list = list(source.plans.values()) if isinstance(source, PointListSource) else []
+    driver = Driver(store, source, runs, executor, wanted, seen)
+    of_list = list(source.plans.values()) if isinstance(source, ListSource) else []
     return Desk(driver, store, executor, runs, view, storage, of_list)
 
 
@@ -436,8 +437,8 @@ def _desk(
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drivers that look again at once."""
     monkeypatch.setattr(drivers, "POLL_S", 0.001)
-    monkeypatch.setattr(drivers, "LOOK_S", 0.002)
-    monkeypatch.setattr(trial_source, "PAUSE_S", 0.002)
+    monkeypatch.setattr(drivers, "CLAIM_S", 0.002)
+    monkeypatch.setattr(sampler_source, "PAUSE_S", 0.002)
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:

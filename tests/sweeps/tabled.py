@@ -12,6 +12,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 from sweeps.worker.point_list import Outcome
@@ -51,15 +52,15 @@ def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
 
 @dataclass(frozen=True)
 class FakeResult:
-    """Stands for `sweeps.worker.run_store.RunResult`."""
+    """Stands for `rgbt.tracking.run_result.RunResult`."""
 
     key: str
-    made: Mapping[ExtraEvaluation | None, Counts]
+    by_path: Mapping[str, Counts]
     commit: str | None = "aaaaaaaaaa"
-    is_of_other_code: bool = False
+    other_code: str | None = None
 
-    def counts(self, evaluation: ExtraEvaluation | None = None) -> Counts:
-        return self.made[evaluation]
+    def counts(self, path: str = OWN_COUNTS) -> Counts:
+        return self.by_path[path]
 
 
 def outcome(
@@ -68,9 +69,10 @@ def outcome(
     commit: str | None = "aaaaaaaaaa",
 ) -> Outcome:
     """A finished run."""
-    by_evaluation = {None: made} if isinstance(made, Counts) else made
-    found: Any = FakeResult(key, by_evaluation, commit)
-    return Outcome(Point(key, ()), "finished", found=(found,))
+    every = {None: made} if isinstance(made, Counts) else made
+    by_path = {OWN_COUNTS if each is None else each.path: counts for each, counts in every.items()}
+    result: Any = FakeResult(key, by_path, commit)
+    return Outcome(Point(key, ()), "finished", results=(result,))
 
 
 def failed(reason: str) -> Outcome:

@@ -8,7 +8,7 @@ from rgbt.evaluate import Options as OfEvaluate
 from sweeps.evaluation import ExtraEvaluation
 
 
-def test_of_single_frames_every_evaluation_is_a_call_and_a_file() -> None:
+def test_evaluation_of_single_frames_has_command_and_path() -> None:
     ring = ExtraEvaluation("thermal", "ring9")
     assert ring.command == ("rgbt.evaluate", "modality=thermal", "regions=ring9")
     assert ring.path == "evaluations/table_thermal_ring9.npz"
@@ -16,7 +16,7 @@ def test_of_single_frames_every_evaluation_is_a_call_and_a_file() -> None:
     assert {word.partition("=")[0] for word in ring.command[1:]} <= set(types_of(OfEvaluate))
 
 
-def test_a_head_that_is_asked_for_has_a_file_of_its_own() -> None:
+def test_evaluation_with_head_has_own_path() -> None:
     day = ExtraEvaluation("rgb", "ring9", head="source")
     assert day.command == ("rgbt.evaluate", "modality=rgb", "regions=ring9", "head=source")
     assert day.path == "evaluations/table_rgb_ring9_source-head.npz"

@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweeps.sheet import results as table_results
 
 from rgbt.checks import InputError
 from rgbt.config.options import parse, types_of
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.options import OF_THE_TABLE, Options, settings_of
 from sweeps.point import Point
+from sweeps.rendering import publish
 from sweeps.reproduce import entry
-from sweeps.settings import EXECUTION, SweepSettings
+from sweeps.settings import SweepSettings
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
 from sweeps.worker.point_list import Outcome, PointList
 from tests.commands import Call, assert_one_sentence
@@ -64,9 +65,9 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
 
 
 def _outcome(point: Point, state: str, index: int) -> Outcome:
-    found: Any = FakeResult(f"k{index}", {None: right(40 + index)})
+    found: Any = FakeResult(f"k{index}", {OWN_COUNTS: right(40 + index)})
     if state == "finished":
-        return Outcome(point, "finished", found=(found,), keys=(f"k{index}",))
+        return Outcome(point, "finished", results=(found,), keys=(f"k{index}",))
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]
 
 
@@ -96,7 +97,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) ->
     assert rows[2]["reason"] == "flow"
 
 
-def test_a_table_given_as_a_file_goes_by_paper_and_name(
+def test_reproduce_table_file_is_named_by_paper(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     asked = driven("finished")
@@ -108,7 +109,7 @@ def test_a_table_given_as_a_file_goes_by_paper_and_name(
     assert (place / "runs/tables/my/mine_demo/table.md").exists()
 
 
-def test_a_failed_cell_is_told_and_the_table_still_comes(
+def test_reproduce_failed_cell_prints_table(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     driven("finished", "failed")
@@ -129,21 +130,21 @@ def test_cells_of_other_drivers_are_no_failure(
     assert_one_sentence(err, "wait=true")
 
 
-def test_a_disk_that_is_full_costs_the_files_but_not_the_table(
+def test_reproduce_full_disk_prints_table_without_files(
     call: Call, place: Path, driven: Callable[..., Asked], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
 
     driven("finished")
-    monkeypatch.setattr(table_results, "write_atomic", full)
+    monkeypatch.setattr(publish, "write_atomic", full)
     code, out, err = call(entry, "table=my/small", "tracking=none")
     assert code == 1
     assert "40.00" in out
     assert_one_sentence(err, "No space left on device; the files were not written")
 
 
-def test_a_table_that_cannot_be_run_shows_what_is_printed(
+def test_reproduce_unrunnable_table_shows_published_values(
     call: Call, place: Path, driven: Callable[..., Asked]
 ) -> None:
     asked = driven("finished")
@@ -246,8 +247,8 @@ def test_mistakes_cost_one_sentence(
     assert_one_sentence(err, sentence)
 
 
-def test_every_key_of_execution_is_a_key_of_the_command() -> None:
-    assert set(types_of(Options)) - set(OF_THE_TABLE) == set(EXECUTION)
+def test_reproduce_options_are_sweep_settings() -> None:
+    assert set(types_of(Options)) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
 
 
 def test_settings_have_the_defaults_of_the_sweeper_and_are_read_as_hydra_does() -> None:

@@ -118,9 +118,7 @@ def test_a_server_that_is_away_costs_a_line(data: Path, tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_full_disk_for_the_runs_is_the_reason_in_the_cell(
-    data: Path, tmp_path: Path, full_disk: Path
-) -> None:
+def test_reproduce_full_disk_is_reason_of_cell(data: Path, tmp_path: Path, full_disk: Path) -> None:
     storage = f"storage={tmp_path / 'studies.journal'}"
     done = reproduce(
         *(tmp_path, data, f"runs_dir={full_disk}", storage, f"out={tmp_path / 'out'}"),

@@ -79,7 +79,7 @@ def table_of(runs: Path) -> str:
 
 
 @pytest.mark.slow
-def test_killed_and_called_again_loses_nothing_and_runs_nothing_twice(
+def test_reproduce_killed_and_rerun_repeats_no_run(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table, runs = tmp_path / "ablation.yaml", tmp_path / "runs"

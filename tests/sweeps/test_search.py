@@ -12,10 +12,10 @@ import sweeps.search as searching
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
 from sweeps import attributes as names
+from sweeps.run_specs import open_run_store
 from sweeps.search import Search, _probe, search
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
-from sweeps.worker.run_store import open_run_store
 from sweeps.worker.storage import load_study, open_storage
 from sweeps.worker.trial_store import TrialStore
 from tests.sweeps.fakes import settings as plain_settings
@@ -62,7 +62,7 @@ def settings(**changes: Any) -> SweepSettings:
     return plain_settings(**{"trials": 3, "objectives": objectives, **changes})
 
 
-def test_a_search_begins_a_study_that_says_what_it_is(
+def test_search_creates_study_with_its_attributes(
     wanted: Search, ends: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.orig_argv", ["python", "x=postgresql://me:secret@host/db"])
@@ -125,7 +125,7 @@ def test_another_search_under_the_same_name_is_refused(
         ),
     ],
 )
-def test_what_cannot_be_is_refused_before_a_study_is_made(
+def test_search_invalid_settings_raise_before_study_exists(
     wanted: Search, ends: list[str], tmp_path: Path, changes: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(InputError, match=said):
@@ -145,7 +145,7 @@ def test_consistency_is_followed_where_the_runs_measure_it(
         search(only_test, settings(objectives=objectives[1:]))
 
 
-def test_what_is_wrong_with_every_trial_is_told_before_the_first(
+def test_search_wrong_fixed_override_raises_before_first_trial(
     wanted: Search, ends: list[str], tmp_path: Path
 ) -> None:
     mistaken = replace(wanted, fixed=(*wanted.fixed, "trainer.max_steps=x"))
@@ -157,19 +157,19 @@ def test_what_is_wrong_with_every_trial_is_told_before_the_first(
 @pytest.mark.parametrize(
     ("low", "high", "refused"), [(-1, 4, "low"), (1, 10**6, "high"), (0.5, 32, None)]
 )
-def test_ends_that_a_setting_does_not_take_are_refused_before_the_first_trial(
+def test_search_range_outside_setting_raises(
     wanted: Search, low: float, high: float, refused: str | None
 ) -> None:
     space = {"masker.sigma_div": {"type": "float", "low": low, "high": high}}
     search = replace(wanted, parameters=parse_space(space))
     if refused is None:
-        assert _probe(search).runs
+        assert _probe(search, settings()).key
         return
     with pytest.raises(InputError, match=r"'masker.sigma_div' must be a number from 0.001 to"):
-        _probe(search)
+        _probe(search, settings())
 
 
-def test_a_search_without_a_finished_trial_ends_in_an_error(
+def test_search_without_finished_trial_raises(
     wanted: Search, ends: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     ends[:] = ["FAIL", "FAIL"]

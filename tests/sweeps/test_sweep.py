@@ -41,8 +41,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
         del settings
         return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
 
-    monkeypatch.setattr(sweeping, "work_off", run_points)
-    monkeypatch.setattr(sweeping, "survey", preview_points)
+    monkeypatch.setattr(sweeping, "run_points", run_points)
+    monkeypatch.setattr(sweeping, "preview_points", preview_points)
     monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
     return found
 
@@ -84,7 +84,7 @@ def test_points_are_run_for_every_value_of_the_grid(asked: Asked, tmp_path: Path
     ]
 
 
-def test_a_grid_in_a_file_is_read_as_it_would_be_typed(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_params_of_file_equal_typed(asked: Asked, tmp_path: Path) -> None:
     params = {"masker.sigma_div": "1,2", "model.weights": None, "seed": 5}
     call(tmp_path, "+experiment=grbm", params=params)
     (wanted,) = asked.lists
@@ -92,9 +92,7 @@ def test_a_grid_in_a_file_is_read_as_it_would_be_typed(asked: Asked, tmp_path: P
     assert {"model.weights=null", "seed=5"} <= set(wanted.points[0].overrides)
 
 
-def test_the_same_command_is_the_same_study_wherever_its_runs_lie(
-    asked: Asked, tmp_path: Path
-) -> None:
+def test_sweep_name_is_independent_of_paths(asked: Asked, tmp_path: Path) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=1,2")
     call(tmp_path / "a", *words)
     call(tmp_path / "b", *words, "fresh=true", "dataset.cache_dir=/c")
@@ -104,14 +102,14 @@ def test_the_same_command_is_the_same_study_wherever_its_runs_lie(
     assert first.startswith("grbm-sigma_div-")
 
 
-def test_fresh_is_a_word_to_the_sweep_and_not_to_its_runs(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_fresh_is_not_passed_to_runs(asked: Asked, tmp_path: Path) -> None:
     call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "fresh=true")
     (wanted,) = asked.lists
     assert wanted.runs.fresh
     assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
 
 
-def test_the_same_search_is_the_same_study_in_any_order(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_search_name_ignores_order(asked: Asked, tmp_path: Path) -> None:
     interval = "masker.sigma_div=interval(1,4)"
     budget = {"trials": 3}
     call(tmp_path, "+experiment=grbm", interval, "seed=1", "trainer.max_steps=3", **budget)
@@ -136,9 +134,7 @@ def test_the_same_search_is_the_same_study_in_any_order(asked: Asked, tmp_path: 
     assert "trainer.max_steps=3" in asked.searches[0].identity
 
 
-def test_a_search_file_gives_ranges_and_its_runs_are_no_sweeps(
-    asked: Asked, tmp_path: Path
-) -> None:
+def test_sweep_search_file_runs_are_single(asked: Asked, tmp_path: Path) -> None:
     call(tmp_path, "+search=grbm", "masker.sigma_div=4")
     (wanted,) = asked.searches
     keys = [parameter.key for parameter in wanted.parameters]

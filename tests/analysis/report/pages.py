@@ -25,7 +25,8 @@ from analysis.report.data import (
     TrialEntry,
 )
 from rgbt.randomness import numpy_generator
-from sweeps.table.table import Table, load_table, table_names
+from sweeps.table.load_table import load_table, table_names
+from sweeps.table.table import Table
 
 CLASSES = ("unlabeled", "car", "person", "bike", "curve", "car_stop", "guardrail", "cone", "bump")
 PROFILE = np.array([43.0, 48.6, 52.6, 50.5, 44.6])

@@ -22,7 +22,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.randomness import numpy_generator
-from sweeps.table.table import load_table
+from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import TABLE, counts_of, files_of
 from tests.analysis.report.test_collect_parts import run_of, stored
 

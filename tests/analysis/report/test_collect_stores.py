@@ -11,7 +11,7 @@ from analysis.report import collect as collecting
 from analysis.report.store import MlflowRun, RunFiles, read_store
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
-from sweeps.worker.run_store import RunResult
+from rgbt.tracking.run_result import RunResult
 from tests.analysis.report.stores import RGB, RGB_FILE
 
 
@@ -44,7 +44,7 @@ def test_without_mlflow_there_is_nothing_to_read(tmp_path: Path) -> None:
 
 
 def test_evaluations_lie_where_sweeps_puts_them(tmp_path: Path) -> None:
-    assert RunResult("k", tmp_path).counts_file(RGB) == tmp_path / RGB.path
+    assert RunResult(tmp_path).counts_file(RGB) == tmp_path / RGB.path
     assert RGB.path == RGB_FILE
 
 

@@ -42,7 +42,7 @@ def test_factor_against_both_metrics_in_order_of_x() -> None:
     assert levels[1:] == [68.0]
 
 
-def test_published_values_far_away_get_an_axis_of_their_own() -> None:
+def test_figure_distant_published_values_get_second_axis() -> None:
     near, far = figure_of(factor_table()), figure_of(factor_table(shift=-40.0))
     assert len(far.axes) > len(near.axes)
 

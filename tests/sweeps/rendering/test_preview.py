@@ -29,13 +29,13 @@ class Trained:
     """Stands for a finished run of ten seconds."""
 
     key = "k"
-    is_of_other_code = False
+    other_code = None
 
     def __init__(self, folder: Any) -> None:
         self.folder = folder
 
 
-def test_each_command_that_is_called_of_a_run_is_told_once() -> None:
+def test_preview_lists_each_evaluation_command_once() -> None:
     wanted, outcomes = asked((*FRAMES, RGB))
     assert summary(wanted, outcomes, 2) == [
         "2 runs: 2 waiting.",
@@ -46,7 +46,7 @@ def test_each_command_that_is_called_of_a_run_is_told_once() -> None:
     ]
 
 
-def test_a_table_without_further_evaluations_or_without_runs_says_nothing_of_them() -> None:
+def test_preview_without_evaluations_omits_them() -> None:
     assert len(summary(*asked((Column(name="mIoU", metric="mIoU"),)), 1)) == 2
     wanted, _ = asked(FRAMES)
     assert summary(wanted, [], 1) == ["0 runs: none."]

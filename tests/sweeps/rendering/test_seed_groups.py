@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from rgbt.tracking.run_result import RunResult
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
 from sweeps.worker.point_list import Outcome
-from sweeps.worker.run_store import RunResult
 from tests.sweeps.fakes import finish
 
 
@@ -16,10 +16,10 @@ def made(folder: Path, label: str, **scores: float) -> Outcome:
     test: Mapping[str, float] = {name.replace("__", "/"): value for name, value in scores.items()}
     run = finish(folder / label.replace(" ", "_"), test=test)
     key = run.path.name
-    return Outcome(Point(label, ()), "finished", found=(RunResult(key, run.path),), keys=(key,))
+    return Outcome(Point(label, ()), "finished", results=(RunResult(run.path),), keys=(key,))
 
 
-def test_a_row_is_the_mean_and_the_sample_sd_over_seeds(tmp_path: Path) -> None:
+def test_group_grid_shows_mean_and_sample_sd(tmp_path: Path) -> None:
     outcomes = [
         made(tmp_path, "sigma_div=1 seed=0", mIoU=0.40, Var=2.0, region__1=0.5),
         made(tmp_path, "sigma_div=1 seed=1", mIoU=0.44, Var=4.0, region__1=0.5),
@@ -51,6 +51,6 @@ def test_configurations_of_one_run_show_its_key(tmp_path: Path) -> None:
     assert not unfinished_grid(outcomes).rows
 
 
-def test_a_grid_of_seeds_alone_is_called_by_its_experiment() -> None:
+def test_configuration_of_seeds_only_is_experiment() -> None:
     assert configuration(Point("seed=3", ("+experiment=grbm", "seed=3"))) == "grbm"
     assert configuration(Point("seed=3", ("seed=3",))) == "-"

@@ -49,7 +49,7 @@ def test_the_order_of_rows_and_the_remarks_stand_below() -> None:
     assert DEMO in shown
 
 
-def test_a_column_of_ours_alone_has_nothing_published_beside_it() -> None:
+def test_terminal_unprinted_column_has_no_published_cell() -> None:
     columns = (
         Column(name="acc", metric="pixel_accuracy"),
         Column(name="own", metric="pixel_accuracy", printed=False),
@@ -75,7 +75,7 @@ def test_a_column_of_ours_alone_has_nothing_published_beside_it() -> None:
     assert last["difference"] == ""
 
 
-def test_a_column_of_ours_alone_has_dashes_where_lines_are_below_each_other() -> None:
+def test_terminal_unprinted_column_has_dashes_below() -> None:
     own = (*STACKED[:3], Column(name="own", metric="pixel_accuracy", printed=False))
     shown = lines(wide(own))
     assert shown[3].split() == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
@@ -83,7 +83,7 @@ def test_a_column_of_ours_alone_has_dashes_where_lines_are_below_each_other() ->
     assert "[1] Not in the paper." in shown
 
 
-def test_more_columns_have_a_line_each_for_ours_published_and_difference() -> None:
+def test_terminal_many_columns_use_separate_lines() -> None:
     shown = lines(wide(STACKED))
     assert shown[3].split() == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
     assert shown[4].split() == ["published", "48.00", "49.25", "-", "-"]
@@ -103,9 +103,7 @@ def test_wide_tables_break_names_and_put_sd_below() -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 100, 120, 200])
 @pytest.mark.parametrize("columns", [WIDE, STACKED, STACKED[:3]], ids=len)
-def test_a_table_fits_the_terminal_and_no_number_is_cut(
-    columns: tuple[Column, ...], width: int
-) -> None:
+def test_terminal_narrow_width_keeps_numbers_whole(columns: tuple[Column, ...], width: int) -> None:
     sheet = render_table(wide(columns))
     whole = str(terminal(sheet, plain=True))
     table = str(terminal(sheet, plain=True, width=width)).split("Published:")[0]
@@ -170,7 +168,7 @@ def test_a_table_that_cannot_be_run_says_so() -> None:
     assert not any("Ours" in remark or remark == DEMO for remark in sheet.remarks)
 
 
-def test_rows_of_the_same_runs_and_several_commits_are_told() -> None:
+def test_rendered_table_notes_shared_runs_and_commits() -> None:
     rows = (Row(label="a", experiment="crm"), Row(label="b", experiment="crm"))
     first, second = outcome("k0", right(4), "aaa"), outcome("k1", right(4), "bbb")
     runs = {(label, seed): run for label in "ab" for seed, run in enumerate((first, second))}
@@ -192,7 +190,7 @@ def sized(columns: tuple[Column, ...], runs: dict[Any, Any]) -> ScoredTable:
     return score("own/t", table(rows, columns), runs, scale="demo", sizes=sizes)
 
 
-def test_sizes_alone_have_neither_seeds_nor_a_scale_of_runs() -> None:
+def test_rendered_table_of_sizes_has_no_seeds() -> None:
     size = Column(name="size", parameters=True, best="lowest")
     scored = sized((size,), {})
     shown = lines(scored)

@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 from sweeps import attributes
 from sweeps.report.axes import Dimension, dimension
 from sweeps.report.drawing import history, intermediate, pareto, slices
-from sweeps.report.figures import StudyFigure, _contour, draw
+from sweeps.report.figures import StudyFigure, _contour, _most_important, _without_contour, draw
 from sweeps.report.study_data import Importances, importances, read
 
 NONE = "no trial is complete yet."
@@ -91,7 +91,7 @@ def test_contour_leaves_the_style_of_others_alone() -> None:
 
     before = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     data = read(filled("maximize"))
-    assert not isinstance(_contour(data, importances(data), 0), str)
+    assert _contour(data, _most_important(importances(data), 0), 0).axes
     after = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     assert after == before
     assert pyplot.get_fignums() == []
@@ -150,17 +150,17 @@ def test_contour_of_parameters_that_never_meet_says_so() -> None:
         value = trial.suggest_float("a" if index % 2 else "b", 0, 1)
         study.tell(trial, value)
     data = read(study)
-    reason = _contour(data, importances(data), 0)
+    shares = importances(data)
+    reason = _without_contour(data, shares, _most_important(shares, 0), 0)
     assert reason in (f"only 0 complete trials have both {x} and {y}." for x, y in ("ab", "ba"))
 
 
-def test_contour_shows_the_two_most_important_parameters_of_its_objective() -> None:
+def test_contour_uses_two_most_important_parameters() -> None:
     shares = {"optimizer.lr": (0.6, 0.1), "masker.patch_size": (0.3, 0.4), "masker": (0.1, 0.5)}
     data = read(filled("maximize", "minimize"))
     wanted = ({"optimizer.lr", "masker.patch_size"}, {"masker.patch_size", "masker"})
     for index, names in enumerate(wanted):
-        figure = _contour(data, Importances(shares, ""), index)
-        assert not isinstance(figure, str)
+        figure = _contour(data, _most_important(Importances(shares, ""), index), index)
         axis = figure.axes[0]
         assert {axis.get_xlabel(), axis.get_ylabel()} == names
         if "optimizer.lr" in names:
@@ -175,13 +175,13 @@ def test_a_list_has_no_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_grid_has_no_figures_of_a_search_that_goes_on(tmp_path: Path) -> None:
+def test_draw_of_grid_omits_search_figures(tmp_path: Path) -> None:
     study = filled("maximize")
     study.set_user_attr(attributes.KIND, "grid")
     assert list(drawn(study, tmp_path)) == ["importances", "parallel", "slices", "contour"]
 
 
-def test_history_shows_the_best_so_far_and_marks_pruned_and_failed_trials() -> None:
+def test_history_marks_best_pruned_and_failed() -> None:
     study = new_study("minimize")
     for value in (5.0, 7.0, None, 4.0, 6.0):
         trial = study.ask()
@@ -202,7 +202,7 @@ def test_pareto_marks_the_front() -> None:
     assert sorted(lines["complete"].get_xdata()) == [50.0, 54.0]
 
 
-def test_intermediate_values_are_told_apart_by_how_the_trial_ended() -> None:
+def test_intermediate_distinguishes_trial_states() -> None:
     axis = intermediate(read(filled("maximize"))).axes[0]
     assert [line.get_label() for line in axis.lines if line.get_label()[0] != "_"] == [
         "complete",
@@ -210,7 +210,7 @@ def test_intermediate_values_are_told_apart_by_how_the_trial_ended() -> None:
     ]
 
 
-def test_slices_have_one_panel_a_parameter_on_its_own_scale() -> None:
+def test_slices_have_one_panel_per_parameter() -> None:
     panels = {axis.get_xlabel(): axis for axis in slices(read(filled("maximize")), 0).axes}
     assert panels["optimizer.lr (log)"].get_xscale() == "log"
     assert panels["masker.patch_size"].get_xscale() == "linear"
@@ -230,7 +230,7 @@ def test_dimensions_scale_to_their_own_range() -> None:
     assert (0.5, "1") in [(round(place, 6), text) for place, text in ticks]
 
 
-def test_dimension_of_a_conditional_parameter_is_nan_where_it_is_not_set() -> None:
+def test_dimension_unset_conditional_parameter_is_nan() -> None:
     data = read(filled("maximize"))
     values = dimension(data, "masker.sigma_div").values
     masker = dimension(data, "masker")

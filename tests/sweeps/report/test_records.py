@@ -61,7 +61,7 @@ def test_a_record_is_one_run_that_a_repeat_updates(place: Path, table_file: Path
 
 
 @pytest.mark.slow
-def test_two_that_make_the_run_at_once_keep_the_older(place: Path, table_file: Path) -> None:
+def test_record_concurrent_creation_keeps_older_run(place: Path, table_file: Path) -> None:
     tracking = tracking_in(place)
     store = tracking.store()
     made = []

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from rgbt.tracking.terminal import rich_table
 from sweeps import attributes
-from sweeps.report.study_data import importances, pruning, read, short_names
+from sweeps.report.study_data import importances, pruning_savings, read, short_names
 from sweeps.report.tables import (
     counts_grid,
     failed_grid,
@@ -75,9 +75,7 @@ def test_dropped_trials_are_not_counted() -> None:
     assert grid.rows == (("4", "1", "1", "1", "1", "0"),)
 
 
-def test_best_trials_come_in_the_direction_of_the_objective_with_val_and_test_side_by_side() -> (
-    None
-):
+def test_trials_grid_sorts_by_objective_direction() -> None:
     study = new_study("minimize", metrics=["val/Var"])
     results = {"val/Var": 8.0, "test/Var": 9.5, "val/mIoU": 50.0, "test/mIoU": 48.25}
     add(study, [8.0], params={"masker.alpha": 0.123456}, results=results, seconds=61.6, runs=["a1"])
@@ -135,7 +133,7 @@ def test_conditional_parameters_are_absent_and_infinite_objectives_left_out() ->
     assert [row[:3] for row in rows] == [("1", "none", "-"), ("0", "grbm", "0.5")]
 
 
-def test_points_of_a_table_are_shown_in_order_by_label() -> None:
+def test_trials_grid_of_table_keeps_point_order() -> None:
     study = new_study("maximize", kind="list", metrics=["val/mIoU"])
     add(study, [51.0], label="Ny/4 seed=1", key="k1", runs=["k1"])
     add(study, state="FAIL", label="Ny/2 seed=1", key="k2", reason="exit code 1")
@@ -163,7 +161,7 @@ def test_failed_trials_have_reason_point_and_runs() -> None:
     assert rows[1] == ("w" * 119 + "…", "1", "x=1", "-", "3")
 
 
-def test_brackets_and_bars_of_a_reason_are_shown_as_they_are() -> None:
+def test_failed_grid_shows_markup_in_reason_verbatim() -> None:
     study = new_study("maximize")
     add(study, state="FAIL", label="l", reason="[red] a | b [/x]")
     grid = failed_grid(read(study))
@@ -194,27 +192,27 @@ def test_share_of_steps_saved_by_pruning() -> None:
         values = [1.0] if state == "COMPLETE" else None
         add(study, values, state=state, reported={10: 0.5, last: 1.0})
     add(study, state="PRUNED")  # reported nothing: not told
-    saved = pruning(read(study))
+    saved = pruning_savings(read(study))
     assert saved is not None
     assert saved.trials == 2
     assert saved.share == pytest.approx(130 / 400)
     assert counts_grid(read(study)).rows[0][-1] == "32%"
 
 
-def test_a_pruned_trial_of_three_seeds_saves_the_other_two_as_well() -> None:
+def test_pruning_savings_count_unstarted_seeds() -> None:
     study = new_study("maximize")
     add(study, [1.0], reported={100: 1.0}, runs=["a", "b", "c"])
     add(study, state="PRUNED", reported={40: 1.0}, runs=["d", "e", "f"])
-    saved = pruning(read(study))
+    saved = pruning_savings(read(study))
     assert saved is not None
     assert saved.share == pytest.approx(260 / 600)
 
 
-def test_steps_saved_cannot_be_told_without_reports_of_complete_trials() -> None:
+def test_pruning_savings_without_reports_are_none() -> None:
     study = new_study("maximize")
     add(study, [1.0])
     add(study, state="PRUNED", reported={10: 1.0})
-    assert pruning(read(study)) is None
+    assert pruning_savings(read(study)) is None
     assert len(counts_grid(read(study)).header) == 6
 
 

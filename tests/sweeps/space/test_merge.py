@@ -56,7 +56,7 @@ def test_a_fixed_key_decides_the_conditions_on_it(fixed: str, left: list[str]) -
     assert [one.key for one in merge_space(SPACE, [fixed], {}, {})] == left
 
 
-def test_a_mistake_in_the_file_is_told_though_the_command_line_covers_it() -> None:
+def test_merge_space_invalid_file_raises_despite_override() -> None:
     wrong = {**SPACE, "masker.sigma_div": {"type": "flaot"}}
     with pytest.raises(InputError, match="did you mean 'float'"):
         merge_space(wrong, ["masker.sigma_div=4"], {}, {})

@@ -70,7 +70,7 @@ def points(study: optuna.Study) -> list[dict[str, Any]]:
         *(pytest.param("gp", count, marks=pytest.mark.slow) for count in (1, 2)),
     ],
 )
-def test_a_search_that_stops_goes_on_as_if_it_had_not(kind: str, objectives: int) -> None:
+def test_sampler_resumed_search_repeats_draws(kind: str, objectives: int) -> None:
     whole = study_on(optuna.storages.InMemoryStorage(), kind, objectives)
     for _ in range(8):
         step(whole)
@@ -84,9 +84,7 @@ def test_a_search_that_stops_goes_on_as_if_it_had_not(kind: str, objectives: int
 
 
 @pytest.mark.parametrize("kind", ["tpe", "random"])
-def test_drivers_with_one_seed_share_a_storage_and_repeat_nothing(
-    kind: str, tmp_path: Path
-) -> None:
+def test_sampler_shared_seed_draws_differ(kind: str, tmp_path: Path) -> None:
     path = str(tmp_path / "journal")
     journals = [JournalFileBackend(path) for _ in range(3)]
     drivers = [study_on(optuna.storages.JournalStorage(one), kind) for one in journals]
@@ -105,7 +103,7 @@ def test_optunas_own_sampler_repeats_them() -> None:
     assert points(drivers[0]) == points(drivers[1])
 
 
-def test_trials_that_run_side_by_side_keep_their_own_draws() -> None:
+def test_sampler_concurrent_trials_keep_own_draws() -> None:
     """Asked together or one by one, told in any order: random points are those of their numbers."""
     together, single = (study_on(optuna.storages.InMemoryStorage(), "random") for _ in range(2))
     running = [together.ask() for _ in range(4)]
@@ -118,7 +116,7 @@ def test_trials_that_run_side_by_side_keep_their_own_draws() -> None:
     assert points(together) == points(single)
 
 
-def test_a_trial_is_ended_by_a_driver_that_did_not_begin_it() -> None:
+def test_sampler_ends_trial_of_other_driver() -> None:
     storage = optuna.storages.InMemoryStorage()
     number = study_on(storage, "tpe").ask().number
     adopter = study_on(storage, "tpe")

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
-from sweeps.table.table import Row, load_table
+from sweeps.table.table import Row
 from tests.sweeps.composed import checked, row_config
 
 NUMBERS = (1, 2, 3, 4, 5)
@@ -38,7 +39,7 @@ def row_of(number: int, label: str) -> Row:
 
 
 @pytest.mark.parametrize(("number", "row"), OURS)
-def test_the_settings_of_a_row_are_those_that_are_printed(number: int, row: Row) -> None:
+def test_row_settings_equal_printed_settings(number: int, row: Row) -> None:
     config = config_of(number, row)
     source, target = config.domains.source, config.domains.target
     heads = {each.head for each in (source, target) if each is not None}
@@ -116,7 +117,7 @@ def test_rows_of_a_table_are_different_runs() -> None:
 
 @pytest.mark.slow  # that of its experiment is looked at in tests/test_config.py
 @pytest.mark.parametrize(("number", "row"), OURS)
-def test_at_the_scale_of_the_paper_a_row_is_trained_on_freiburg(number: int, row: Row) -> None:
+def test_row_at_paper_scale_trains_on_freiburg(number: int, row: Row) -> None:
     config = config_of(number, row, "paper")
     assert (config.dataset.name, config.dataset.num_classes) == ("freiburg", 14)
     assert config.model.num_classes == 14

@@ -7,8 +7,8 @@ import yaml
 
 from rgbt.checks import InputError
 from sweeps.reproduce import entry
+from sweeps.table.load_table import load_table
 from sweeps.table.new_table import write_new
-from sweeps.table.table import load_table
 from tests.commands import Call, assert_one_sentence
 
 
@@ -44,7 +44,7 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
     assert table.rows[0].x is None
 
 
-def test_values_that_are_no_numbers_and_keys_that_end_alike(tmp_path: Path) -> None:
+def test_new_table_text_values_and_equal_key_ends(tmp_path: Path) -> None:
     path = write_new("groups", "grbm", ["masker=grbm_paper,grbm_released"], tmp_path)
     assert [row["label"] for row in yaml.safe_load(path.read_text())["rows"]] == [
         "masker=grbm_paper",

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from sweeps.table.parameter_counts import million_parameters, parameter_cells
+from sweeps.run_specs import million_parameters
+from sweeps.table.parameter_counts import parameter_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import table
@@ -54,7 +55,7 @@ def test_parameters_by_hand() -> None:
     assert fourteen * 1e6 == pytest.approx(encoders + decoder(14))
 
 
-def test_sizes_are_of_the_paper_whatever_is_run_and_no_data_set_is_needed() -> None:
+def test_parameter_cells_use_paper_scale() -> None:
     row = Row(label="a", experiment="crm", at={"paper": ("model=mfnet",)})
     cells = parameter_cells(wanted(row))
     cell = cells["a", "size"]
@@ -79,7 +80,7 @@ def test_a_network_is_counted_once_and_takes_no_memory(monkeypatch: pytest.Monke
     assert (len(built), set(built)) == (2 * once, {"meta"})
 
 
-def test_rows_that_cannot_be_run_and_tables_without_the_column_have_none() -> None:
+def test_parameter_cells_skip_unrunnable_rows() -> None:
     row = Row(label="a", experiment="crm")
     later = Row(label="later", experiment="crm", needs="a part")
     assert parameter_cells(wanted(later, Row(label="theirs", values={"size": 3.0}))) == {}
@@ -87,7 +88,7 @@ def test_rows_that_cannot_be_run_and_tables_without_the_column_have_none() -> No
     assert parameter_cells(wanted(row, columns=(Column(name="acc", metric="mIoU"),))) == {}
 
 
-def test_overrides_of_the_user_count_and_what_cannot_be_built_says_why() -> None:
+def test_parameter_cells_follow_overrides_and_report_errors() -> None:
     rows = (
         Row(label="a", experiment="crm", overrides=("model=mfnet",)),
         Row(label="b", experiment="crm", overrides=("model=mfnte",)),

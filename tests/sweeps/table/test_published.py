@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
-from sweeps.table.table import Row, load_table, table_names
+from sweeps.table.load_table import load_table, table_names
+from sweeps.table.table import Row
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"

@@ -31,7 +31,7 @@ def wanted(scale: str = "demo", **others: object) -> TableRequest:
     return TableRequest("own/t", table(ROWS, COLUMNS, at=at, **others), scale, (0, 2), ("a.b=1",))
 
 
-def test_a_point_per_run_with_the_rows_that_share_it() -> None:
+def test_points_share_runs_of_equal_rows() -> None:
     points = wanted().points()
     assert [point.label for point in points] == [
         "small (and 1 more) seed=0",
@@ -46,7 +46,7 @@ def test_a_point_per_run_with_the_rows_that_share_it() -> None:
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 
 
-def test_at_paper_scale_the_rows_differ_and_the_users_overrides_win() -> None:
+def test_points_at_paper_scale_use_user_overrides() -> None:
     points = wanted("paper").points()
     assert len(points) == 6
     assert points[1].overrides == (
@@ -78,7 +78,7 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         )
 
 
-def test_a_run_is_evaluated_for_the_columns_that_its_rows_have() -> None:
+def test_points_evaluate_columns_of_their_rows() -> None:
     columns = (
         Column(name="rgb", metric="mIoU"),
         Column(name="thermal", metric="mIoU", modality="thermal"),
@@ -106,7 +106,7 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
     asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
     assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)
     alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
-    assert (alone.places(), alone.points(), alone.runs([])) == ([], [], {})
+    assert (alone.row_seeds(), alone.points(), alone.runs([])) == ([], [], {})
     assert alone.models() == set()
 
 
@@ -163,6 +163,6 @@ def test_rows_of_different_networks_take_weights_of_their_own() -> None:
     )
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
-    assert wanted.typed() == ("x=1", *given[:2])
+    assert wanted.typed_overrides() == ("x=1", *given[:2])
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
         request_of(options.table, options, ("weights.mask2former_swinb=x",))

@@ -13,7 +13,8 @@ from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.metrics.named import parse
 from rgbt.spec.specify import specify
-from sweeps.table.table import Column, Row, Table, load_table, table_names
+from sweeps.table.load_table import load_table, table_names
+from sweeps.table.table import Column, Row, Table
 from tests.sweeps.composed import row_config
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
@@ -199,7 +200,7 @@ def test_ones_own_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
         load_table("crm/table4", tmp_path)
 
 
-def test_overrides_go_from_the_table_to_the_row_at_its_scale() -> None:
+def test_table_overrides_precede_row_overrides() -> None:
     row = Row(label="a", experiment="crm", overrides=("b=2",), at={"paper": ("c=3",)})
     table = Table(
         paper="my",
@@ -230,7 +231,7 @@ def test_a_row_runs_unless_a_part_is_missing() -> None:
     assert not runnable(None, None, None)
 
 
-def test_a_row_leaves_out_columns_and_what_is_computed_from_them() -> None:
+def test_columns_of_row_omit_dependent_columns() -> None:
     row = Row(label="a", experiment="crm", without=("night",))
     columns = (
         Column(name="far", mean=("both", "day")),
@@ -331,7 +332,7 @@ def test_x_is_the_printed_factor(name: str) -> None:
     assert [row.x for row in TABLES[name].rows] == [row.settings[key] for row in TABLES[name].rows]
 
 
-def test_x_of_the_gaussian_is_its_share_of_the_rows() -> None:
+def test_gaussian_x_equals_share_of_rows() -> None:
     shares: dict[str | None, float | None]
     shares = {"Ny" if n == 1 else f"Ny/{n}": 1 / n for n in (1, 2, 4, 8, 16, 32)}
     found = {row.settings["sigma_p"]: row.x for row in TABLES["spatialseg/table3"].rows}
@@ -346,7 +347,7 @@ def test_columns_are_scores_that_can_be_computed(name: str) -> None:
                 parse(column.metric.format_map(row.settings))
 
 
-def test_crm_table1_drops_images_of_all_and_features_of_its_own_network() -> None:
+def test_crm_table1_drops_images_and_own_features() -> None:
     found = TABLES["crm/table1"]
     dropped = {
         column.name: (column.degradation, column.modality)
@@ -372,7 +373,7 @@ def test_imported_rows_are_published_only() -> None:
             assert not (imported and row.experiment)
 
 
-def test_a_row_of_the_paper_runs_or_says_what_is_missing() -> None:
+def test_published_row_is_runnable_or_has_needs() -> None:
     silent = [
         (name, row.label)
         for name, table in TABLES.items()

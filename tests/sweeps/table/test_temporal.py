@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
-from sweeps.table.table import Row, load_table
+from sweeps.table.table import Row
 from tests.sweeps.composed import row_config
 
 NUMBERS = (1, 2, 3, 4, 5)
@@ -28,7 +29,7 @@ def config_of(number: int, row: Row) -> Any:
 
 
 @pytest.mark.parametrize(("number", "row"), OURS)
-def test_the_losses_of_a_row_are_those_that_are_printed(number: int, row: Row) -> None:
+def test_row_losses_equal_printed_losses(number: int, row: Row) -> None:
     config = config_of(number, row)
     first, second = ["seg1"], []
     if "second" in config.loss:
@@ -41,14 +42,14 @@ def test_the_losses_of_a_row_are_those_that_are_printed(number: int, row: Row) -
 
 
 @pytest.mark.parametrize("row", TABLES[2].rows, ids=lambda row: row.label)
-def test_the_views_of_a_row_are_those_that_are_printed(row: Row) -> None:
+def test_row_views_equal_printed_views(row: Row) -> None:
     scheme = config_of(2, row).scheme
     mode = scheme.view.mode if "view" in scheme else "neither"
     turns, moves = row.settings["rotation"], row.settings["translation"]
     assert (turns, moves) == (mode in ("rotation", "both"), mode in ("translation", "both"))
 
 
-def test_every_row_of_the_first_three_tables_and_all_proposed_ones_run() -> None:
+def test_rows_of_first_tables_are_runnable() -> None:
     for number, table in TABLES.items():
         for row in table.rows:
             assert table.runnable(row) or number > 3 and not row.proposed, (number, row.label)
@@ -70,7 +71,7 @@ def test_the_printed_columns_are_of_the_released_protocol(number: int) -> None:
     assert any("come from the released protocol" in remark for remark in TABLES[number].remarks)
 
 
-def test_backbones_of_rtfnet_differ_at_the_scale_of_the_paper_alone() -> None:
+def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:
     wanted = {scale: TableRequest("t", TABLES[5], scale, (0,)) for scale in ("demo", "paper")}
     assert [len(each.points()) for each in wanted.values()] == [1, 2]
     assert wanted["paper"].models() == {"rtfnet_50", "rtfnet_152"}

@@ -60,7 +60,7 @@ def trial(desk: Desk, number: int) -> Any:
     return desk.store.study.get_trials(deepcopy=False)[number]
 
 
-def test_a_list_is_run_once_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
+def test_driver_second_call_runs_nothing(tmp_path: Path) -> None:
     storage = memory()
     desk = list_desk(tmp_path, plans(4), storage=storage, workers=2).run()
     assert sorted(desk.executor.started()) == [(f"x={x}",) for x in range(4)]
@@ -81,7 +81,7 @@ def test_no_more_processes_at_a_time_than_workers(tmp_path: Path) -> None:
     assert max(most) == 3
 
 
-def test_what_is_finished_already_needs_neither_a_process_nor_a_slot(tmp_path: Path) -> None:
+def test_driver_finished_points_need_no_slot(tmp_path: Path) -> None:
     points = plans(5)
     for plan in points[1:]:
         finish(tmp_path / plan.key)
@@ -93,7 +93,7 @@ def test_what_is_finished_already_needs_neither_a_process_nor_a_slot(tmp_path: P
     assert done[0] == 4, "all four in the first round, while x=0 trains"
 
 
-def test_a_point_that_fails_harms_no_other_and_keeps_its_reason(tmp_path: Path) -> None:
+def test_driver_failed_point_keeps_reason(tmp_path: Path) -> None:
     storage = memory()
     behaviour = only("x=1", fail, only("x=2", leave(-9)))
     desk = list_desk(tmp_path, plans(4), behaviour, storage=storage).run()
@@ -130,7 +130,7 @@ def test_a_score_that_is_no_number_is_a_failure(tmp_path: Path, score: float | N
     assert "no test/mIoU that is a number" in trial(desk, 0).user_attrs[names.REASON]
 
 
-def test_consistency_that_was_not_measured_says_how_to_get_it(tmp_path: Path) -> None:
+def test_driver_missing_consistency_names_command(tmp_path: Path) -> None:
     objectives = (Objective("val/TC/aligned", "maximize"),)
     desk = search_desk(tmp_path, objectives=objectives, trials=1).run()
     assert (
@@ -139,7 +139,7 @@ def test_consistency_that_was_not_measured_says_how_to_get_it(tmp_path: Path) ->
     )
 
 
-def test_a_configuration_that_changed_meanwhile_is_a_failure_that_says_so(tmp_path: Path) -> None:
+def test_driver_changed_configuration_fails_trial(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1), leave(0)).run()
     assert desk.states() == {"x=0": ["FAIL"]}
     assert "was changed during the sweep" in trial(desk, 0).user_attrs[names.REASON]
@@ -151,20 +151,18 @@ def test_after_too_many_failures_no_point_is_begun(tmp_path: Path) -> None:
     assert len(list_desk(tmp_path / "2", plans(3), fail, max_failures=9).run().executor.calls) == 3
 
 
-def test_max_failures_is_the_number_of_failures_that_ends_a_call(tmp_path: Path) -> None:
+def test_driver_stops_at_max_failures(tmp_path: Path) -> None:
     assert len(list_desk(tmp_path, plans(6), fail, max_failures=2).run().executor.calls) == 2
 
 
-def test_a_run_that_takes_too_long_is_stopped_and_the_next_one_begun(tmp_path: Path) -> None:
+def test_driver_timeout_starts_next_trial(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2), only("x=0", hang), timeout_minutes=0.02).run()
     assert desk.states() == {"x=0": ["FAIL"], "x=1": ["COMPLETE"]}
     assert "timeout_minutes" in trial(desk, 0).user_attrs[names.REASON]
     assert desk.executor.calls[0].stops == 1
 
 
-def test_when_the_hours_are_spent_what_runs_is_finished_and_nothing_begun(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_driver_spent_hours_start_no_trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     clock = type("Clock", (), {"monotonic": lambda: now[0], "sleep": lambda s: None})
     monkeypatch.setattr(drivers, "time", clock)
@@ -174,7 +172,7 @@ def test_when_the_hours_are_spent_what_runs_is_finished_and_nothing_begun(
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path, late, hours=1.0)
-    desk.driver._began = desk.driver._beaten = 0.0
+    desk.driver._began = desk.driver._last_heartbeat = 0.0
 
     def tick(works: Any) -> None:
         now[0] += 0.01
@@ -221,7 +219,7 @@ def owners(count: int) -> list[Owner]:
 def test_two_drivers_on_one_journal_run_twelve_points_once(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     desks = [
-        list_desk(runs, plans(12), storage=open_storage(None, runs), me=me, workers=2, wait=True)
+        list_desk(runs, plans(12), storage=open_storage(None, runs), owner=me, workers=2, wait=True)
         for me in owners(2)
     ]
     together(desks)
@@ -232,12 +230,12 @@ def test_two_drivers_on_one_journal_run_twelve_points_once(tmp_path: Path) -> No
         assert desk.states() == {f"x={x}": ["COMPLETE"] for x in range(12)}
 
 
-def test_three_drivers_of_a_search_make_twenty_trials_with_parameters_of_their_own(
+def test_three_drivers_share_twenty_search_trials(
     tmp_path: Path,
 ) -> None:
     runs = tmp_path / "runs"
     desks = [
-        search_desk(runs, storage=open_storage(None, runs), me=me, trials=20) for me in owners(3)
+        search_desk(runs, storage=open_storage(None, runs), owner=me, trials=20) for me in owners(3)
     ]
     together(desks)
     trials = desks[0].store.trials()
@@ -252,7 +250,7 @@ from pathlib import Path
 from sweeps.worker import driver
 from sweeps.worker.storage import open_storage
 from tests.sweeps.fakes import list_desk, plans
-driver.POLL_S, driver.LOOK_S = 0.001, 0.002
+driver.POLL_S, driver.CLAIM_S = 0.001, 0.002
 runs = Path(sys.argv[1])
 storage = open_storage(None, runs)
 print("ready", flush=True)
@@ -263,7 +261,7 @@ print(*(words[0] for words in desk.executor.started()))
 
 
 @pytest.mark.slow
-def test_two_processes_that_begin_a_list_together_run_it_once(tmp_path: Path) -> None:
+def test_two_processes_run_a_list_once(tmp_path: Path) -> None:
     every = [
         subprocess.Popen(
             [sys.executable, "-c", PROCESS, str(tmp_path / "runs")],
@@ -293,7 +291,7 @@ def killed(desk: Desk) -> None:
             raise KeyboardInterrupt
 
     desk.view._look = gone
-    desk.driver._give_back = lambda: None  # type: ignore[method-assign]
+    desk.driver._release_all = lambda: None  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         desk.run()
 
@@ -303,11 +301,11 @@ def killed(desk: Desk) -> None:
     [(GONE, 0.0, True), (DEAD, 9999.0, True), (DEAD, 1.0, False)],
     ids=["its process is gone", "silent on another machine", "heard of on another machine"],
 )
-def test_points_of_a_driver_that_is_gone_are_run_by_the_next(
+def test_driver_resumes_points_of_dead_driver(
     tmp_path: Path, owner: Owner, seconds: float, taken_over: bool
 ) -> None:
     storage = memory()
-    killed(list_desk(tmp_path, plans(2), hang, storage=storage, me=owner))
+    killed(list_desk(tmp_path, plans(2), hang, storage=storage, owner=owner))
     silent(storage, 0, seconds)
     desk = list_desk(tmp_path, plans(2), storage=storage).run()
     ran = [("x=0",), ("x=1",)] if taken_over else [("x=1",)]
@@ -316,11 +314,9 @@ def test_points_of_a_driver_that_is_gone_are_run_by_the_next(
 
 
 @pytest.mark.parametrize("owner", [GONE, DEAD])
-def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
-    tmp_path: Path, owner: Owner
-) -> None:
+def test_driver_requeues_search_trial_of_dead_driver(tmp_path: Path, owner: Owner) -> None:
     storage = memory()
-    before = search_desk(tmp_path, hang, storage=storage, me=owner, trials=3)
+    before = search_desk(tmp_path, hang, storage=storage, owner=owner, trials=3)
     killed(before)
     if owner == DEAD:
         silent(storage, 0)
@@ -332,10 +328,10 @@ def test_a_search_trial_of_a_driver_that_is_gone_comes_back_with_its_parameters(
     assert [each.params for each in done].count(lost) == 1
 
 
-def test_an_orphan_that_still_trains_is_adopted_and_not_started_twice(tmp_path: Path) -> None:
+def test_driver_adopts_stale_trial_in_training(tmp_path: Path) -> None:
     storage = memory()
     points = plans(1)
-    killed(list_desk(tmp_path, points, hang, storage=storage, me=GONE))
+    killed(list_desk(tmp_path, points, hang, storage=storage, owner=GONE))
     folder = tmp_path / points[0].key
     seen: list[str] = []
     with held_by_another(folder) as process:
@@ -352,15 +348,15 @@ def test_an_orphan_that_still_trains_is_adopted_and_not_started_twice(tmp_path: 
     assert desk.states() == {"x=0": ["COMPLETE"]}
 
 
-def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
+def test_two_drivers_release_stale_trial_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     storage = memory()
-    killed(search_desk(tmp_path, hang, storage=storage, me=GONE, trials=1))
-    a, b = (search_desk(tmp_path, storage=storage, me=me, trials=1) for me in owners(2))
+    killed(search_desk(tmp_path, hang, storage=storage, owner=GONE, trials=1))
+    a, b = (search_desk(tmp_path, storage=storage, owner=me, trials=1) for me in owners(2))
     seen = [list(b.store.stale_trials(())), []]
     assert len(seen[0]) == 1
-    monkeypatch.setattr(b.store, "orphans", lambda mine: seen.pop(0) if seen else [])
+    monkeypatch.setattr(b.store, "stale_trials", lambda mine: seen.pop(0) if seen else [])
     a.run()
     b.run()
     assert a.numbers("COMPLETE") == [1]
@@ -368,10 +364,10 @@ def test_two_drivers_that_find_an_orphan_make_one_trial_of_it(
     assert len(a.executor.calls) + len(b.executor.calls) == 1
 
 
-def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: Path) -> None:
+def test_driver_with_wait_stays_for_other_drivers(tmp_path: Path) -> None:
     storage = memory()
     points = plans(2)
-    other = list_desk(tmp_path, points, storage=storage, me=ALIVE)
+    other = list_desk(tmp_path, points, storage=storage, owner=ALIVE)
     task = other.driver.source.next()
     assert task is not None
     rounds: list[int] = []
@@ -389,15 +385,15 @@ def test_with_wait_a_driver_stays_until_the_points_of_others_are_done(tmp_path: 
 
 
 def test_a_driver_says_that_it_is_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drivers, "BEAT_S", 0.0)
+    monkeypatch.setattr(drivers, "HEARTBEAT_S", 0.0)
     beats: list[list[int]] = []
     desk = list_desk(tmp_path, plans(1))
-    monkeypatch.setattr(desk.store, "beat", lambda numbers: beats.append(list(numbers)))
+    monkeypatch.setattr(desk.store, "send_heartbeat", lambda numbers: beats.append(list(numbers)))
     desk.run()
     assert [0] in beats
 
 
-def test_ctrl_c_stops_the_processes_and_gives_the_points_back(tmp_path: Path) -> None:
+def test_driver_ctrl_c_releases_points(tmp_path: Path) -> None:
     storage = memory()
     view = interrupt_when(lambda works: len(works) == 2)
     desk = list_desk(tmp_path, plans(3), hang, storage=storage, view=view, workers=2)
@@ -411,7 +407,7 @@ def test_ctrl_c_stops_the_processes_and_gives_the_points_back(tmp_path: Path) ->
     assert again.states() == {f"x={x}": ["COMPLETE"] for x in range(3)}
 
 
-def test_ctrl_c_puts_the_trials_of_a_search_into_its_queue(tmp_path: Path) -> None:
+def test_driver_ctrl_c_enqueues_search_trials(tmp_path: Path) -> None:
     storage = memory()
     view = interrupt_when(lambda works: bool(works))
     desk = search_desk(tmp_path, hang, storage=storage, view=view, trials=2)
@@ -423,7 +419,7 @@ def test_ctrl_c_puts_the_trials_of_a_search_into_its_queue(tmp_path: Path) -> No
     assert len(again.numbers("COMPLETE")) == len(again.store.trials()) == 2
 
 
-def test_ctrl_c_while_a_process_is_being_started_gives_the_point_back(tmp_path: Path) -> None:
+def test_driver_ctrl_c_at_start_releases_point(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1), hang)
     start = desk.executor.start
 
@@ -437,7 +433,7 @@ def test_ctrl_c_while_a_process_is_being_started_gives_the_point_back(tmp_path: 
     assert desk.store.trials() == []
 
 
-def test_a_process_that_cannot_be_started_fails_its_point_alone(tmp_path: Path) -> None:
+def test_driver_unstartable_process_fails_one_point(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2))
     start = desk.executor.start
 
@@ -499,7 +495,7 @@ def test_a_hopeless_trial_is_stopped_and_booked_as_pruned(tmp_path: Path) -> Non
     assert desk.driver.failures == 0
 
 
-def test_the_mean_over_replicates_is_the_value_and_the_first_seed_reports(tmp_path: Path) -> None:
+def test_driver_replicates_average_and_report_first(tmp_path: Path) -> None:
     values = {"seed=0": 0.5, "seed=1": 0.25, "seed=2": 0.75}
 
     def by_seed(call: Call) -> Process:
@@ -536,7 +532,7 @@ def test_a_search_finds_runs_that_other_studies_have_made(tmp_path: Path) -> Non
     assert other.numbers("COMPLETE") == [0, 1, 2, 3, 4]
 
 
-def test_a_search_that_was_cut_in_two_asks_the_same_points(tmp_path: Path) -> None:
+def test_driver_resumed_search_asks_same_points(tmp_path: Path) -> None:
     whole = search_desk(tmp_path / "a", trials=6).run()
     storage = memory()
     search_desk(tmp_path / "b", storage=storage, trials=2).run()
@@ -546,10 +542,10 @@ def test_a_search_that_was_cut_in_two_asks_the_same_points(tmp_path: Path) -> No
     assert parameters == [each.params for each in whole.store.trials()]
 
 
-def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+def test_driver_keeps_trial_finished_by_other(tmp_path: Path) -> None:
     """This machine slept; the other driver took the trial for an orphan's."""
     storage = memory()
-    other = list_desk(tmp_path, plans(1), storage=storage, me=ALIVE)
+    other = list_desk(tmp_path, plans(1), storage=storage, owner=ALIVE)
 
     def taken_over(call: Call) -> Process:
         other.store.complete(0, [99.0], {})
@@ -559,13 +555,13 @@ def test_a_trial_that_another_driver_finished_meanwhile_stays_as_it_is(tmp_path:
     assert trial(desk, 0).values == [99.0]
 
 
-def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_path: Path) -> None:
+def test_driver_survives_report_of_taken_trial(tmp_path: Path) -> None:
     storage = memory()
-    other = search_desk(tmp_path, storage=storage, me=ALIVE, objectives=UP)
+    other = search_desk(tmp_path, storage=storage, owner=ALIVE, objectives=UP)
 
     def taken_over(call: Call) -> Process:
         if len(desk.executor.calls) == 1:
-            other.store.release(0, "its driver was gone", again=False)
+            other.store.release(0, "its driver was gone", requeue=False)
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path, taken_over, storage=storage, trials=1, objectives=UP)
@@ -575,7 +571,7 @@ def test_a_report_of_a_trial_that_was_taken_over_does_not_end_the_driver(tmp_pat
 
 def test_points_that_cannot_be_composed_count_as_failures(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, planner=PickyPlanner(), trials=5, max_failures=1).run()
-    assert len(desk.view.refusals) == 1
+    assert len(desk.view.rejections) == 1
 
 
 def test_a_search_tries_a_failed_point_again_too(tmp_path: Path) -> None:
@@ -584,7 +580,7 @@ def test_a_search_tries_a_failed_point_again_too(tmp_path: Path) -> None:
     assert len(desk.numbers("COMPLETE")) == 1
 
 
-def test_a_storage_that_is_away_for_a_moment_is_waited_for(
+def test_driver_waits_for_unreachable_storage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drivers, "PAUSE_S", 0.0, raising=False)

@@ -134,9 +134,7 @@ def pids(place: Path) -> tuple[int, ...]:
     return tuple(map(int, place.read_text().split()))
 
 
-def test_a_command_runs_as_its_own_with_its_words_and_environment(
-    start: Start, tmp_path: Path
-) -> None:
+def test_local_executor_passes_arguments_and_environment(start: Start, tmp_path: Path) -> None:
     place = tmp_path / "facts"
     assert code(start("tell", str(place), "a b=[1,2]", environment={"GIVEN": "it"})) == 0
     facts = json.loads(place.read_text())
@@ -184,9 +182,7 @@ def test_the_log_is_appended_to(start: Start, tmp_path: Path) -> None:
     assert log(tmp_path).count("said leave") == 2
 
 
-def test_a_module_that_is_not_there_is_told_in_the_log(
-    executor: LocalExecutor, tmp_path: Path
-) -> None:
+def test_local_executor_missing_module_is_logged(executor: LocalExecutor, tmp_path: Path) -> None:
     assert code(executor.start(("no_such_module",), {}, tmp_path / "log")) == 1
     assert "No module named no_such_module" in (tmp_path / "log").read_text()
 
@@ -225,9 +221,7 @@ def test_a_second_stop_gives_no_more_time(
     assert code(job) == -signal.SIGKILL
 
 
-def test_processes_are_no_part_of_the_terminal_that_gets_ctrl_c(
-    start: Start, tmp_path: Path
-) -> None:
+def test_local_executor_process_ignores_terminal_ctrl_c(start: Start, tmp_path: Path) -> None:
     start("stay", str(tmp_path / "pids"))
     mine, _ = pids(tmp_path / "pids")
     assert os.getsid(mine) == os.getpgid(mine) == mine
@@ -306,7 +300,7 @@ def test_what_is_loaded_beforehand_can_be_loaded() -> None:
     assert "forkserver" in multiprocessing.get_all_start_methods()
 
 
-def test_every_command_that_is_called_of_a_run_is_loaded_by_its_process_alone() -> None:
+def test_commands_are_not_preloaded() -> None:
     evaluations = (
         ExtraEvaluation(),
         ExtraEvaluation(frames="aligned"),

@@ -33,9 +33,7 @@ def planner(base: tuple[str, ...]) -> Planner:
     return Planner(base)
 
 
-def test_a_run_is_planned_under_the_key_that_the_command_gives_it(
-    planner: Planner, base: tuple[str, ...]
-) -> None:
+def test_plan_uses_run_key_of_command(planner: Planner, base: tuple[str, ...]) -> None:
     plan = planner.plan(Point("p", ("seed=3",)))
     (run,) = plan.runs
     assert run.key == plan.key == specify(compose([*base, "seed=3"])).key
@@ -44,13 +42,13 @@ def test_a_run_is_planned_under_the_key_that_the_command_gives_it(
     assert plan.point.label == "p"
 
 
-def test_a_label_shows_the_value_of_pixels_at_the_scale(planner: Planner) -> None:
+def test_plan_label_shows_scaled_pixels(planner: Planner) -> None:
     point = Point("patch_size=${px:64}", ("masker.patch_size=${px:64}",))
     plan = planner.plan(point)
     assert (plan.point.label, plan.pixel_factor) == ("patch_size=32", 0.5)
 
 
-def test_seeds_make_a_run_each_and_evaluations_a_point_of_its_own(planner: Planner) -> None:
+def test_plan_keys_depend_on_seeds_and_evaluations(planner: Planner) -> None:
     single = planner.plan(Point("p", ("seed=1",)))
     both = planner.plan(Point("p", (), seeds=(0, 1)))
     assert [run.overrides[-1] for run in both.runs] == ["seed=0", "seed=1"]
@@ -69,7 +67,7 @@ def test_seeds_make_a_run_each_and_evaluations_a_point_of_its_own(planner: Plann
     assert all(len(plan.key) == 12 for plan in (*evaluated, both))
 
 
-def test_points_without_frames_keep_the_keys_of_studies_from_before_there_were_any(
+def test_plan_keys_of_older_studies_are_unchanged(
     planner: Planner,
 ) -> None:
     plan = planner.plan(Point("p", ("seed=1",), evaluations=(ExtraEvaluation("thermal", "ring9"),)))

@@ -12,6 +12,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import code
+from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.worker import point_list
@@ -23,17 +24,17 @@ from sweeps.worker.point_list import (
     other_code_line,
     preview_points,
 )
-from sweeps.worker.run_store import RunResult, RunStore
+from sweeps.worker.run_store import RunStore
 from tests.sweeps.fakes import counts, finish, plan_of, settings
 
 
 def made(folder: Path, seconds: float) -> Outcome:
     run = finish(folder)
     (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
-    return Outcome(Point("p", ()), "finished", found=(RunResult(run.path.name, run.path),))
+    return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
 
 
-def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
+def test_estimated_seconds_is_median_over_workers(
     tmp_path: Path,
 ) -> None:
     known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
@@ -43,7 +44,7 @@ def test_the_time_left_is_the_median_of_what_is_known_shared_by_the_workers(
     assert estimated_seconds(left, 1) is None
 
 
-def test_the_time_of_what_is_trained_and_not_evaluated_is_not_counted(tmp_path: Path) -> None:
+def test_estimated_seconds_ignores_trained_points(tmp_path: Path) -> None:
     trained = replace(made(tmp_path / "a", 40), state="waiting")
     failed = replace(made(tmp_path / "b", 20), state="failed")
     waiting = Outcome(Point("q", ()), "waiting")
@@ -96,14 +97,14 @@ def test_points_that_are_one_run_share_their_tags(
     assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
 
 
-def test_what_varies_are_the_keys_that_not_all_points_share() -> None:
+def test_varied_keys_are_those_not_shared() -> None:
     words = [("+e=a", f"+y={y}", f"seed={seed}") for y in (1, 2) for seed in (0, 1)]
     points = [Point(str(index), each) for index, each in enumerate(words)]
     assert varied_keys(points) == ["y", "seed"]
     assert varied_keys(points[:1]) == varied_keys([]) == []
 
 
-def test_runs_of_a_grid_have_colours_that_can_be_told_apart() -> None:
+def test_colours_of_a_grid_are_distinct() -> None:
     colours = [colour("s", index) for index in range(20)]
     assert all(re.fullmatch("#[0-9a-f]{6}", each) for each in colours)
     assert len(set(colours)) == 20
@@ -117,17 +118,17 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
     for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
         run = finish(tmp_path / name)
         run.add_provenance({"code": digest, "diff": ""})
-        found.append(RunResult(name, run.path))
-    outcomes = [Outcome(Point("p", ()), "finished", found=tuple(found[:2]))] * 2
+        found.append(RunResult(run.path))
+    outcomes = [Outcome(Point("p", ()), "finished", results=tuple(found[:2]))] * 2
     assert other_code_line(outcomes[:0]) == ""
-    assert other_code_line([Outcome(Point("p", ()), "finished", found=(found[1],))]) == ""
-    outcomes.append(Outcome(Point("q", ()), "finished", found=(found[2],)))
+    assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
+    outcomes.append(Outcome(Point("q", ()), "finished", results=(found[2],)))
     assert other_code_line(outcomes) == (
         "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
     )
 
 
-def test_a_mistake_of_all_points_is_one_of_the_call(
+def test_point_list_all_points_wrong_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(point_list, "Planner", OneKey)

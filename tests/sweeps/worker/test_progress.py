@@ -50,7 +50,7 @@ def console(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], io.StringIO]:
 Make = Callable[[bool], io.StringIO]
 
 
-def test_in_a_log_every_begin_and_end_is_a_line(console: Make) -> None:
+def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
     text = console(False)
     view = ProgressView("table", 3, 1, lambda: 0)
     with view:
@@ -59,7 +59,7 @@ def test_in_a_log_every_begin_and_end_is_a_line(console: Make) -> None:
         view.update([one])
         view.ended(one, "finished", "")
         view.ended(one, "failed", "ValueError: [red]not a colour[/red] [1,2]")
-        view.refused("p", "x does not fit.")
+        view.rejected("p", "x does not fit.")
     lines = [line[9:] for line in text.getvalue().splitlines()]
     assert lines == [
         "begins   Ny/4 seed=1",
@@ -69,7 +69,7 @@ def test_in_a_log_every_begin_and_end_is_a_line(console: Make) -> None:
     ]
 
 
-def test_in_a_terminal_the_workers_are_drawn_and_only_trouble_stays(console: Make) -> None:
+def test_progress_in_terminal_prints_failures_only(console: Make) -> None:
     text = console(True)
     view = ProgressView("table", 4, 2, lambda: 1)
     with view:
@@ -94,7 +94,7 @@ def test_in_a_terminal_the_workers_are_drawn_and_only_trouble_stays(console: Mak
     assert "finished Ny/4" not in text.getvalue()
 
 
-def test_the_time_left_follows_from_what_was_finished_by_all_workers(console: Make) -> None:
+def test_progress_time_left_uses_finished_trials(console: Make) -> None:
     console(False)
     view = ProgressView("table", 10, 2, lambda: 0)
     assert view._left([]) == ""

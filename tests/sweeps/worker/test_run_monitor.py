@@ -94,7 +94,7 @@ def test_a_long_message_is_cut(tmp_path: Path) -> None:
 def test_what_an_earlier_process_said_is_no_reason(tmp_path: Path) -> None:
     log, start = log_of(tmp_path, "", before="rgbt: an old mistake é\n")
     said = failure_reason(3, log, start)
-    assert said.startswith("it left with exit code 3 and said nothing")
+    assert said.startswith("it ended with exit code 3 and no output")
     assert str(log) in said
     assert "exit code 3" in failure_reason(3, tmp_path / "no.log", 0)
 
@@ -118,7 +118,7 @@ def test_a_signal_is_named(tmp_path: Path, code: int, said: str) -> None:
     assert failure_reason(code, *log_of(tmp_path, "rgbt: a remark\n")) == said
 
 
-def test_our_sentence_at_the_end_is_the_reason_though_a_library_logged_a_traceback(
+def test_failure_reason_prefers_last_rgbt_message(
     tmp_path: Path,
 ) -> None:
     text = TRACEBACK.replace("torch.cuda.OutOfMemoryError", "ConnectionError")
@@ -126,7 +126,7 @@ def test_our_sentence_at_the_end_is_the_reason_though_a_library_logged_a_traceba
     assert failure_reason(1, *log) == "the loss at step 7 is not finite; lower optimizer.lr."
 
 
-def test_the_process_that_holds_a_folder_is_asked_to_stop(tmp_path: Path) -> None:
+def test_signal_lock_holder_stops_process(tmp_path: Path) -> None:
     with held_by_another(tmp_path) as process:
         signal_lock_holder(tmp_path, signal.SIGTERM)
         assert process.wait() == -signal.SIGTERM

@@ -15,8 +15,10 @@ from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_fill import read_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.percent import in_percent
+from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.worker.run_store import FETCHED, RunResult, RunStore, open_run_store
+from sweeps.run_specs import open_run_store
+from sweeps.worker.run_store import FETCHED, RunStore
 from tests.sweeps.fakes import DATASET, counts, finish
 
 DEAD_STORE = "http://127.0.0.1:9"
@@ -27,7 +29,7 @@ def runs(tmp_path: Path) -> RunStore:
     return RunStore(tmp_path, NoTracking())
 
 
-def test_a_finished_run_is_found_and_an_unfinished_one_is_not(runs: RunStore) -> None:
+def test_find_returns_finished_runs_only(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
     RunFolder(runs.runs_dir / "b").append(1, "val", {"mIoU": 0.5})
     found = runs.find("a", DATASET)
@@ -40,18 +42,18 @@ def test_a_finished_run_is_found_and_an_unfinished_one_is_not(runs: RunStore) ->
     assert not (runs.runs_dir / FETCHED).exists()
 
 
-def test_a_run_on_other_files_of_the_data_set_is_told(runs: RunStore) -> None:
+def test_find_run_on_other_data_raises(runs: RunStore) -> None:
     finish(runs.runs_dir / "a", dataset="another-fingerprint")
     with pytest.raises(RunError, match=r"a was made on other files .*another-, now fingerpr"):
         runs.find("a", DATASET)
 
 
-def test_scores_are_in_percent_but_for_the_variance_and_without_what_is_missing(
+def test_scores_are_in_percent_except_var(
     tmp_path: Path,
 ) -> None:
     val = {"mIoU": 0.512345678, "Var": 9.25, "day/mIoU": 0.5, "day/Var": 4.0, "class/car": None}
     finish(tmp_path / "a", val=val, test={"region/1": 0.1, "class/car": 0.25, "mAcc": 1.0})
-    assert RunResult("a", tmp_path / "a").scores() == pytest.approx(
+    assert RunResult(tmp_path / "a").scores() == pytest.approx(
         {
             "val/mIoU": 51.2345678,
             "val/Var": 9.25,
@@ -65,32 +67,32 @@ def test_scores_are_in_percent_but_for_the_variance_and_without_what_is_missing(
     )
 
 
-def test_every_score_of_a_run_but_the_variances_becomes_percent() -> None:
+def test_in_percent_scales_every_score_except_var() -> None:
     for name in scores.summary(counts(), "released"):
         factor = 1 if name.split("/")[-1] == names.VAR else 100
         assert in_percent(name, 0.123456) == pytest.approx(factor * 0.123456)
 
 
-def test_counts_of_a_run_and_of_its_further_evaluations_have_files_of_their_own(
+def test_counts_of_evaluations_have_own_files(
     tmp_path: Path,
 ) -> None:
     finish(tmp_path)
-    found = RunResult("a", tmp_path)
+    found = RunResult(tmp_path)
     assert found.counts().counts[0, 0, 0, 0] == 3
     ring = ExtraEvaluation("thermal", "ring9")
-    assert found.counts_file(ring) == tmp_path / "evaluations" / "table_thermal_ring9.npz"
-    assert found.counts_file(ExtraEvaluation()).name == "table_default_as-trained.npz"
+    assert found.folder / ring.path == tmp_path / "evaluations" / "table_thermal_ring9.npz"
+    assert Path(ExtraEvaluation().path).name == "table_default_as-trained.npz"
     with pytest.raises(InputError, match="no file of counts"):
-        found.counts(ring)
-    ring_file = found.counts_file(ring)
+        found.counts(ring.path)
+    ring_file = found.folder / ring.path
     ring_file.parent.mkdir()
     counts(right=7).save(ring_file)
-    assert found.counts(ring).counts[0, 0, 0, 0] == 7
+    assert found.counts(ring.path).counts[0, 0, 0, 0] == 7
 
 
-def test_the_commit_is_that_of_the_first_process_with_a_mark_for_changes(tmp_path: Path) -> None:
+def test_commit_is_of_first_process_with_change_mark(tmp_path: Path) -> None:
     run = finish(tmp_path)
-    found = RunResult("a", tmp_path)
+    found = RunResult(tmp_path)
     assert found.commit is None
     run.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": False})
     assert found.commit == "0123456789"
@@ -110,7 +112,7 @@ def tags_of(folder: Path) -> dict[str, str]:
 
 def test_tags_are_added_to_those_that_a_run_has(runs: RunStore) -> None:
     finish(runs.runs_dir / "a", tags={"rgbt.table/one": "row"})
-    found = RunResult("a", runs.runs_dir / "a")
+    found = RunResult(runs.runs_dir / "a")
     runs.tag(found, {"rgbt.table/two": "other row"})
     assert tags_of(found.folder) == {
         "rgbt.key": "a",
@@ -125,19 +127,19 @@ def test_tags_are_added_to_those_that_a_run_has(runs: RunStore) -> None:
 def test_a_stopped_run_says_why(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
     (runs.runs_dir / "a" / "result.json").unlink()
-    runs.stopped("a", "pruned at step 2")
+    runs.mark_stopped("a", "pruned at step 2")
     assert tags_of(runs.runs_dir / "a")["rgbt.stopped"] == "pruned at step 2"
-    runs.stopped("nothing began", "pruned at step 2")
+    runs.mark_stopped("nothing began", "pruned at step 2")
     assert not (runs.runs_dir / "nothing began").exists()
 
 
-def test_a_run_that_finished_while_it_was_stopped_is_not_shown_as_stopped(runs: RunStore) -> None:
+def test_mark_stopped_ignores_finished_run(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
-    runs.stopped("a", "pruned at step 2")
+    runs.mark_stopped("a", "pruned at step 2")
     assert "rgbt.stopped" not in tags_of(runs.runs_dir / "a")
 
 
-def test_a_store_that_is_away_is_told_once_and_runs_here_are_found(
+def test_run_store_unreachable_mlflow_warns_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -151,13 +153,13 @@ def test_a_store_that_is_away_is_told_once_and_runs_here_are_found(
         DEAD_STORE, artifact_uri=None, experiment="rgbt", runs_dir=str(tmp_path)
     )
     runs = RunStore(tmp_path, tracking)
-    runs.touch()
+    runs.create_tables()
     finish(tmp_path / "a")
     assert runs.find("b", DATASET) is None
     found = runs.find("a", DATASET)
     assert found is not None
     runs.tag(found, {"rgbt.table/one": "row"})
-    runs.send(found)
+    runs.sync(found)
     assert tags_of(found.folder)["rgbt.table/one"] == "row", "kept for a later sync"
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
@@ -200,7 +202,7 @@ class Machines:
         there = self.runs("there")
         run = finish(there.runs_dir / key, tags={"rgbt.table/one": "row"})
         run.add_provenance({"git_commit": "0123456789abcdef"})
-        there.send(RunResult(key, run.path))
+        there.sync(RunResult(run.path))
         return run
 
     def tags(self, run: RunFolder) -> dict[str, str]:
@@ -216,7 +218,7 @@ def machines(tmp_path_factory: pytest.TempPathFactory) -> Machines:
 
 
 @pytest.mark.slow
-def test_a_run_made_elsewhere_is_found_in_mlflow_with_its_files(machines: Machines) -> None:
+def test_find_fetches_remote_run_from_mlflow(machines: Machines) -> None:
     made = machines.send("a")
     here = machines.runs("here")
     found = here.find("a", DATASET)
@@ -240,10 +242,10 @@ def test_a_run_made_elsewhere_is_found_in_mlflow_with_its_files(machines: Machin
 
 
 @pytest.mark.slow
-def test_tags_added_to_a_run_here_arrive_in_mlflow_beside_the_old_ones(machines: Machines) -> None:
+def test_tag_keeps_existing_tags_in_mlflow(machines: Machines) -> None:
     made = machines.send("b")
     there = machines.runs("there")
-    there.tag(RunResult("b", made.path), {"rgbt.table/two": "other row"})
+    there.tag(RunResult(made.path), {"rgbt.table/two": "other row"})
     tags = machines.tags(made)
     assert (tags["rgbt.table/one"], tags["rgbt.table/two"]) == ("row", "other row")
     assert tags["rgbt.dataset"] == DATASET
@@ -265,7 +267,7 @@ def test_unfinished_runs_and_half_fetched_ones_are_not_taken(machines: Machines)
     there = machines.runs("there")
     begun = finish(there.runs_dir / "d")
     (begun.path / "result.json").unlink()
-    there.stopped("d", "pruned at step 2")
+    there.mark_stopped("d", "pruned at step 2")
     assert here.find("d", DATASET) is None
     assert machines.tags(begun)["rgbt.stopped"] == "pruned at step 2"
 
@@ -276,11 +278,11 @@ def test_evaluations_made_elsewhere_later_are_fetched(machines: Machines) -> Non
     here, there = machines.runs("here"), machines.runs("there")
     assert here.find("e", DATASET) is not None
     ring = ExtraEvaluation("thermal", "ring9")
-    file = RunResult("e", made.path).counts_file(ring)
+    file = RunResult(made.path).folder / ring.path
     file.parent.mkdir()
     counts(right=7).save(file)
-    there.send(RunResult("e", made.path))
+    there.sync(RunResult(made.path))
     found = here.find("e", DATASET)
     assert found is not None
-    assert here.fetch_again(found, ring)
-    assert found.counts(ring).counts.tolist() == counts(right=7).counts.tolist()
+    assert here.fetch_counts(found, ring.path)
+    assert found.counts(ring.path).counts.tolist() == counts(right=7).counts.tolist()

@@ -10,11 +10,12 @@ import pytest
 
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.worker import running_trial as works
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.run_store import RunResult, RunStore
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import (
     LOGS,
     ExecutionContext,
@@ -102,7 +103,7 @@ def test_a_run_is_started_followed_and_found(tmp_path: Path) -> None:
     assert bench.work.score == 0.2
     assert bench.work.done_share == 0.5, "step 2 of 4"
     (found,) = bench.run()
-    assert found == RunResult(key, tmp_path / key)
+    assert found == RunResult(tmp_path / key)
     (call,) = bench.executor.calls
     assert (call.module, call.words) == ("rgbt.run", ("x=1",))
     assert call.log == tmp_path / LOGS / f"{key}.log"
@@ -115,7 +116,7 @@ def test_all_is_done_of_a_point_that_is_finished(tmp_path: Path) -> None:
     assert bench.work.done_share == 1.0
 
 
-def test_what_is_finished_already_needs_no_process_and_gets_the_tags(tmp_path: Path) -> None:
+def test_running_trial_finished_run_gets_tags_only(tmp_path: Path) -> None:
     plan = plan_of(point(tags={"rgbt.table/one": "row"}))
     finish(tmp_path / plan.key)
     bench = Bench(tmp_path, plan)
@@ -126,21 +127,21 @@ def test_what_is_finished_already_needs_no_process_and_gets_the_tags(tmp_path: P
     assert description.tags["rgbt.table/one"] == "row"
 
 
-def test_fresh_trains_again_what_other_code_made_and_only_that(tmp_path: Path) -> None:
+def test_running_trial_fresh_retrains_other_code_once(tmp_path: Path) -> None:
     plan, key = single()
     made_by_other_code(finish(tmp_path / key))
-    assert Bench(tmp_path, plan).run()[0].is_of_other_code, "without fresh it is taken"
+    assert Bench(tmp_path, plan).run()[0].other_code, "without fresh it is taken"
 
     for calls in (1, 0):  # and given again, nothing is left to do
         bench = Bench(tmp_path, plan)
         bench.runs.fresh = True
         (found,) = bench.run()
         assert len(bench.executor.calls) == calls
-        assert (found.folder, found.is_of_other_code) == (tmp_path / key, False)
+        assert (found.folder, found.other_code) == (tmp_path / key, None)
     assert [path.name for path in (tmp_path / "replaced").iterdir()] == [f"{key}-1"]
 
 
-def test_every_seed_is_a_run_and_only_the_first_is_reported(tmp_path: Path) -> None:
+def test_running_trial_reports_first_seed_only(tmp_path: Path) -> None:
     plan = plan_of(point(seeds=(0, 1)))
     steps: list[int] = []
 
@@ -155,10 +156,10 @@ def test_every_seed_is_a_run_and_only_the_first_is_reported(tmp_path: Path) -> N
     assert steps == [2, 4]
 
 
-def test_scores_are_means_over_the_seeds_of_what_all_have(tmp_path: Path) -> None:
+def test_mean_scores_averages_shared_scores(tmp_path: Path) -> None:
     finish(tmp_path / "a", val={"mIoU": 0.5}, test={"mIoU": 0.25, "Var": 9.0, "class/car": None})
     finish(tmp_path / "b", val={"mIoU": 0.25}, test={"mIoU": 0.75, "Var": 1.0, "class/car": 0.5})
-    found = [RunResult(key, tmp_path / key) for key in "ab"]
+    found = [RunResult(tmp_path / key) for key in "ab"]
     assert mean_scores(found) == {"val/mIoU": 37.5, "test/mIoU": 50.0, "test/Var": 5.0}
 
 
@@ -176,7 +177,7 @@ def say(text: str, code: int) -> Behaviour:
     [
         (fail, "ValueError: a bad day"),
         (say("rgbt: masker.sigma_div must be positive, got -1.", 2), "masker.sigma_div must be"),
-        (leave(3), "it left with exit code 3 and said nothing"),
+        (leave(3), "it ended with exit code 3 and no output"),
         (leave(-9), "stopped by SIGKILL (the system kills what takes too much memory)"),
         (leave(-11), "stopped by SIGSEGV"),
         (leave(0), "the run ended, but not as"),
@@ -222,7 +223,7 @@ def test_a_finished_run_on_other_files_fails(tmp_path: Path) -> None:
     assert bench.executor.calls == []
 
 
-def test_a_run_that_another_process_trains_is_adopted_and_not_started(tmp_path: Path) -> None:
+def test_running_trial_adopts_run_of_other_process(tmp_path: Path) -> None:
     plan, key = single()
     run = RunFolder(tmp_path / key)
     scores: list[float] = []
@@ -268,7 +269,7 @@ def test_an_orphan_whose_process_is_gone_is_started_again(tmp_path: Path) -> Non
     assert len(bench.executor.calls) == 1
 
 
-def test_a_process_that_finds_its_run_taken_leaves_it_to_that_one(tmp_path: Path) -> None:
+def test_running_trial_adopts_run_taken_meanwhile(tmp_path: Path) -> None:
     """Two drivers start the same run at the same moment: the lock decides."""
     plan, key = single()
     with held_by_another(tmp_path / key) as other:
@@ -289,7 +290,7 @@ def test_a_process_that_finds_its_run_taken_leaves_it_to_that_one(tmp_path: Path
     assert len(bench.executor.calls) == 1
 
 
-def test_a_run_whose_result_is_there_did_not_fail_whatever_its_process_says(
+def test_running_trial_result_wins_over_exit_code(
     tmp_path: Path,
 ) -> None:
     def refused(call: Call) -> Process:
@@ -302,7 +303,7 @@ def test_a_run_whose_result_is_there_did_not_fail_whatever_its_process_says(
     assert found.result["test"] == {"mIoU": 0.25, "Var": 9.0}
 
 
-def test_a_run_that_takes_too_long_is_stopped_and_fails(tmp_path: Path) -> None:
+def test_running_trial_timeout_stops_and_fails(tmp_path: Path) -> None:
     plan, _ = single()
     bench = Bench(tmp_path, plan, hang, timeout_s=0.03)
     with pytest.raises(TrialError, match=r"stopped after 0.0005 minutes \(timeout_minutes\)"):
@@ -311,7 +312,7 @@ def test_a_run_that_takes_too_long_is_stopped_and_fails(tmp_path: Path) -> None:
     assert bench.work.is_stopped()
 
 
-def test_an_adopted_run_that_takes_too_long_is_asked_to_stop(tmp_path: Path) -> None:
+def test_running_trial_timeout_stops_adopted_run(tmp_path: Path) -> None:
     plan, key = single()
     bench = Bench(tmp_path, plan, timeout_s=0.03)
     with held_by_another(tmp_path / key) as process:
@@ -333,7 +334,7 @@ def test_a_hopeless_run_is_stopped_and_told_where(tmp_path: Path) -> None:
         bench.work.advance()
 
 
-def test_a_run_that_ends_with_its_hopeless_line_is_finished_not_pruned(tmp_path: Path) -> None:
+def test_running_trial_finished_at_pruning_line_is_complete(tmp_path: Path) -> None:
     def at_once(call: Call) -> Process:
         RunFolder(call.folder).append(4, "val", {"mIoU": 0.5})
         finish(call.folder)
@@ -344,7 +345,7 @@ def test_a_run_that_ends_with_its_hopeless_line_is_finished_not_pruned(tmp_path:
     assert len(bench.run()) == 1
 
 
-def test_a_stop_ends_the_process_and_a_second_one_changes_nothing(tmp_path: Path) -> None:
+def test_running_trial_second_stop_has_no_effect(tmp_path: Path) -> None:
     bench = Bench(tmp_path, single()[0], hang)
     bench.work.stop()
     assert bench.work.is_stopped(), "nothing was started yet"
@@ -380,7 +381,7 @@ def test_further_evaluations_follow_the_run(tmp_path: Path) -> None:
         ("rgbt.evaluate", ("modality=thermal", "regions=ring9")),
     ]
     assert bench.executor.calls[1].value("run") == str(found.folder)
-    assert found.counts(RING).counts[0, 0, 0, 0] == 7
+    assert found.counts(RING.path).counts[0, 0, 0, 0] == 7
     assert Bench(tmp_path, plan).work.advance() is not None, "all there: nothing is started"
 
 
@@ -414,11 +415,11 @@ def test_both_protocols_of_virtual_views_are_one_call(tmp_path: Path) -> None:
         ("rgbt.consistency", (place[0], "frames=next", place[1], "dataset.root=/x")),
     ]
     for evaluation in (ALIGNED, RELEASED, NEXT):
-        assert found.counts(evaluation).counts[0, 0, 0, 0] == 5
+        assert found.counts(evaluation.path).counts[0, 0, 0, 0] == 5
     assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
 
 
-def test_a_run_that_has_measured_its_consistency_itself_is_not_measured_again(
+def test_running_trial_own_consistency_is_not_repeated(
     tmp_path: Path,
 ) -> None:
     def at_its_end(call: Call) -> Process:
@@ -436,7 +437,7 @@ def test_a_run_that_has_measured_its_consistency_itself_is_not_measured_again(
     bench = Bench(tmp_path, plan, at_its_end)
     (found,) = bench.run()
     assert [call.module for call in bench.executor.calls] == ["rgbt.run"]
-    assert found.counts(ALIGNED).counts[0, 0, 0, 0] == 6
+    assert found.counts(ALIGNED.path).counts[0, 0, 0, 0] == 6
 
 
 def test_a_consistency_that_cannot_be_measured_fails_the_point(tmp_path: Path) -> None:
@@ -447,7 +448,7 @@ def test_a_consistency_that_cannot_be_measured_fails_the_point(tmp_path: Path) -
         Bench(tmp_path, plan, refused).run()
 
 
-def test_an_evaluation_that_fails_or_writes_nothing_fails_the_point(tmp_path: Path) -> None:
+def test_running_trial_failed_evaluation_fails_trial(tmp_path: Path) -> None:
     plan = plan_of(point(evaluations=(RING,)))
     finish(tmp_path / plan.runs[0].key)
     with pytest.raises(TrialError, match="a bad day"):
@@ -456,21 +457,19 @@ def test_an_evaluation_that_fails_or_writes_nothing_fails_the_point(tmp_path: Pa
         Bench(tmp_path, plan, leave(0)).run()
 
 
-def test_evaluations_of_a_run_made_elsewhere_cannot_be_made_here(
+def test_running_trial_remote_run_cannot_be_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = plan_of(point(evaluations=(RING,)))
     finish(tmp_path / "copy")
     bench = Bench(tmp_path, plan)
-    monkeypatch.setattr(
-        bench.runs, "find", lambda key, dataset: RunResult(key, tmp_path / "copy", "7")
-    )
+    monkeypatch.setattr(bench.runs, "find", lambda key, dataset: RunResult(tmp_path / "copy", "7"))
     with pytest.raises(TrialError, match="made on another machine: .*thermal, ring9"):
         bench.run()
     assert bench.executor.calls == []
 
 
-def test_a_seed_that_fails_fails_the_point_and_what_is_done_is_kept(tmp_path: Path) -> None:
+def test_running_trial_failed_seed_keeps_finished_seeds(tmp_path: Path) -> None:
     plan = plan_of(point(seeds=(0, 1)))
     bench = Bench(tmp_path, plan, only("seed=1", first(fail, succeed)))
     with pytest.raises(TrialError, match="a bad day"):
@@ -480,7 +479,7 @@ def test_a_seed_that_fails_fails_the_point_and_what_is_done_is_kept(tmp_path: Pa
     assert again.executor.started() == [("x=1", "seed=1")]
 
 
-def test_a_report_that_could_not_be_sent_does_not_finish_the_point(tmp_path: Path) -> None:
+def test_running_trial_unsent_report_is_retried(tmp_path: Path) -> None:
     told: list[int] = []
 
     def report(line: Any) -> str:

@@ -178,7 +178,7 @@ def search_command(servers: Servers, data: Path, runs: Path) -> list[str]:
     ]
 
 
-def test_a_search_on_four_drivers_survives_the_death_of_one(
+def test_search_on_four_drivers_survives_killed_driver(
     servers: Servers, data: Path, tmp_path: Path
 ) -> None:
     runs = tmp_path / "runs"

@@ -25,7 +25,7 @@ UP = (Objective("test/mIoU", "maximize"),)
 BOTH = (*UP, Objective("test/Var", "minimize"))
 
 
-def test_the_default_is_a_journal_in_the_folder_of_runs(tmp_path: Path) -> None:
+def test_open_storage_default_is_journal_in_runs_dir(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path / "runs")
     open_study("study", storage, UP, {})
     assert (tmp_path / "runs" / "studies.journal").is_file()
@@ -50,7 +50,7 @@ def test_a_study_is_there_again_in_a_named_storage(tmp_path: Path, named: str) -
         ("nonsense://user:secret@host/x", "nonsense"),
     ],
 )
-def test_a_storage_that_is_none_is_refused_in_one_sentence(
+def test_open_storage_invalid_address_raises(
     tmp_path: Path, named: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stores, "PAUSE_S", 0.0)
@@ -61,9 +61,7 @@ def test_a_storage_that_is_none_is_refused_in_one_sentence(
     assert "\n" not in str(error.value)
 
 
-def test_a_database_that_cannot_be_opened_is_told_without_its_password(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open_storage_error_hides_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stores, "PAUSE_S", 0.0)
     with pytest.raises(InputError, match="its folder does not exist"):
         open_storage(f"sqlite:///{tmp_path}/no/such/folder.db", tmp_path)
@@ -73,7 +71,7 @@ def test_a_database_that_cannot_be_opened_is_told_without_its_password(
     assert "secret" not in str(error.value)
 
 
-def test_a_database_whose_tables_another_process_is_making_is_tried_again(
+def test_open_storage_retries_while_tables_are_created(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(stores, "PAUSE_S", 0.0)
@@ -85,7 +83,7 @@ def test_a_database_whose_tables_another_process_is_making_is_tried_again(
             raise RuntimeError("table studies already exists")
         return "open"
 
-    assert stores._patiently(opening, "sqlite:///x") == "open"
+    assert stores._retry(opening, "sqlite:///x") == "open"
     assert len(tries) == 3
 
 
@@ -94,11 +92,11 @@ import sys
 from pathlib import Path
 import optuna, sqlalchemy  # loaded before the start, so that all open at the same time
 from sweeps.settings import Objective
-from sweeps.worker.storage import begin_study, open_storage
+from sweeps.worker.storage import open_study, open_storage
 print("ready", flush=True)
 sys.stdin.readline()
 storage = open_storage(sys.argv[1], Path("."))
-study = begin_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
+study = open_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
 study.add_trial(optuna.trial.create_trial(value=1.0))
 """
 
@@ -106,7 +104,7 @@ study.add_trial(optuna.trial.create_trial(value=1.0))
 @pytest.mark.parametrize(
     ("named", "processes"), [("sqlite:///{}/fresh.db", 3), ("{}/fresh.journal", 2)]
 )
-def test_several_processes_open_a_fresh_storage_at_the_same_time(
+def test_open_storage_by_several_processes_at_once(
     tmp_path: Path, named: str, processes: int
 ) -> None:
     where = named.format(tmp_path)
@@ -133,7 +131,7 @@ def test_several_processes_open_a_fresh_storage_at_the_same_time(
     assert [trial.number for trial in study.trials] == list(range(processes))
 
 
-def test_a_study_with_other_objectives_or_another_space_is_refused(tmp_path: Path) -> None:
+def test_open_study_with_other_attributes_raises(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     open_study("study", storage, UP, {names.SIGNATURE: "a"})
     open_study("study", storage, UP, {names.SIGNATURE: "a"})
@@ -145,14 +143,14 @@ def test_a_study_with_other_objectives_or_another_space_is_refused(tmp_path: Pat
         open_study("study", storage, UP, {names.KIND: "list"})
 
 
-def test_a_search_under_the_name_of_a_list_is_refused(tmp_path: Path) -> None:
+def test_open_study_of_other_kind_raises(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     open_study("study", storage, UP, {names.KIND: "list"})
     with pytest.raises(InputError, match="study"):
         open_study("study", storage, UP, {names.KIND: "search", names.SIGNATURE: "a"})
 
 
-def test_a_study_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+def test_load_study_unknown_name_lists_studies(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     with pytest.raises(InputError, match="no study 'x'; the storage holds none"):
         load_study("x", storage)
@@ -168,7 +166,7 @@ def test_looking_for_a_study_makes_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_looking_for_a_study_finds_it_in_every_kind_of_storage(tmp_path: Path) -> None:
+def test_find_study_in_every_kind_of_storage(tmp_path: Path) -> None:
     for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
         open_study("study", open_storage(named, tmp_path), UP, {})
         found: Any = find_study("study", named, tmp_path)

@@ -93,7 +93,7 @@ def is_gone(pid: int) -> bool:
         return True
 
 
-def test_exit_codes_are_those_of_the_command_and_its_output_is_in_the_log(place: Place) -> None:
+def test_submitit_job_returns_exit_code_and_logs(place: Place) -> None:
     place.log("one").parent.mkdir()
     place.log("one").write_text("earlier\n")
     jobs = [place.start("one", "0"), place.start("two", "3"), place.start("three", "-9")]
@@ -111,7 +111,7 @@ def test_starting_and_asking_do_not_wait_for_the_command(place: Place) -> None:
 
 
 @pytest.mark.slow
-def test_a_loop_with_two_slots_never_has_three_unfinished_jobs(place: Place) -> None:
+def test_submitit_two_slots_limit_unfinished_jobs(place: Place) -> None:
     left = [f"job{index}" for index in range(6)]
     running: dict[str, SubmititJob] = {}
     at_once, codes = [], []
@@ -152,7 +152,7 @@ def test_a_job_stopped_before_it_began_ends(place: Place) -> None:
     assert all(is_gone(process) for process, _ in place.begun("early"))
 
 
-def test_a_killed_job_says_so_in_its_log_and_harms_no_other(place: Place) -> None:
+def test_submitit_killed_job_is_logged(place: Place) -> None:
     killed, other = place.start("killed", "wait", "0"), place.start("other", "wait", "0")
     process, parent = until(lambda: place.begun("killed"))[0]
     os.kill(parent, signal.SIGKILL)
@@ -176,9 +176,7 @@ def signalled(place: Place) -> SubmititJob:
 
 
 @pytest.mark.parametrize("timeout_min", [600, 5], ids=["pre-emption", "time limit"])
-def test_a_node_that_is_taken_away_has_the_command_begun_again(
-    tmp_path: Path, timeout_min: int
-) -> None:
+def test_submitit_preempted_command_is_requeued(tmp_path: Path, timeout_min: int) -> None:
     place = Place(tmp_path, {"cluster": "local", "timeout_min": timeout_min})
     assert code(signalled(place)) == 0
     assert len(place.begun("long")) == 2
@@ -305,7 +303,7 @@ def test_slurm_gets_a_script_with_the_options(slurm: Place) -> None:
     assert " --cpus-per-task=4 " in script.partition("srun")[2], "SLURM 22.05 asks for it twice"
 
 
-def test_slurm_that_refuses_a_job_is_quoted_in_the_log(slurm: Place) -> None:
+def test_submitit_refused_job_is_logged(slurm: Place) -> None:
     (state(slurm) / "refuse").write_text("gqu")
     job = slurm.start("one", "0")
     assert job.poll() == FAILED

@@ -16,11 +16,16 @@ from optuna.trial import TrialState
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour
 from sweeps.settings import Objective
-from sweeps.worker.trial_source import ClaimedTrial, PointListSource, known, reason_of, short
+from sweeps.worker.list_source import ListSource, finished_runs, is_evaluated, reason_of
+from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.sampler_source import short_override
+from sweeps.worker.trial_source import ClaimedTrial
 from sweeps.worker.trial_store import TrialClaim
 from tests.sweeps.fakes import (
     DEAD,
@@ -53,19 +58,24 @@ def done(desk: Desk, task: ClaimedTrial, value: float = 25.0) -> None:
     desk.store.complete(task.number, [value], {names.RESULTS: {"test/mIoU": value}})
 
 
-def standing(desk: Desk, index: int = 0) -> Any:
+def known(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...] | None:
+    results = finished_runs(plan, runs)
+    return results if results is not None and is_evaluated(plan, results) else None
+
+
+def status(desk: Desk, index: int = 0) -> Any:
     source = desk.driver.source
-    assert isinstance(source, PointListSource)
-    return source.standing(desk.plans[index], desk.store.by_key())
+    assert isinstance(source, ListSource)
+    return source.status(desk.plans[index], desk.store.by_key())
 
 
 def is_exhausted(desk: Desk, *, wait: bool = False) -> bool:
     return desk.driver.source.is_exhausted(wait=wait)
 
 
-def test_points_of_a_list_are_claimed_in_order_and_noted(tmp_path: Path) -> None:
+def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2))
-    source = PointListSource(
+    source = ListSource(
         desk.plans,
         desk.store,
         desk.runs,
@@ -82,46 +92,46 @@ def test_points_of_a_list_are_claimed_in_order_and_noted(tmp_path: Path) -> None
     assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
 
 
-def test_a_list_is_over_when_nothing_waits_or_with_wait_when_nothing_runs(tmp_path: Path) -> None:
+def test_list_source_exhausted_depends_on_wait(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1))
     assert not is_exhausted(desk)
     task = taken(desk)
-    assert standing(desk).state == "running"
+    assert status(desk).state == "running"
     assert is_exhausted(desk)
     assert not is_exhausted(desk, wait=True)
     done(desk, task)
     assert is_exhausted(desk, wait=True)
-    assert standing(desk).state == "finished"
-    assert standing(desk).found[0].key == desk.plans[0].key
+    assert status(desk).state == "finished"
+    assert status(desk).results[0].key == desk.plans[0].key
 
 
-def test_the_same_point_twice_in_a_list_is_one_point(tmp_path: Path) -> None:
+def test_list_source_duplicate_point_is_one_trial(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, [*plans(1), *plans(1)])
     taken(desk)
     assert desk.driver.source.next() is None
 
 
-def test_a_failed_point_waits_for_a_retry_that_somebody_asks_for(tmp_path: Path) -> None:
+def test_list_source_failed_point_waits_for_retry(tmp_path: Path) -> None:
     storage = memory()
     first = list_desk(tmp_path, plans(1), storage=storage)
     first.store.fail(taken(first).number, "a bad day", {})
-    assert standing(first).state == "failed"
-    assert standing(first).reason == "a bad day"
+    assert status(first).state == "failed"
+    assert status(first).reason == "a bad day"
     assert first.driver.source.next() is None
 
     plain = list_desk(tmp_path, plans(1), storage=storage)
     assert plain.driver.source.next() is None
     again = list_desk(tmp_path, plans(1), storage=storage, retry="failed")
-    assert standing(again).state == "waiting"
+    assert status(again).state == "waiting"
     again.store.fail(taken(again).number, "another bad day", {})
-    assert standing(again).reason == "another bad day"
+    assert status(again).reason == "another bad day"
     assert again.driver.source.next() is None, "forgiven once, not for ever"
 
 
-def test_a_point_is_tried_as_often_as_retries_say_all_drivers_together(tmp_path: Path) -> None:
+def test_list_source_retries_are_shared_by_drivers(tmp_path: Path) -> None:
     storage = memory()
     a = list_desk(tmp_path, plans(1), storage=storage, retries=2)
-    b = list_desk(tmp_path, plans(1), storage=storage, retries=2, me=DEAD)
+    b = list_desk(tmp_path, plans(1), storage=storage, retries=2, owner=DEAD)
     for desk in (a, b, a):
         task = taken(desk)
         desk.store.fail(task.number, "a bad day", {})
@@ -137,7 +147,7 @@ def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
     assert before.driver.source.next() is None
     (tmp_path / before.plans[0].key / "result.json").unlink()
     desk = list_desk(tmp_path, plans(1), storage=storage)
-    assert standing(desk).state == "waiting"
+    assert status(desk).state == "waiting"
     assert taken(desk).number == 1
 
 
@@ -149,16 +159,16 @@ def test_other_points_in_the_study_are_left_alone(tmp_path: Path) -> None:
     assert is_exhausted(desk)
 
 
-def test_a_failed_point_that_was_finished_by_hand_since_is_not_failed(tmp_path: Path) -> None:
+def test_list_source_failed_point_finished_by_hand(tmp_path: Path) -> None:
     storage = memory()
     before = list_desk(tmp_path, plans(1), storage=storage)
     before.store.fail(taken(before).number, "a bad day", {})
     finish(tmp_path / before.plans[0].key)
     desk = list_desk(tmp_path, plans(1), storage=storage)
-    assert standing(desk).state in ("finished", "waiting")
+    assert status(desk).state in ("finished", "waiting")
 
 
-def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) -> None:
+def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
     ring = ExtraEvaluation(regions="ring9")
     plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring,)))
     runs = list_desk(tmp_path, []).runs
@@ -170,7 +180,7 @@ def test_a_point_is_known_when_all_its_runs_and_evaluations_are(tmp_path: Path) 
         (tmp_path / run.key / "evaluations").mkdir()
         found = runs.find(run.key, run.dataset)
         assert found is not None
-        shutil.copyfile(found.folder / "counts_test.npz", found.counts_file(ring))
+        shutil.copyfile(found.folder / "counts_test.npz", found.folder / ring.path)
     both = known(plan, runs)
     assert both is not None
     assert [found.key for found in both] == [run.key for run in plan.runs]
@@ -209,7 +219,7 @@ def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
     assert desk.driver.source.next() is None
     assert is_exhausted(desk)
     assert not is_exhausted(desk, wait=True)
-    desk.store.release(task.number, "given back", again=True)
+    desk.store.release(task.number, "given back", requeue=True)
     assert not is_exhausted(desk), "somebody has to take it up"
     again = taken(desk)
     assert again.plan.key == task.plan.key
@@ -221,7 +231,7 @@ def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
 SMALL = {"x": {"type": "categorical", "choices": [7]}}
 
 
-def test_a_duplicate_of_a_finished_point_is_answered_without_a_run(tmp_path: Path) -> None:
+def test_sampler_source_copies_finished_duplicate(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     done(desk, taken(desk), 31.0)
     assert desk.driver.source.next() is None
@@ -233,9 +243,7 @@ def test_a_duplicate_of_a_finished_point_is_answered_without_a_run(tmp_path: Pat
     assert is_exhausted(desk)
 
 
-def test_a_duplicate_of_a_running_point_is_dropped_and_the_search_goes_on_later(
-    tmp_path: Path, quick: None
-) -> None:
+def test_sampler_source_drops_running_duplicate(tmp_path: Path, quick: None) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     task = taken(desk)
     assert desk.driver.source.next() is None
@@ -246,19 +254,19 @@ def test_a_duplicate_of_a_running_point_is_dropped_and_the_search_goes_on_later(
     assert desk.numbers("COMPLETE") == [0, desk.store.trials()[1].number]
 
 
-def test_a_failed_point_of_a_search_may_be_tried_again_by_the_sampler(tmp_path: Path) -> None:
+def test_sampler_source_may_repeat_failed_point(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     desk.store.fail(taken(desk).number, "a bad day", {})
     assert taken(desk).number == 1
 
 
-def test_a_point_that_cannot_be_composed_fails_and_is_told(tmp_path: Path) -> None:
+def test_sampler_source_wrong_point_fails_and_is_reported(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, planner=PickyPlanner(), trials=1)
     assert desk.driver.source.next() is None
     (trial,) = desk.store.trials()
     assert trial.state.name == "FAIL"
     assert reason_of(trial) == "x does not fit."
-    ((label, reason),) = desk.view.refusals
+    ((label, reason),) = desk.view.rejections
     assert label == trial.user_attrs[names.LABEL]
     assert reason == "x does not fit."
     assert is_exhausted(desk)
@@ -283,7 +291,7 @@ def test_evaluations_are_reported_once_each_in_percent(tmp_path: Path) -> None:
     assert math.isnan(reported.get(8, math.nan))
 
 
-def test_a_variance_is_reported_as_it_is_and_nothing_of_two_objectives(tmp_path: Path) -> None:
+def test_pruning_callback_keeps_var_and_skips_two_objectives(tmp_path: Path) -> None:
     var = Objective("val/Var", "minimize")
     desk = search_desk(tmp_path, objectives=(var,), trials=1)
     report = taken(desk).report
@@ -316,10 +324,10 @@ def test_a_hopeless_trial_is_told_by_the_pruner(tmp_path: Path) -> None:
     ],
 )
 def test_overrides_are_short_for_people(override: str, shown: str) -> None:
-    assert short(override) == shown
+    assert short_override(override) == shown
 
 
-def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
+def test_reason_of_trial_without_reason() -> None:
     store = store_on(memory())
     number = store.claim(TrialClaim("k", {}))
     assert number == 0
@@ -327,7 +335,7 @@ def test_of_a_failed_trial_without_a_reason_that_is_said() -> None:
     assert reason_of(store.trials()[0]) == "no reason was noted"
 
 
-def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_path: Path) -> None:
+def test_has_counts_ignores_outdated_evaluation(tmp_path: Path) -> None:
     ring = ExtraEvaluation(regions="ring9")
     plan = plan_of(Point("p", (), evaluations=(ring,)))
     runs = list_desk(tmp_path, []).runs
@@ -335,18 +343,18 @@ def test_an_evaluation_of_an_earlier_training_or_other_data_does_not_count(tmp_p
     finish(tmp_path / run.key)
     found = runs.find(run.key, run.dataset)
     assert found is not None
-    file = found.counts_file(ring)
+    file = found.folder / ring.path
     file.parent.mkdir()
     shutil.copyfile(found.folder / "counts_test.npz", file)
-    assert found.has(ring)
+    assert found.has_counts(ring.path)
     os.utime(file, (0, 0))
-    assert found.has(ring), "of a run made elsewhere there is no checkpoint"
+    assert found.has_counts(ring.path), "of a run made elsewhere there is no checkpoint"
     (found.folder / "best.pt").touch()  # the run was trained again since
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     assert known(plan, runs) is None
     replace(Counts.load(found.folder / "counts_test.npz"), dataset="other").save(file)
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     replace(Counts.load(found.folder / "counts_test.npz"), split="val").save(file)
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)
     file.write_bytes(b"half")
-    assert not found.has(ring)
+    assert not found.has_counts(ring.path)

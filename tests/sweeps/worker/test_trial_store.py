@@ -37,9 +37,9 @@ def states(store: TrialStore) -> list[str]:
     return [each.state.name for each in store.trials()]
 
 
-def searching(storage: Any, me: Owner | None = None) -> TrialStore:
-    """A ledger of a search; every driver has a study object and a sampler of its own."""
-    return store_on(storage, me, sampler=build_sampler("random", 0, {}, 1))
+def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
+    """The store of a search; every driver has a study object and a sampler of its own."""
+    return store_on(storage, owner, sampler=build_sampler("random", 0, {}, 1))
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
@@ -47,7 +47,7 @@ def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
     asked = store.ask(total)
     assert asked is not None
     x = asked.suggest_float("x", 0, 1)
-    store.note(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
+    store.set_attributes(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
     return asked.number, x
 
 
@@ -55,7 +55,7 @@ def stale_trials(store: TrialStore, *mine: int) -> list[int]:
     return [each.number for each in store.stale_trials(mine)]
 
 
-def test_a_claim_is_a_running_trial_with_all_that_is_known_of_the_point(store: TrialStore) -> None:
+def test_claim_adds_running_trial_with_attributes(store: TrialStore) -> None:
     number = claim(store, params={"x": 3}, distributions={"x": IntDistribution(0, 9)})
     assert number == 0
     found = trial(store, 0)
@@ -63,11 +63,11 @@ def test_a_claim_is_a_running_trial_with_all_that_is_known_of_the_point(store: T
     assert found.params == {"x": 3}
     assert found.user_attrs[names.KEY] == "k"
     assert found.user_attrs[names.LABEL] == "point k"
-    assert found.user_attrs[names.OWNER] == str(Owner.me())
+    assert found.user_attrs[names.OWNER] == str(Owner.this_process())
     assert abs(found.user_attrs[names.HEARTBEAT] - time.time()) < 60
 
 
-def test_a_point_that_runs_is_not_claimed_again_and_the_attempt_does_not_count(
+def test_claim_of_running_point_is_dropped(
     store: TrialStore,
 ) -> None:
     assert claim(store) == 0
@@ -78,16 +78,14 @@ def test_a_point_that_runs_is_not_claimed_again_and_the_attempt_does_not_count(
 
 
 @pytest.mark.parametrize("how", ["complete", "prune"])
-def test_a_point_that_is_done_is_not_claimed_again_unless_that_is_past(
-    store: TrialStore, how: str
-) -> None:
+def test_claim_of_finished_point_requires_replaced(store: TrialStore, how: str) -> None:
     claim(store)
     if how == "complete":
         store.complete(0, [1.0], {})
     else:
         store.prune(0, "hopeless", {})
     assert claim(store) is None
-    assert claim(store, past=[0]) == 2
+    assert claim(store, replaced=[0]) == 2
 
 
 def test_a_failed_trial_does_not_keep_its_point(store: TrialStore) -> None:
@@ -104,18 +102,16 @@ def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
 
 
 @pytest.mark.parametrize(("kind", "keys"), [("journal", "abcdefgh"), ("sqlite", "abc")])
-def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
-    tmp_path: Path, kind: str, keys: str
-) -> None:
+def test_claim_by_two_drivers_succeeds_once_per_point(tmp_path: Path, kind: str, keys: str) -> None:
     opened = opener(tmp_path, kind)
-    ledgers = [store_on(opened()) for _ in range(2)]
+    stores = [store_on(opened()) for _ in range(2)]
     got: list[list[str]] = [[], []]
     at_once = threading.Barrier(2)
 
     def work(index: int) -> None:
         for key in keys:
             at_once.wait()
-            if claim(ledgers[index], key) is not None:
+            if claim(stores[index], key) is not None:
                 got[index].append(key)
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
@@ -124,15 +120,13 @@ def test_of_two_drivers_that_claim_the_same_points_at_once_one_gets_each(
     for thread in threads:
         thread.join()
     assert sorted(got[0] + got[1]) == list(keys)
-    assert states(ledgers[0]) == ["RUNNING"] * len(keys)
+    assert states(stores[0]) == ["RUNNING"] * len(keys)
 
 
 @pytest.mark.parametrize(("kind", "total"), [("journal", 20), ("sqlite", 7)])
-def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
-    tmp_path: Path, kind: str, total: int
-) -> None:
+def test_ask_by_three_drivers_respects_total(tmp_path: Path, kind: str, total: int) -> None:
     opened = opener(tmp_path, kind)
-    ledgers = [searching(opened()) for _ in range(3)]
+    stores = [searching(opened()) for _ in range(3)]
     drawn: list[float] = []
 
     def work(store: TrialStore) -> None:
@@ -141,12 +135,12 @@ def test_three_drivers_that_ask_at_once_make_as_many_trials_as_were_wanted(
             if asked is not None:
                 drawn.append(asked.suggest_float("x", 0, 1))
 
-    threads = [threading.Thread(target=work, args=(store,)) for store in ledgers]
+    threads = [threading.Thread(target=work, args=(store,)) for store in stores]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert states(ledgers[0]) == ["RUNNING"] * total, "none was told: running ones count"
+    assert states(stores[0]) == ["RUNNING"] * total, "none was told: running ones count"
     assert len(set(drawn)) == len(drawn) == total
 
 
@@ -161,7 +155,7 @@ def test_running_trials_of_other_drivers_count_in_the_total() -> None:
     assert mine.ask(3) is not None
 
 
-def test_of_two_that_ask_for_the_last_trial_the_earlier_number_keeps_it(
+def test_ask_last_trial_goes_to_lower_number(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     storage = memory()
@@ -182,14 +176,14 @@ def test_the_last_sign_of_a_driver_is_renewed() -> None:
     store = store_on(storage, DEAD)
     claim(store)
     silent(storage, 0)
-    store.beat([0])
+    store.send_heartbeat([0])
     assert stale_trials(store_on(storage)) == []
 
 
-def test_a_sign_for_a_trial_that_another_driver_finished_does_no_harm(store: TrialStore) -> None:
+def test_heartbeat_of_finished_trial_is_ignored(store: TrialStore) -> None:
     claim(store)
     store.complete(0, [1.0], {})
-    store.beat([0])
+    store.send_heartbeat([0])
     store.fail(0, "too late", {})
     store.complete(0, [2.0], {})
     assert trial(store, 0).state.name == "COMPLETE"
@@ -197,7 +191,7 @@ def test_a_sign_for_a_trial_that_another_driver_finished_does_no_harm(store: Tri
     assert names.REASON not in trial(store, 0).user_attrs
 
 
-def test_what_the_storage_refuses_of_an_unfinished_trial_is_not_hidden(store: TrialStore) -> None:
+def test_update_unfinished_raises_other_errors(store: TrialStore) -> None:
     claim(store)
     with pytest.raises(ValueError, match="did not match the number of the objectives"):
         store.complete(0, [1.0, 2.0], {})
@@ -221,7 +215,7 @@ def test_trials_of_a_driver_that_is_gone_are_orphans(
     assert stale_trials(store_on(storage)) == ([0] if is_gone else [])
 
 
-def test_a_trial_of_its_own_that_a_driver_does_not_work_on_is_an_orphan(store: TrialStore) -> None:
+def test_stale_trials_include_own_lost_trial(store: TrialStore) -> None:
     claim(store, "a")
     claim(store, "b")
     assert stale_trials(store, 0, 1) == []
@@ -239,7 +233,7 @@ def test_finished_and_dropped_trials_are_no_orphans() -> None:
     assert stale_trials(store_on(storage)) == [3]
 
 
-def test_a_search_trial_asked_for_a_moment_ago_is_no_orphan_though_nobody_signed_it(
+def test_stale_trials_exclude_fresh_unowned_trial(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     store = searching(memory())
@@ -250,9 +244,9 @@ def test_a_search_trial_asked_for_a_moment_ago_is_no_orphan_though_nobody_signed
     assert stale_trials(store) == [0]
 
 
-def test_a_released_point_of_a_list_can_be_claimed_again(store: TrialStore) -> None:
+def test_release_allows_new_claim(store: TrialStore) -> None:
     claim(store)
-    store.release(0, "its driver was gone", again=False)
+    store.release(0, "its driver was gone", requeue=False)
     assert store.trials() == []
     assert claim(store) == 1
 
@@ -261,72 +255,72 @@ def test_a_released_search_trial_comes_back_with_its_parameters() -> None:
     storage = memory()
     number, x = taken(searching(storage, GONE), 1)
     mine = searching(storage)
-    mine.release(number, "its driver was gone", again=True)
+    mine.release(number, "its driver was gone", requeue=True)
     assert states(mine) == ["WAITING"]
     again = mine.ask(1)
     assert again is not None
     assert again.suggest_float("x", 0, 1) == x
     assert again.user_attrs[names.KEY] == f"x={x}"
     assert states(mine) == ["RUNNING"]
-    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.me())
+    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.this_process())
 
 
-def test_a_search_trial_without_a_point_yet_is_dropped_and_another_one_asked_for() -> None:
+def test_release_trial_without_point_is_not_enqueued() -> None:
     storage = memory()
     gone = searching(storage, GONE)
     gone.ask(1)
     mine = searching(storage)
-    mine.release(0, "its driver was gone", again=True)
+    mine.release(0, "its driver was gone", requeue=True)
     assert states(mine) == []
     assert mine.ask(1) is not None
 
 
-def test_two_drivers_that_release_an_orphan_one_after_the_other_queue_it_once() -> None:
+def test_release_twice_enqueues_once() -> None:
     storage = memory()
     number, _ = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
-    a.release(number, "gone", again=True)
-    b.release(number, "gone", again=True)
+    a.release(number, "gone", requeue=True)
+    b.release(number, "gone", requeue=True)
     assert states(a) == ["WAITING"]
 
 
-def test_a_crash_between_queueing_an_orphan_and_dropping_it_queues_it_once() -> None:
+def test_release_after_crash_enqueues_once() -> None:
     storage = memory()
     number, x = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
     a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
     assert stale_trials(b) == [number]
-    b.release(number, "gone", again=True)
+    b.release(number, "gone", requeue=True)
     assert states(b) == ["WAITING"]
 
 
 @pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
-def test_an_orphan_that_another_driver_released_and_took_up_is_not_queued_again(
+def test_release_of_resumed_trial_enqueues_nothing(
     finished: bool,
 ) -> None:
     storage = memory()
     number, _ = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
     (seen,) = stale_trials(b)
-    a.release(number, "gone", again=True)
+    a.release(number, "gone", requeue=True)
     again = a.ask(1)
     assert again is not None
     if finished:
         a.complete(again.number, [1.0], {})
-    b.release(seen, "gone", again=True)
+    b.release(seen, "gone", requeue=True)
     assert states(b) == ["COMPLETE" if finished else "RUNNING"]
 
 
-def test_giving_back_a_trial_that_another_driver_has_finished_changes_nothing() -> None:
+def test_release_finished_trial_has_no_effect() -> None:
     storage = memory()
     mine, other = searching(storage, DEAD), searching(storage)
     number, _ = taken(mine)
     other.complete(number, [1.0], {})
-    mine.release(number, "its driver was stopped", again=True)
+    mine.release(number, "its driver was stopped", requeue=True)
     assert states(mine) == ["COMPLETE"]
 
 
-def test_trials_are_found_by_the_key_of_their_point_earlier_ones_first(store: TrialStore) -> None:
+def test_by_key_orders_trials_by_number(store: TrialStore) -> None:
     claim(store, "a")
     store.fail(0, "a bad day", {})
     claim(store, "b")
@@ -335,7 +329,7 @@ def test_trials_are_found_by_the_key_of_their_point_earlier_ones_first(store: Tr
     assert found == {"a": [0, 2], "b": [1]}
 
 
-def test_a_trial_pruned_at_its_last_report_keeps_that_value() -> None:
+def test_prune_keeps_last_reported_value() -> None:
     store = searching(memory())
     asked = store.ask(None)
     assert isinstance(asked, optuna.Trial)

@@ -1,0 +1,102 @@
+"""Reads and checks table files: the papers' in ``sweeps/tables``, the user's in ``tables``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from rgbt.checks import InputError, nearest
+from rgbt.files.yaml_files import read_yaml
+from sweeps.table.checks import check_table
+from sweeps.table.table import Column, Factor, Row, Table
+
+PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
+"""The papers' tables, part of the package."""
+
+OWN = Path("tables")
+"""Tables of the user, in the current folder."""
+
+
+def table_names(folder: Path = OWN) -> list[str]:
+    """Names for `load_table`: the papers' tables, then those in `folder`."""
+    return [
+        path.relative_to(root).with_suffix("").as_posix()
+        for root in (PUBLISHED, folder)
+        for path in sorted(root.rglob("*.yaml"))
+    ]
+
+
+def load_table(name: str, folder: Path = OWN) -> Table:
+    """Read and check a table.
+
+    Args:
+        name: "spatialseg/table3" for a published table, "my/ablation" for one in `folder`, or a
+            path that ends in .yaml.
+        folder: of the user's tables.
+
+    Raises:
+        InputError: no such table, two of that name, an unreadable file, an unknown key or column,
+            a wrong type; the sentence names file, row and key.
+    """
+    path = _find(name, folder)
+    table = _typed(read_yaml(path), path)
+    check_table(table, str(path))
+    return table
+
+
+def _find(name: str, folder: Path) -> Path:
+    if name.endswith((".yaml", ".yml")):
+        path = Path(name).expanduser()
+        if not path.is_file():
+            raise InputError(f"table={name}: there is no such file.")
+        return path
+    paths = [path for root in (PUBLISHED, folder) if (path := root / f"{name}.yaml").is_file()]
+    if len(paths) > 1:
+        raise InputError(f"table={name} is {paths[0]} as well as {paths[1]}; name the file.")
+    if not paths:
+        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
+    return paths[0]
+
+
+def _typed(plain: Any, path: Path) -> Table:
+    import pydantic
+
+    try:  # Read as JSON: a list may be a tuple, but a number is no text and text no number.
+        text = json.dumps(plain, default=str)
+        return pydantic.TypeAdapter(Table).validate_json(text, strict=True)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}, {_sentence(first, plain)}") from None
+
+
+SHAPES: dict[str, type[Any]] = {"rows": Row, "columns": Column, "factor": Factor}
+
+
+def _sentence(error: Mapping[str, Any], plain: Any) -> str:
+    """Pydantic's error with the row and the key, and the nearest known key."""
+    *parents, last = error["loc"] or ("the whole file",)
+    if isinstance(last, int):
+        last = f"{parents.pop()}[{last}]"
+    where = _location(parents, plain)
+    if error["type"] == "unexpected_keyword_argument":
+        shape = SHAPES[parents[0]] if parents else Table
+        known = [entry.name for entry in fields(shape)]
+        return f"{where}'{last}' is not a key; {nearest(str(last), known)}."
+    if error["type"] == "missing":
+        return f"{where}'{last}' has no value; give one."
+    reason = error["msg"].replace("Input", "input").replace("valid array", "list")
+    got = json.dumps(error["input"], default=str)
+    return f"{where}'{last}': {reason}, got {got}."
+
+
+def _location(parents: list[str | int], plain: Any) -> str:
+    """The position in the file: ("rows", 3, "values") is ``row 'Ny/4', values:``."""
+    words = [str(parent) for parent in parents]
+    if len(parents) > 1 and isinstance(index := parents[1], int):
+        entry = plain[parents[0]][index]
+        title = entry.get("label", entry.get("name")) if isinstance(entry, dict) else None
+        words[:2] = [f"{words[0].removesuffix('s')} {index + 1 if title is None else repr(title)}"]
+    return "".join(f"{word}, " for word in words).removesuffix(", ") + (": " if words else "")
