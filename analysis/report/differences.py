@@ -87,7 +87,7 @@ def difference_entries(
         resamples: of the images, for intervals and p-values.
         track: shows how far it is.
     """
-    scored = [run for run in runs if run.counts is not None and run.config]
+    scored = [run for run in runs if run.test_counts is not None and run.config]
     settings = Resampling(resamples=resamples)
     return tuple(
         _entry(choice, find_pairs(choice, scored), settings)
@@ -120,14 +120,14 @@ def _is_side(config: Mapping[str, Any], side: Side) -> bool:
 
 def _rest(run: ReportRun, keys: set[str]) -> str:
     """All else that makes the run what it is: configuration and images."""
-    assert run.counts is not None, "only runs with counts are compared"
+    assert run.test_counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
     same = {
         key: _number(value)
         for key, value in run.config.items()
         if key not in keys and not any(key == out or key.startswith(f"{out}.") for out in left_out)
     }
-    images = [run.counts.dataset, run.counts.partition, run.counts.split]
+    images = [run.test_counts.dataset, run.test_counts.partition, run.test_counts.split]
     return json.dumps([images, same], sort_keys=True, default=str)
 
 
@@ -169,7 +169,7 @@ def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -
 
 
 def _counts(runs: Sequence[ReportRun]) -> list[Any]:
-    return [run.counts for run in runs]
+    return [run.counts() for run in runs]
 
 
 def sentence(pair: PairedRuns, compared: Comparison) -> str:

@@ -29,6 +29,7 @@ from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
 from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG
 
 SPLIT = "test"
@@ -45,30 +46,44 @@ class ReportRun:
 
     Attributes:
         entry: what the page shows.
-        counts: of the test split; None where there are none.
+        test_counts: that the run ended with; None where there are none.
         absent: how the run scores a class without pixels.
         config: dotted key -> value; empty where the store has no configuration.
         files: its files.
     """
 
     entry: RunEntry
-    counts: Counts | None
+    test_counts: Counts | None
     absent: Absent
     config: Mapping[str, Any]
     files: RunFiles
     _evaluations: dict[str, Counts] = field(default_factory=dict)
 
-    def counts_of(self, path: str) -> Counts:
-        """Counts of another evaluation, by the path of their file in the run.
+    @property
+    def key(self) -> str:
+        """Its config key."""
+        return self.entry.key
+
+    @property
+    def commit(self) -> str | None:
+        """Git commit of the code that made it."""
+        return self.entry.commit or None
+
+    def counts(self, path: str = OWN_COUNTS) -> Counts:
+        """Counts of an evaluation, by the path of their file in the run.
 
         Raises:
             InputError: there is no such file, or it is damaged.
         """
+        if path == OWN_COUNTS:
+            if self.test_counts is None:
+                raise InputError(f"run {self.key} has no counts.")
+            return self.test_counts
         if path not in self._evaluations:
             found = self.files.find(path)
             if found is None:
-                raise InputError(f"run {self.entry.key} has no {path}.")
-            self._evaluations[path] = _load(found, self.entry.key)
+                raise InputError(f"run {self.key} has no {path}.")
+            self._evaluations[path] = _load(found, self.key)
         return self._evaluations[path]
 
 
@@ -119,7 +134,7 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         dataset=run.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
         config={name: as_text(value) for name, value in config.items()} or dict(run.params),
     )
-    return ReportRun(entry=entry, counts=counts, absent=absent, config=config, files=run.files)
+    return ReportRun(entry=entry, test_counts=counts, absent=absent, config=config, files=run.files)
 
 
 def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:
@@ -153,16 +168,15 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _counts(run: MlflowRun, key: str, remarks: list[str]) -> Counts | None:
-    path = f"counts_{SPLIT}.npz"
     try:
-        found = run.files.find(path)
+        found = run.files.find(OWN_COUNTS)
         if found is not None:
             return _load(found, key)
     except InputError as error:
         remarks.append(f"Run '{run.name}' has no scores: {error}")
         return None
     if run.status == "FINISHED":
-        remarks.append(f"Run '{run.name}' has no scores: its {path} is not in the store.")
+        remarks.append(f"Run '{run.name}' has no scores: its {OWN_COUNTS} is not in the store.")
     return None
 
 

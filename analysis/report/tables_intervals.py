@@ -16,9 +16,6 @@ from rgbt.metrics.metric import Absent
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Goes over a sequence and shows how far it is: (sequence, what is done)."""
 
-OWN = ""
-"""Path of the evaluation that a run makes itself."""
-
 
 @dataclass(frozen=True)
 class CountsSource:
@@ -26,7 +23,7 @@ class CountsSource:
 
     Attributes:
         keys: of the runs, one per seed.
-        paths: of the evaluation in each run, `OWN` for the run's own; two: the first less the
+        paths: of the counts in each run; two: the first less the
             second.
         absent: how a class without pixels scores; None: as the counts say.
     """
@@ -81,20 +78,7 @@ class Intervals:
             self.found |= {(source, metric): each for metric, each in found.items()}
 
     def _counts(self, keys: Sequence[str], path: str) -> list[Counts]:
-        return [counts_of(self.runs[key], path) for key in keys]
-
-
-def counts_of(run: ReportRun, path: str) -> Counts:
-    """Counts of one evaluation of a run.
-
-    Raises:
-        InputError: it has none.
-    """
-    if path != OWN:
-        return run.counts_of(path)
-    if run.counts is None:
-        raise InputError(f"run {run.entry.key} has no counts.")
-    return run.counts
+        return [self.runs[key].counts(path) for key in keys]
 
 
 def _resampled(

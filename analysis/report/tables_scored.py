@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 from analysis.report.runs import ReportRun
 from analysis.report.tables_files import NO_CELL, RecordedTable
-from analysis.report.tables_intervals import OWN, CountsSource, counts_of
+from analysis.report.tables_intervals import CountsSource
 from rgbt.checks import InputError
-from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from sweeps.table.cells import (
     CellId,
     TableCell,
+    counts_path,
     derived,
-    evaluation_of,
     is_counted,
     is_of_runs,
     metric_of,
@@ -29,25 +28,12 @@ AGREES = 1e-4
 
 
 @dataclass(frozen=True)
-class _Opened:
-    """A run as `sweeps.table.scoring` reads one."""
-
-    key: str
-    commit: str | None
-    run: ReportRun
-
-    def counts(self, path: str = OWN) -> Counts:
-        """Counts of an evaluation."""
-        return counts_of(self.run, path)
-
-
-@dataclass(frozen=True)
 class _Outcome:
     """What became of a cell's run, as `sweeps.table.scoring` reads it."""
 
     state: str
     reason: str = ""
-    results: tuple[_Opened, ...] = ()
+    results: tuple[ReportRun, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,7 +91,7 @@ def _by_seed(
 def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     if run is None:
         return _Outcome("missing", f"run {key} is not in the store")
-    return _Outcome("finished", results=(_Opened(key, run.entry.commit or None, run),))
+    return _Outcome("finished", results=(run,))
 
 
 def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:
@@ -118,8 +104,7 @@ def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSour
     metrics = {metric_of(each, row) for each in columns if each.metric is not None}
     if len(metrics) != 1 or not all(map(is_counted, columns)) or column.mean is not None:
         return None  # a mean, or the difference of two different scores
-    asked = (evaluation_of(each, table) for each in columns)
-    paths = tuple(OWN if each is None else each.path for each in asked)
+    paths = tuple(counts_path(each, table) for each in columns)
     # Of the runs of the row those that the value is a mean of: all of them, see the check above.
     keys = cell.keys if cell.seeds == len(cell.keys) else ()
     return (CountsSource(keys, paths, table.absent), metrics.pop()) if keys else None
@@ -142,10 +127,8 @@ def _value(table: Table, row: Row, column: Column, run: ReportRun | None) -> flo
         each = [_value(table, row, side, run) for side in _sides(table, column)]
         found = derived(column, ["" if value is None else value for value in each])
         return None if isinstance(found, str) else found
-    evaluation = evaluation_of(column, table)
-    path = OWN if evaluation is None else evaluation.path
     try:
-        counts = counts_of(run, path)
+        counts = run.counts(counts_path(column, table))
         return value(metric_of(column, row), counts, table.absent or counts.absent)
     except InputError:  # the reason stands in the cell
         return None

@@ -16,12 +16,13 @@ from analysis.report.runs import percent_scores
 from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import cell_of
 from analysis.report.tables_files import RecordedCell, RecordedTable
-from analysis.report.tables_intervals import OWN, CountsSource, Intervals
+from analysis.report.tables_intervals import CountsSource, Intervals
 from analysis.report.tables_scored import RescoredTable, asked_of, score_again, values_of
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.randomness import numpy_generator
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import TABLE, counts_of, files_of
 from tests.analysis.report.test_collect_parts import run_of, stored
@@ -51,7 +52,7 @@ def test_variances_of_parts_are_no_percent() -> None:
 @pytest.mark.parametrize("absent", ["released", "exclude"])
 def test_intervals_score_absent_classes_as_the_table_does(absent: Any) -> None:
     runs = {f"k{seed}": run_of({}, seed, without_a_class(seed)) for seed in range(2)}
-    intervals, source = Intervals(runs), CountsSource(tuple(runs), (OWN,), absent)
+    intervals, source = Intervals(runs), CountsSource(tuple(runs), (OWN_COUNTS,), absent)
     intervals.ask(source, "mIoU")
     intervals.compute(200, quiet)
     counts = [without_a_class(seed) for seed in range(2)]
@@ -71,7 +72,7 @@ def test_differences_score_absent_classes_as_the_runs_do() -> None:
     entries = difference_entries([run for side in sides for run in side], 200, quiet)
     effect = next(each.effect for each in entries if each.topic == choice.topic)
     expected = compare(
-        *([run.counts for run in side if run.counts] for side in sides),
+        *([run.counts() for run in side] for side in sides),
         metrics=["mIoU"],
         settings=Resampling(resamples=200, absent="exclude"),
     ).differences[0]

@@ -71,7 +71,7 @@ def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) 
     )
     return ReportRun(
         entry=entry,
-        counts=counts or counts_of(seed),
+        test_counts=counts or counts_of(seed),
         absent="released",
         config={"seed": seed, **config},
         files=RunFiles(()),
