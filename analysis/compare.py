@@ -19,7 +19,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from analysis.results import Stored
+    from analysis.results import NamedCounts
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent
@@ -243,12 +243,12 @@ def remark(settings: Resampling) -> str:
 
 
 def _counts(
-    opened: Sequence[tuple[Stored, ...]], missing: str
+    opened: Sequence[tuple[NamedCounts, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
     from analysis.uncertainty.images import common
     from rgbt.tracking.terminal import tell
 
-    methods = [[stored.counts for stored in each] for each in opened]
+    methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
     if shared:
         raise InputError(f"a and b both hold {min(shared)}; a method is compared with another one.")
@@ -280,15 +280,13 @@ def _check_given(options: Options) -> None:
             )
 
 
-def _labels(opened: Sequence[tuple[Stored, ...]]) -> list[str]:
+def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
     """Labels that differ: what the methods are called, else with their seeds."""
     from analysis.results import label_of
 
     labels = [label_of(each) for each in opened]
     if labels[0] == labels[1]:
-        seeds = [
-            sorted(stored.seed for stored in each if stored.seed is not None) for each in opened
-        ]
+        seeds = [sorted(named.seed for named in each if named.seed is not None) for each in opened]
         labels = [
             f"{label} seed {', '.join(map(str, s))}"
             for label, s in zip(labels, seeds, strict=True)

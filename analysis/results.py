@@ -14,40 +14,46 @@ from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
 from rgbt.spec.naming import GROUP, group_of
-from rgbt.tracking.folder import Description, RunFolder, find_run, runs_in
+from rgbt.tracking.folder import Description, find_run, runs_in
+from rgbt.tracking.run_result import RunResult
 from rgbt.tracking.terminal import tell
 
 SEED = "rgbt.seed"
 
 RUNS = "runs, files of counts or a group"
-"""What is listed, for messages."""
+"""What a list may hold, for messages."""
 
 Frames = Literal["", "aligned", "released", "next"]
 """Counts of single frames, or of pairs of frames by one protocol."""
 
 
 @dataclass(frozen=True)
-class Stored:
-    """Counts with where they come from.
+class NamedCounts:
+    """Counts of a run or of a file, under the name that tables show.
 
     Attributes:
-        label: what they are called in tables.
-        key: config key of the run; "" for a file.
-        seed: of the run; None for a file.
+        label: of the method.
         path: of the counts.
         counts: the counts.
+        run: the run that they are of; None for a file.
+        seed: of the run; None for a file.
     """
 
     label: str
-    key: str
-    seed: int | None
     path: Path
     counts: Counts
+    run: RunResult | None = None
+    seed: int | None = None
+
+    @property
+    def key(self) -> str:
+        """Config key of the run; "" for a file."""
+        return "" if self.run is None else self.run.key
 
 
 def open_counts(
     text: str, runs_dir: Path | str = "runs", split: str = "", frames: Frames = ""
-) -> tuple[Stored, ...]:
+) -> tuple[NamedCounts, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
@@ -67,44 +73,44 @@ def open_counts(
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
     is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
     words = [text] if is_whole else split_list(text, RUNS)
-    found = [stored for word in words for stored in _open(word, root, split, frames)]
-    for stored in found:
-        _check_asked_for(stored, split, frames)
-    paths = [stored.path for stored in found]
+    found = [each for word in words for each in _open(word, root, split, frames)]
+    for each in found:
+        _check_split_and_frames(each, split, frames)
+    paths = [each.path for each in found]
     for path in paths:
         if paths.count(path) > 1:
             raise InputError(f"'{text}' names {path} twice; one training counts once.")
     _check_trainings_differ(text, found)
-    labels = dict.fromkeys(stored.label for stored in found)
+    labels = dict.fromkeys(each.label for each in found)
     if len(labels) > 1:
         tell(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
     return tuple(found)
 
 
-def _check_asked_for(stored: Stored, split: str, frames: Frames) -> None:
-    counts = stored.counts
+def _check_split_and_frames(named: NamedCounts, split: str, frames: Frames) -> None:
+    counts = named.counts
     if split and counts.split != split:
         raise InputError(
-            f"{stored.path} is of split '{counts.split}', but split={split} was asked for; leave "
-            "split= out, or name counts of that split."
+            f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
+            "or name counts of that split."
         )
     if frames and protocol_of(counts.partition) != frames:
         raise InputError(
-            f"{stored.path} is by {counts.partition}, but frames={frames} was asked for; leave "
-            "frames= out, or name a run or what python -m rgbt.consistency run=... counted so."
+            f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
+            "or name a run or what python -m rgbt.consistency run=... counted so."
         )
 
 
-def _check_trainings_differ(text: str, found: Sequence[Stored]) -> None:
+def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
     """One seed twice, or equal counts, are no two trainings and would make a method look sure."""
     for first, second in combinations(found, 2):
         is_again = (first.label, first.seed) == (second.label, second.seed)
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in what their overrides do not say); name the runs."
+                f"{second.key}, which differ in settings beside their overrides); name the runs."
             )
-        is_one = first.label == second.label or not (first.key and second.key)
+        is_one = first.label == second.label or not (first.run and second.run)
         if is_one and np.array_equal(first.counts.counts, second.counts.counts):
             raise InputError(
                 f"'{text}': {first.path} and {second.path} hold the same counts; one training "
@@ -114,16 +120,16 @@ def _check_trainings_differ(text: str, found: Sequence[Stored]) -> None:
 
 def groups_in(runs_dir: Path | str) -> list[str]:
     """Names of all groups with finished runs in a folder."""
-    runs = [run for run in _runs(Path(runs_dir)) if run.result() is not None]
-    return sorted({_groups(run)[0] for run in runs} - {""})
+    runs = [run for run in _runs(Path(runs_dir)) if run.is_finished]
+    return sorted({_groups(_description(run))[0] for run in runs} - {""})
 
 
-def label_of(stored: tuple[Stored, ...]) -> str:
+def label_of(counts: Sequence[NamedCounts]) -> str:
     """What a method is called: its group, or all that its counts are called."""
-    return " + ".join(dict.fromkeys(each.label for each in stored))
+    return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
-def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[Stored]:
+def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCounts]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
         return [_of_file(path)]
@@ -141,7 +147,7 @@ def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[Stored]
             f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
             f"counts (.npz){known}."
         ) from error
-    return [_of_run(RunFolder(folder), split, frames)]
+    return [_of_run(RunResult(folder), split, frames)]
 
 
 def _is_folder(path: Path) -> bool:
@@ -151,7 +157,7 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
-def _of_scores(folder: Path) -> Stored:
+def _of_scores(folder: Path) -> NamedCounts:
     """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
     files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
     if not files:
@@ -166,77 +172,71 @@ def _of_scores(folder: Path) -> Stored:
     return _of_file(files[0])
 
 
-def _of_file(path: Path) -> Stored:
+def _of_file(path: Path) -> NamedCounts:
     """A file of counts, called like its folder where its own name says only what it holds."""
     path = path.resolve()
     folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
     label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem
-    return Stored(label, "", None, path, Counts.load(path))
+    return NamedCounts(label, path, Counts.load(path))
 
 
-def _of_group(word: str, runs_dir: Path) -> list[RunFolder]:
+def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
     runs = _runs(runs_dir)
-    return [run for run in runs if word in _groups(run) and run.result() is not None]
+    return [run for run in runs if word in _groups(_description(run)) and run.is_finished]
 
 
-def _runs(runs_dir: Path) -> list[RunFolder]:
-    return runs_in(runs_dir) if runs_dir.is_dir() else []
+def _runs(runs_dir: Path) -> list[RunResult]:
+    return [RunResult(run.path) for run in runs_in(runs_dir)] if runs_dir.is_dir() else []
 
 
-def _of_run(run: RunFolder, split: str, frames: Frames) -> Stored:
+def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
     path = _pairs_of_frames(run, split, frames) if frames else _single_frames(run, split)
-    if run.result() is None:
-        tell(f"{run.path} is not finished; its counts are of a training that goes on.")
-    seed = _tag(run, SEED)
-    return Stored(
-        label=_groups(run)[0] or run.path.name,
-        key=run.path.name,
-        seed=int(seed) if seed else None,
+    if not run.is_finished:
+        tell(f"{run.folder} is not finished; its counts are those of its last evaluation.")
+    description = _description(run)
+    seed = description.tags.get(SEED, "")
+    return NamedCounts(
+        label=_groups(description)[0] or run.key,
         path=path,
         counts=Counts.load(path),
+        run=run,
+        seed=int(seed) if seed else None,
     )
 
 
-def _single_frames(run: RunFolder, split: str) -> Path:
+def _single_frames(run: RunResult, split: str) -> Path:
     path = run.counts_path(split)
     if not path.is_file():
-        there = [each.stem.removeprefix("counts_") for each in run.path.glob("counts_*.npz")]
+        there = [each.stem.removeprefix("counts_") for each in run.folder.glob("counts_*.npz")]
         raise InputError(
-            f"{run.path} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
-            f"'{split}'; python -m rgbt.evaluate run={run.path} split={split} out={path} makes "
+            f"{run.folder} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
+            f"'{split}'; python -m rgbt.evaluate run={run.folder} split={split} out={path} makes "
             "them once it is finished."
         )
     return path
 
 
-def _pairs_of_frames(run: RunFolder, split: str, protocol: Protocol) -> Path:
-    path = run.path / file_name(protocol, split)
+def _pairs_of_frames(run: RunResult, split: str, protocol: Protocol) -> Path:
+    path = run.folder / file_name(protocol, split)
     if not path.is_file():
         frames = "next" if protocol == "next" else "virtual"
         raise InputError(
-            f"{run.path} has no counts of pairs of frames {path.relative_to(run.path)}; python -m "
-            f"rgbt.consistency run={run.path} split={split} frames={frames} makes them once it is "
-            "finished."
+            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
+            f"python -m rgbt.consistency run={run.folder} split={split} frames={frames} makes them "
+            "once it is finished."
         )
     return path
 
 
-def _groups(run: RunFolder) -> tuple[str, str]:
+def _groups(description: Description) -> tuple[str, str]:
     """The run's group as it is written now, and as the run wrote it: commands may name either."""
-    description = _description(run)
-    if description is None:
-        return "", ""
-    return group_of(description.tags, description.params), description.tags.get(GROUP, "")
+    tags = description.tags
+    return group_of(tags, description.params), tags.get(GROUP, "")
 
 
-def _tag(run: RunFolder, name: str) -> str:
-    description = _description(run)
-    return "" if description is None else description.tags.get(name, "")
-
-
-def _description(run: RunFolder) -> Description | None:
+def _description(run: RunResult) -> Description:
     try:
-        return run.description()
+        return run.description
     except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
-        return None
+        return Description("", {}, {})

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from analysis.results import RUNS, Stored, open_counts
+from analysis.results import RUNS, NamedCounts, open_counts
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
@@ -81,23 +81,23 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
         if (place / f"{CLEAN}.json").is_file():
             found.append(Training(place.name, place, levels_of(place)))
             continue
-        for stored in open_counts(word, runs_dir, split):
-            place = folder_of(stored)
-            found.append(Training(stored.label, place, levels_of(place)))
+        for named in open_counts(word, runs_dir, split):
+            place = folder_of(named)
+            found.append(Training(named.label, place, levels_of(place)))
     return found
 
 
-def folder_of(stored: Stored) -> Path:
+def folder_of(named: NamedCounts) -> Path:
     """Folder of the counts of a run's corrupted images.
 
     Raises:
         InputError: it is no run, or was not measured.
     """
-    folder = stored.path.parent / FOLDER / stored.counts.split
-    if not stored.key or not folder.is_dir():
-        what = f"{stored.path} is no run" if not stored.key else f"{folder} is not there"
-        split = "" if stored.counts.split == "test" else f" split={stored.counts.split}"
-        run = stored.path.parent if stored.key else "..."
+    folder = named.path.parent / FOLDER / named.counts.split
+    if not named.key or not folder.is_dir():
+        what = f"{named.path} is no run" if not named.key else f"{folder} is not there"
+        split = "" if named.counts.split == "test" else f" split={named.counts.split}"
+        run = named.path.parent if named.key else "..."
         raise InputError(f"{what}; python -m rgbt.robustness run={run}{split} makes the counts.")
     return folder
 
@@ -121,22 +121,24 @@ def _place(level: Level) -> tuple[bool, bool, str, str, float]:
     return (level.row != CLEAN, level.unit != "", level.title, level.row, level.severity)
 
 
-def under(stored: Sequence[Stored], corruption: str, severity: str) -> tuple[Stored, ...]:
+def under(
+    trained: Sequence[NamedCounts], corruption: str, severity: str
+) -> tuple[NamedCounts, ...]:
     """The same trainings on corrupted images.
 
     Args:
-        stored: runs.
+        trained: runs.
         corruption: as it was measured, e.g. "noise:rgb", or a row such as "features-thermal".
         severity: as text; "" where the row has one alone.
 
     Raises:
         InputError: no runs, not measured, or measured at other severities.
     """
-    return tuple(_under(each, row_name(corruption), severity) for each in stored)
+    return tuple(_under(each, row_name(corruption), severity) for each in trained)
 
 
-def _under(stored: Stored, row: str, severity: str) -> Stored:
-    folder = folder_of(stored)
+def _under(named: NamedCounts, row: str, severity: str) -> NamedCounts:
+    folder = folder_of(named)
     levels = levels_of(folder)
     of_row = [level for level in levels if level.row == row]
     if not of_row:
@@ -151,7 +153,7 @@ def _under(stored: Stored, row: str, severity: str) -> Stored:
         )
     (level,) = chosen
     path = folder / f"{level.mark}.npz"
-    return replace(stored, path=path, counts=level.counts)
+    return replace(named, path=path, counts=level.counts)
 
 
 def _level(path: Path) -> Level:

@@ -23,10 +23,10 @@ from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
-    from analysis.predictions.scoring import Options as Counting
-    from analysis.predictions.scoring import Scored
-    from analysis.predictions.table import Cell, ScoreTable
-    from analysis.results import Stored
+    from analysis.predictions.scoring import FolderScores
+    from analysis.predictions.scoring import ScoringOptions as Counting
+    from analysis.predictions.table import ScoreKey, ScoreTable
+    from analysis.results import NamedCounts
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
 
@@ -46,7 +46,7 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 
 
 @dataclass(frozen=True)
-class Options:
+class ScoringOptions:
     """What is scored, and how."""
 
     predictions: Annotated[
@@ -116,7 +116,7 @@ class Options:
         return f"predictions={folder} split={self.split or 'test'}"
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: ScoringOptions, overrides: list[str]) -> int:
     """Score predictions of any method by region, class, day and night, with intervals.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
@@ -173,7 +173,7 @@ def score_tables(
     return tables
 
 
-def write_counts(scored: Scored, out: Path) -> None:
+def write_counts(scored: FolderScores, out: Path) -> None:
     """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
     from rgbt.tracking.terminal import tell
 
@@ -230,7 +230,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
         show(place_lines(places))
 
 
-def _scored(options: Options, overrides: list[str]) -> Scored:
+def _scored(options: ScoringOptions, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import score_folder
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
@@ -240,9 +240,9 @@ def _scored(options: Options, overrides: list[str]) -> Scored:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _counting(options: Options) -> Counting:
+def _counting(options: ScoringOptions) -> Counting:
     from analysis.predictions.scoring import PARTITIONS
-    from analysis.predictions.scoring import Options as Counting
+    from analysis.predictions.scoring import ScoringOptions as Counting
 
     return Counting(
         partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
@@ -256,11 +256,11 @@ def _counting(options: Options) -> Counting:
     )
 
 
-def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored(options: ScoringOptions, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import tell
 
-    default = Options()
+    default = ScoringOptions()
     without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]
     without_effect += [word.partition("=")[0] for word in overrides]
     if without_effect:
@@ -273,19 +273,19 @@ def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
         "stored counts hold one partition and no map by pixel; for the others write predictions "
         "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
     )
-    labels = [stored.label for stored in found]
+    labels = [each.label for each in found]
     return [
-        (stored.label if labels.count(stored.label) == 1 else _told_apart(stored), stored.counts)
-        for stored in found
+        (each.label if labels.count(each.label) == 1 else _distinct_label(each), each.counts)
+        for each in found
     ]
 
 
-def _told_apart(stored: Stored) -> str:
+def _distinct_label(named: NamedCounts) -> str:
     """A label of its own for one of several of one name."""
-    return str(stored.path) if stored.seed is None else f"{stored.label} seed {stored.seed}"
+    return str(named.path) if named.seed is None else f"{named.label} seed {named.seed}"
 
 
-def _resampling(options: Options) -> Resampling | None:
+def _resampling(options: ScoringOptions) -> Resampling | None:
     from analysis.uncertainty import Resampling
 
     if options.resamples == 0:
@@ -298,7 +298,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     from analysis.predictions.table import interval_cells, with_intervals
     from analysis.uncertainty import estimate
 
-    found: dict[Cell, tuple[float, float]] = {}
+    found: dict[ScoreKey, tuple[float, float]] = {}
     drawn: dict[str, str] = {}
     reason = ""
     for absent, part in product(table.conventions(), table.num_images):
@@ -329,7 +329,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     return with_intervals(table, found, said)
 
 
-entry = PlainCommand(Options, main, heeds=("dataset",))
+entry = PlainCommand(ScoringOptions, main, heeds=("dataset",))
 
 if __name__ == "__main__":
     entry()

@@ -20,9 +20,10 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.regions import MAX_REGIONS
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
-    from analysis.statistics.collect import DataSet, Settings
+    from analysis.statistics.collect import MeasurementSettings
     from analysis.statistics.data import SpatialStatistics
     from analysis.statistics.judging import Claim
+    from rgbt.dataset import LabelledDataset
     from rgbt.metrics.metric import Regions
 
 
@@ -97,10 +98,12 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def _settings(options: Options, overrides: list[str]) -> tuple[Settings, DataSet]:
-    from analysis.statistics.collect import Settings
+def _settings(
+    options: Options, overrides: list[str]
+) -> tuple[MeasurementSettings, LabelledDataset]:
+    from analysis.statistics.collect import MeasurementSettings
 
-    settings = Settings(
+    settings = MeasurementSettings(
         regions=_regions(options),
         kernel=options.kernel,
         workers=options.workers,
@@ -123,7 +126,9 @@ def _regions(options: Options) -> Regions:
     )
 
 
-def _collect(dataset: DataSet, split: str, settings: Settings) -> SpatialStatistics:
+def _collect(
+    dataset: LabelledDataset, split: str, settings: MeasurementSettings
+) -> SpatialStatistics:
     from analysis.statistics.collect import collect
     from rgbt.tracking.terminal import tell
 

@@ -25,8 +25,8 @@ from sweeps.worker.storage import JOURNAL, load_study, open_storage, storage_fil
 if TYPE_CHECKING:
     import optuna
 
-    from rgbt.tracking.mlflow_store import Link, Tracking
     from rgbt.tracking.tables import Grid
+    from rgbt.tracking.tracker import Link, Tracking
     from sweeps.report.figures import StudyFigure
     from sweeps.report.study_data import Importances, StudyData
 

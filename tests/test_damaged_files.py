@@ -215,10 +215,10 @@ def read_label(path: Path) -> Any:
 
 
 def read_prediction(path: Path) -> Any:
-    from analysis.predictions.images import Reader
+    from analysis.predictions.images import PredictionReader
 
     palette = tuple((n, 2 * n, 3 * n) for n in range(5))
-    return plain(Reader(tuple("abcde"), palette, "index").read(path))
+    return plain(PredictionReader(tuple("abcde"), palette, "index").read(path))
 
 
 def label_array(folder: Path) -> Path:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analysis.figures.style import COLOURS, COLUMN, SMALL, log_axis, new_figure, region_axis, styled
 from analysis.statistics.data import MODALITIES, SpatialStatistics
 from analysis.statistics.derive import AVERAGES, region_laplacian, region_snr, snr_of
-from analysis.statistics.resampling import Blocks
+from analysis.statistics.resampling import ConsecutiveBlocks
 from rgbt.checks import check_choice
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class RegionSeries:
     is_log: bool
 
 
-def laplacian_series(statistics: SpatialStatistics, blocks: Blocks) -> RegionSeries:
+def laplacian_series(statistics: SpatialStatistics, blocks: ConsecutiveBlocks) -> RegionSeries:
     """Laplacian variance by region (SpatialSeg, Eq. 3 and Fig. 5), mean over images.
 
     Args:
@@ -74,7 +74,7 @@ def laplacian_series(statistics: SpatialStatistics, blocks: Blocks) -> RegionSer
 
 
 def snr_series(
-    statistics: SpatialStatistics, blocks: Blocks, estimator: str, average: str
+    statistics: SpatialStatistics, blocks: ConsecutiveBlocks, estimator: str, average: str
 ) -> RegionSeries:
     """Signal-to-noise ratio by region (SpatialSeg, Eq. 4 and Fig. 6).
 
@@ -102,7 +102,7 @@ def snr_series(
     return _made(f"signal-to-noise ratio ({estimator})", statistics, values, bands)
 
 
-def _band(blocks: Blocks, drawn: Floats, part: str) -> Floats:
+def _band(blocks: ConsecutiveBlocks, drawn: Floats, part: str) -> Floats:
     """(2, R) ends of the intervals of (1 + B, R) resampled values; NaN where there are none."""
     found = [blocks.interval(each, part, level=LEVEL, scale="ratio") for each in drawn.T]
     return np.array([[each.low for each in found], [each.high for each in found]])

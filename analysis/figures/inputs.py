@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Given:
+class FigureInput:
     """The arguments of one figure.
 
     Attributes:
@@ -215,10 +215,10 @@ class Given:
         return stored
 
     def _measured(self) -> SpatialStatistics:
-        from analysis.statistics.collect import Settings, collect
+        from analysis.statistics.collect import MeasurementSettings, collect
 
         split = self.get("split", "train")
-        settings = Settings(regions=self.regions)
+        settings = MeasurementSettings(regions=self.regions)
         with progress("measuring", len(self.dataset.names(split))) as advance:
             return collect(self.dataset, split, settings, advance)
 
@@ -238,8 +238,8 @@ class Given:
         found: dict[str, list[Counts]] = {}
         for word in split_list(self.need("runs", what), what):
             label, colon, place = word.partition(":")
-            for stored in open_counts(place if colon else label, runs_dir, split, frames):
-                found.setdefault(label if colon else stored.label, []).append(stored.counts)
+            for named in open_counts(place if colon else label, runs_dir, split, frames):
+                found.setdefault(label if colon else named.label, []).append(named.counts)
         check_same_images(found)
         return found
 

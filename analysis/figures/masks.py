@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,9 @@ from analysis.figures.style import PAGE, new_figure, pack, show_image, styled
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
-    import torch
     from matplotlib.figure import Figure
-    from torch import Tensor
 
-    from rgbt.types import Sample
+    from rgbt.types import Masker, Sample
 
 PATCHES = (8, 16, 32, 64)
 """Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b)."""
@@ -28,23 +26,6 @@ STRIDE = 32
 
 HIDDEN = (150, 190, 230)
 """Colour of a hidden pixel: a grey one would be lost in a thermal image."""
-
-
-class MaskPair(NamedTuple):
-    """Cells (B, h, w) that are hidden, as a masker returns them."""
-
-    rgb: Tensor
-    thermal: Tensor
-
-
-class DrawsMasks(Protocol):
-    """A masker, see `rgbt.types.Masker`."""
-
-    def __call__(
-        self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
-    ) -> MaskPair:
-        """Cells of RGB and of thermal that are hidden."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +59,7 @@ def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
 
 
 def mask_examples(
-    sample: Sample, maskers: Mapping[str, DrawsMasks], multiple: int, seed: int
+    sample: Sample, maskers: Mapping[str, Masker], multiple: int, seed: int
 ) -> tuple[MaskExample, ...]:
     """The pair under each mask.
 

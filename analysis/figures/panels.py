@@ -53,7 +53,7 @@ LAYOUTS = ("rows", "columns")
 
 
 @dataclass(frozen=True)
-class Row:
+class PanelRow:
     """One image of a panel.
 
     Attributes:
@@ -75,7 +75,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Panel:
+class QualitativePanel:
     """A qualitative figure.
 
     Attributes:
@@ -87,7 +87,7 @@ class Panel:
     """
 
     methods: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[PanelRow, ...]
     classes: tuple[str, ...]
     palette: Labels
     box: tuple[slice, slice]
@@ -104,7 +104,7 @@ def panel(
     methods: Mapping[str, ReadPrediction],
     names: Sequence[str],
     regions: Regions,
-) -> Panel:
+) -> QualitativePanel:
     """The pictures of a panel.
 
     Args:
@@ -127,7 +127,7 @@ def panel(
         )
     height, width = samples[0].thermal.shape
     scored = scored_classes(dataset.classes, dataset.unscored)
-    return Panel(
+    return QualitativePanel(
         methods=tuple(methods),
         rows=tuple(_row(sample, methods, scored) for sample in samples),
         classes=tuple(dataset.classes),
@@ -136,7 +136,9 @@ def panel(
     )
 
 
-def _row(sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[np.bool_]) -> Row:
+def _row(
+    sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[np.bool_]
+) -> PanelRow:
     if sample.label is None:
         raise InputError(f"names: '{sample.name}' has no label; choose images that are labelled.")
     predictions = {label: read(sample.name) for label, read in methods.items()}
@@ -144,7 +146,7 @@ def _row(sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[
         check_size(sample.name, label, sample.label, prediction)
     whole = RegionCounter(len(scored), WHOLE)
     matrices = [whole(sample.label, each).sum(0) for each in predictions.values()]
-    return Row(
+    return PanelRow(
         name=sample.name,
         rgb=sample.rgb,
         thermal=sample.thermal,
@@ -191,7 +193,7 @@ def most_different(
 
 
 @styled
-def draw(data: Panel, layout: str = "rows") -> Figure:
+def draw(data: QualitativePanel, layout: str = "rows") -> Figure:
     """Pictures with a white box on the centre; below them the classes.
 
     Args:
@@ -222,7 +224,7 @@ def draw(data: Panel, layout: str = "rows") -> Figure:
     return figure
 
 
-def _draw_row(axes: Sequence[Axes], row: Row, data: Panel) -> None:
+def _draw_row(axes: Sequence[Axes], row: PanelRow, data: QualitativePanel) -> None:
     from matplotlib.patches import Rectangle
 
     from rgbt.tracking.pictures import colours

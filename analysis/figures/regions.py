@@ -37,7 +37,7 @@ NUMBER_WIDTH = 0.3
 
 
 @dataclass(frozen=True)
-class RegionHeat:
+class MethodHeatMaps:
     """Methods whose regions are painted in one scale.
 
     Attributes:
@@ -57,7 +57,7 @@ class RegionHeat:
         return np.asarray(self.profiles[index].means[self.region_map], np.float64)
 
 
-def region_heat(profiles: Sequence[Profile], image_hw: tuple[int, int]) -> RegionHeat:
+def region_heat(profiles: Sequence[Profile], image_hw: tuple[int, int]) -> MethodHeatMaps:
     """Heat maps of several methods with one scale, so that colours can be compared.
 
     Args:
@@ -72,7 +72,7 @@ def region_heat(profiles: Sequence[Profile], image_hw: tuple[int, int]) -> Regio
     check_one_partition(profiles)
     low, high = colour_limits([mean / 100 for each in profiles for mean in each.means.tolist()])
     region_map = map_of(profiles[0].partition, image_hw)
-    return RegionHeat(tuple(profiles), region_map, low, high)
+    return MethodHeatMaps(tuple(profiles), region_map, low, high)
 
 
 def staircase(region_map: NDArray[np.uint8], step: int) -> list[tuple[int, int] | None]:
@@ -96,7 +96,7 @@ def staircase(region_map: NDArray[np.uint8], step: int) -> list[tuple[int, int] 
 
 
 @styled
-def draw_heat(heat: RegionHeat) -> Figure:
+def draw_heat(heat: MethodHeatMaps) -> Figure:
     """One map per method with the mIoU of each region written into it."""
     height, width = heat.region_map.shape
     columns = 2 if len(heat.profiles) == 4 else min(ABREAST, len(heat.profiles))

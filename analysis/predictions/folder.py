@@ -20,7 +20,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True)
-class Found:
+class PredictionFiles:
     """Files of a split.
 
     Attributes:
@@ -36,7 +36,7 @@ class Found:
 
 def find(
     folder: Path, dataset: LabelledDataset, split: str, suffix: str, missing: Missing
-) -> Found:
+) -> PredictionFiles:
     """The predictions of a split: files NAME + `suffix` + ".png".
 
     Args:
@@ -65,7 +65,7 @@ def find(
             "with missing=leave_out."
         )
     own = {f"{name}{suffix}" for name in names} | {f"{name}{OVERLAY}" for name in names}
-    return Found(there, absent, tuple(sorted(stems - own)))
+    return PredictionFiles(there, absent, tuple(sorted(stems - own)))
 
 
 def listed(names: tuple[str, ...]) -> str:

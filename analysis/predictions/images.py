@@ -84,7 +84,7 @@ def check_one_kind(paths: Iterable[Path]) -> None:
         )
 
 
-class Reader:
+class PredictionReader:
     """Reads predictions in terms of the classes of a data set.
 
     Args:

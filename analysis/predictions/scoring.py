@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.predictions.folder import Found, Missing, find
-from analysis.predictions.images import Array, Format, Reader, check_one_kind
+from analysis.predictions.folder import Missing, PredictionFiles, find
+from analysis.predictions.images import Array, Format, PredictionReader, check_one_kind
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
 from rgbt.dataset import LabelledDataset
@@ -32,13 +32,13 @@ PARTITIONS: tuple[Partition, ...] = get_args(Partition)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ScoringOptions:
     """How a folder of predictions is counted.
 
     Attributes:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
-        form: how files are read, see `analysis.predictions.images.Reader`.
+        form: how files are read, see `analysis.predictions.images.PredictionReader`.
         missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
             label the "nearest" one of the prediction (by pixel centres).
@@ -68,12 +68,12 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Scored:
+class FolderScores:
     """What a folder of predictions gave.
 
     Attributes:
         name: of the method.
-        counts: one per partition, in the order of `Options.partitions`.
+        counts: one per partition, in the order of `ScoringOptions.partitions`.
         maps: counts by pixel; None where the images differ in size.
         found: which files were read, which are missing, which belong to no image.
         resized: names of images whose prediction had another size.
@@ -82,7 +82,7 @@ class Scored:
     name: str
     counts: tuple[Counts, ...]
     maps: PixelMaps | None
-    found: Found
+    found: PredictionFiles
     resized: tuple[str, ...]
 
 
@@ -90,9 +90,9 @@ def score_folder(
     folder: Path,
     dataset: LabelledDataset,
     split: str,
-    options: Options = Options(),  # noqa: B008 - frozen
+    options: ScoringOptions = ScoringOptions(),  # noqa: B008 - frozen
     advance: Callable[[], None] = lambda: None,
-) -> Scored:
+) -> FolderScores:
     """Count predicted label images of any method against the labels of a split.
 
     The same files give the same counts whatever the number of threads. Memory: the counts, the
@@ -102,7 +102,7 @@ def score_folder(
         folder: holds NAME.png for every image of the split; other files are not read.
         dataset: names, labels, classes and colours.
         split: of the data set.
-        options: see `Options`.
+        options: see `ScoringOptions`.
         advance: called after each image.
 
     Raises:
@@ -112,7 +112,7 @@ def score_folder(
     found = find(folder, dataset, split, options.suffix, options.missing)
     if options.form == "auto":
         check_one_kind(found.paths.values())
-    counting = _Counting(dataset, options)
+    counting = _CountingPass(dataset, options)
     names = tuple(found.paths)
     size = (len(options.partitions), len(names), options.regions, *[dataset.num_classes] * 2)
     counts = np.zeros(size, np.int32)
@@ -123,7 +123,7 @@ def score_folder(
             resized.append(names[index])
         advance()
     fingerprint, name = dataset.fingerprint(), options.name or folder.resolve().name
-    return Scored(
+    return FolderScores(
         name=name,
         counts=tuple(
             Counts(
@@ -145,13 +145,13 @@ def score_folder(
     )
 
 
-class _Counting:
+class _CountingPass:
     """The state of one pass, shared by its threads."""
 
-    def __init__(self, dataset: LabelledDataset, options: Options) -> None:
+    def __init__(self, dataset: LabelledDataset, options: ScoringOptions) -> None:
         self.dataset = dataset
         self.options = options
-        self.reader = Reader(dataset.classes, dataset.palette, options.form)
+        self.reader = PredictionReader(dataset.classes, dataset.palette, options.form)
         self.counters = [
             RegionCounter(dataset.num_classes, _regions(partition, options.regions))
             for partition in options.partitions
@@ -160,7 +160,7 @@ class _Counting:
         self._sizes: set[tuple[int, ...]] = set()
         self._lock = threading.Lock()
 
-    def run(self, found: Found) -> Iterator[tuple[NDArray[np.int64], bool]]:
+    def run(self, found: PredictionFiles) -> Iterator[tuple[NDArray[np.int64], bool]]:
         """Counts (partitions, R, K, K) and whether it was resized, of every image in order."""
         threads = self.options.threads or os.cpu_count() or 1
         with ThreadPoolExecutor(threads) as pool:

@@ -20,7 +20,7 @@ Metric = Literal["IoU", "Acc", "Var"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class ScoreKey:
     """What a score is of: two scores of a table differ in one of these.
 
     Attributes:
@@ -91,7 +91,7 @@ class ScoreTable:
     regions: int
     classes: tuple[str, ...]
     num_images: Mapping[str, int]
-    scores: Mapping[Cell, Score]
+    scores: Mapping[ScoreKey, Score]
     intervals: str = ""
     unscored: tuple[str, ...] = ()
     absent: Absent = "released"
@@ -139,7 +139,7 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
         cell: Score(value)
         for images, subset in parts.items()
         for absent in CONVENTIONS
-        for cell, value in _scores(subset, Cell(images=images, absent=absent))
+        for cell, value in _scores(subset, ScoreKey(images=images, absent=absent))
     }
     return ScoreTable(
         name=name,
@@ -154,23 +154,23 @@ def score_table(counts: Counts, name: str) -> ScoreTable:
     )
 
 
-def interval_cells(table: ScoreTable, absent: Absent) -> dict[str, dict[str, Cell]]:
+def interval_cells(table: ScoreTable, absent: Absent) -> dict[str, dict[str, ScoreKey]]:
     """The cells that are given intervals: mIoU, that of each region, and Var.
 
     Returns:
         part of the images -> metric name -> cell.
     """
     regions = (None, *range(1, table.regions + 1))
-    found: dict[str, dict[str, Cell]] = {}
+    found: dict[str, dict[str, ScoreKey]] = {}
     for images in table.num_images:
-        plain = (*(Cell(region=region) for region in regions), Cell(metric="Var"))
+        plain = (*(ScoreKey(region=region) for region in regions), ScoreKey(metric="Var"))
         cells = [replace(cell, images=images, absent=absent) for cell in plain]
         found[images] = {str(cell.metric_name): cell for cell in cells}
     return found
 
 
 def with_intervals(
-    table: ScoreTable, intervals: Mapping[Cell, tuple[float, float]], said: str
+    table: ScoreTable, intervals: Mapping[ScoreKey, tuple[float, float]], said: str
 ) -> ScoreTable:
     """The table with the given intervals.
 
@@ -185,7 +185,7 @@ def with_intervals(
     return replace(table, scores=scores, intervals=said)
 
 
-def _scores(counts: Counts, base: Cell) -> Iterator[tuple[Cell, float]]:
+def _scores(counts: Counts, base: ScoreKey) -> Iterator[tuple[ScoreKey, float]]:
     by_region, scored = counts.by_region(), counts.scored
     matrices = np.concatenate([by_region, by_region.sum(0, keepdims=True)])
     regions: list[int | None] = [*range(1, len(by_region) + 1), None]

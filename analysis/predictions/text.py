@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from analysis.predictions.folder import listed
-from analysis.predictions.scoring import Scored
-from analysis.predictions.table import ALL, Cell, Metric, Score, ScoreTable
+from analysis.predictions.scoring import FolderScores
+from analysis.predictions.table import ALL, Metric, Score, ScoreKey, ScoreTable
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
 from rgbt.tracking.csv_files import csv_text
@@ -39,7 +39,7 @@ def region_grid(table: ScoreTable) -> Grid:
     for name, metric in means:
         conventions = table.conventions(metric)
         for absent in conventions:
-            scores = _by_region(table, Cell(metric=metric, absent=absent))
+            scores = _by_region(table, ScoreKey(metric=metric, absent=absent))
             rows.append((f"{name}{_ending(absent, conventions)}", *scores))
     title = f"{_title(table)}: mIoU, mAcc and IoU of each class by region"
     return Grid(title, _header(table), (*rows, *_class_rows(table, "IoU")))
@@ -59,7 +59,7 @@ def part_grid(table: ScoreTable) -> Grid:
     rows = []
     for images, num_images in table.num_images.items():
         for absent in conventions:
-            cell = Cell(images=images, absent=absent)
+            cell = ScoreKey(images=images, absent=absent)
             cells = [cell, replace(cell, metric="Var"), replace(cell, metric="Acc")]
             cells += [replace(cell, region=region) for region in numbers]
             label = f"{images} ({num_images}){_ending(absent, conventions)}"
@@ -92,7 +92,7 @@ def convention_line(table: ScoreTable) -> str:
     )
 
 
-def remarks_on(scored: Scored) -> list[str]:
+def remarks_on(scored: FolderScores) -> list[str]:
     """What a reader of the numbers has to know about the folder, one sentence each."""
     found, remarks = scored.found, []
     if found.missing:
@@ -156,14 +156,14 @@ def _header(table: ScoreTable) -> tuple[str, ...]:
 
 def _class_rows(table: ScoreTable, metric: Metric) -> tuple[tuple[str, ...], ...]:
     """Absent classes as "-"; `convention_line` says how they count."""
-    cell = Cell(metric=metric, absent="exclude")
+    cell = ScoreKey(metric=metric, absent="exclude")
     labelled = zip(class_labels(table.classes, table.unscored), table.classes, strict=True)
     return tuple(
         (label, *_by_region(table, replace(cell, class_name=name))) for label, name in labelled
     )
 
 
-def _by_region(table: ScoreTable, cell: Cell) -> list[str]:
+def _by_region(table: ScoreTable, cell: ScoreKey) -> list[str]:
     cells = [replace(cell, region=region) for region in (*range(1, table.regions + 1), None)]
     return [_with_interval(table.scores[each]) for each in cells]
 

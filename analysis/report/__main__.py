@@ -61,7 +61,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from analysis.report.collect import Asked, collect
+    from analysis.report.collect import ReportRequest, collect
     from analysis.report.page import write_page
     from rgbt.tracking.provenance import command_line
     from rgbt.tracking.terminal import place_lines, show, tell
@@ -72,7 +72,7 @@ def main(options: Options, overrides: list[str]) -> int:
         def track(items: Sequence[Any], what: str) -> Any:
             return progress.track(items, description=what)
 
-        data = collect(Asked(tracking, runs_dir, options.resamples, typed, trust), track)
+        data = collect(ReportRequest(tracking, runs_dir, options.resamples, typed, trust), track)
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
     for remark in data.remarks[:TOLD]:

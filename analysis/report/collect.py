@@ -11,20 +11,21 @@ from pathlib import Path
 from analysis.report.data import ReportData
 from analysis.report.differences import difference_entries
 from analysis.report.masks import mask_pictures
-from analysis.report.runs import Run, open_run
-from analysis.report.store import StoredRun, read_store
+from analysis.report.runs import ReportRun, open_run
+from analysis.report.store import MlflowRun, read_store
 from analysis.report.studies import study_entries
 from analysis.report.tables import table_entries
 from analysis.report.tables_intervals import Track
-from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced import TAG as REPLACED_TAG
+from rgbt.tracking.tracker import Tracking
 
 TITLE = "RGB-thermal segmentation: runs and tables"
 
 
 @dataclass(frozen=True)
-class Asked:
+class ReportRequest:
     """What the page is made from.
 
     Attributes:
@@ -42,7 +43,7 @@ class Asked:
     trust: tuple[str, ...] = ()
 
 
-def collect(asked: Asked, track: Track) -> ReportData:
+def collect(asked: ReportRequest, track: Track) -> ReportData:
     """Read the store; what cannot be read becomes a remark.
 
     Args:
@@ -85,9 +86,9 @@ def collect(asked: Asked, track: Track) -> ReportData:
     )
 
 
-def _open_all(stored: Sequence[StoredRun], track: Track, remarks: list[str]) -> list[Run]:
+def _open_all(stored: Sequence[MlflowRun], track: Track, remarks: list[str]) -> list[ReportRun]:
     """The runs, newest first; one that the store has twice is taken once."""
-    runs: dict[str, Run] = {}
+    runs: dict[str, ReportRun] = {}
     for each in track([one for one in stored if one.kind == "run"], "runs"):
         key = each.tags.get("rgbt.key", each.run_id)
         known = runs.get(key)

@@ -221,7 +221,7 @@ class DifferenceEntry:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
+class PagePicture:
     """A picture inside the page: title, caption, data address ("data:image/png;base64,...")."""
 
     title: str
@@ -257,7 +257,7 @@ class ReportData:
     runs: tuple[RunEntry, ...]
     tables: tuple[TableEntry, ...]
     studies: tuple[StudyEntry, ...]
-    masks: tuple[Picture, ...]
+    masks: tuple[PagePicture, ...]
     differences: tuple[DifferenceEntry, ...]
     remarks: tuple[str, ...] = field(default=())
     silent: tuple[str, ...] = NOT_IN_KEY

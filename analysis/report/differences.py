@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.report.data import DifferenceEntry
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.report.tables_intervals import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
 from rgbt.checks import InputError
@@ -56,11 +56,11 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Pair:
+class PairedRuns:
     """Runs that differ by one choice and their seeds alone."""
 
-    paper: tuple[Run, ...]
-    released: tuple[Run, ...]
+    paper: tuple[ReportRun, ...]
+    released: tuple[ReportRun, ...]
 
 
 def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
@@ -78,7 +78,7 @@ def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
 
 
 def difference_entries(
-    runs: Iterable[Run], resamples: int, track: Track
+    runs: Iterable[ReportRun], resamples: int, track: Track
 ) -> tuple[DifferenceEntry, ...]:
     """Every difference with its effect.
 
@@ -87,7 +87,7 @@ def difference_entries(
         resamples: of the images, for intervals and p-values.
         track: shows how far it is.
     """
-    scored = [run for run in runs if run.counts is not None and run.config]
+    scored = [run for run in runs if run.test_counts is not None and run.config]
     settings = Resampling(resamples=resamples)
     return tuple(
         _entry(choice, find_pairs(choice, scored), settings)
@@ -95,17 +95,17 @@ def difference_entries(
     )
 
 
-def find_pairs(choice: Choice, runs: Iterable[Run]) -> list[Pair]:
+def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
     """Runs that differ by `choice` alone, those with the most seeds first."""
     keys = {*choice.paper.values, *choice.released.values}
-    groups: dict[str, tuple[list[Run], list[Run]]] = {}
+    groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
     for run in runs:
         sides = [_is_side(run.config, side) for side in (choice.paper, choice.released)]
         if any(sides):
             group = groups.setdefault(_rest(run, keys), ([], []))
             group[sides.index(True)].append(run)
     pairs = [
-        Pair(_by_seed(paper), _by_seed(released))
+        PairedRuns(_by_seed(paper), _by_seed(released))
         for paper, released in groups.values()
         if paper and released
     ]
@@ -118,16 +118,16 @@ def _is_side(config: Mapping[str, Any], side: Side) -> bool:
     )
 
 
-def _rest(run: Run, keys: set[str]) -> str:
+def _rest(run: ReportRun, keys: set[str]) -> str:
     """All else that makes the run what it is: configuration and images."""
-    assert run.counts is not None, "only runs with counts are compared"
+    assert run.test_counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
     same = {
         key: _number(value)
         for key, value in run.config.items()
         if key not in keys and not any(key == out or key.startswith(f"{out}.") for out in left_out)
     }
-    images = [run.counts.dataset, run.counts.partition, run.counts.split]
+    images = [run.test_counts.dataset, run.test_counts.partition, run.test_counts.split]
     return json.dumps([images, same], sort_keys=True, default=str)
 
 
@@ -136,11 +136,11 @@ def _number(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def _by_seed(runs: Sequence[Run]) -> tuple[Run, ...]:
+def _by_seed(runs: Sequence[ReportRun]) -> tuple[ReportRun, ...]:
     return tuple(sorted(runs, key=lambda run: (run.entry.seed is None, run.entry.seed or 0)))
 
 
-def _entry(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> DifferenceEntry:
+def _entry(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> DifferenceEntry:
     runs = [run.entry.key for pair in pairs[:1] for run in (*pair.paper, *pair.released)]
     return DifferenceEntry(
         topic=choice.topic,
@@ -152,7 +152,7 @@ def _entry(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> Diffe
     )
 
 
-def _effect(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> str:
+def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> str:
     if choice.released.setting is None:
         return "Cannot be compared: one side alone can be run."
     if not pairs:
@@ -168,11 +168,11 @@ def _effect(choice: Choice, pairs: Sequence[Pair], settings: Resampling) -> str:
     return sentence(best, compared) + more
 
 
-def _counts(runs: Sequence[Run]) -> list[Any]:
-    return [run.counts for run in runs]
+def _counts(runs: Sequence[ReportRun]) -> list[Any]:
+    return [run.counts() for run in runs]
 
 
-def sentence(pair: Pair, compared: Comparison) -> str:
+def sentence(pair: PairedRuns, compared: Comparison) -> str:
     """Released less paper in every score, with intervals and p-values."""
     counts = (len(pair.released), len(pair.paper))
     over = "images and seeds" if all(each.both for each in compared.differences) else "images"

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.report.data import Picture
-from analysis.report.runs import Run
+from analysis.report.data import PagePicture
+from analysis.report.runs import ReportRun
 from analysis.report.tables_intervals import Track
 from rgbt.checks import InputError
 from rgbt.config.stored_config import check_targets
@@ -35,7 +35,7 @@ SETTINGS = ("sampler", "patch_size", "ratio", "sigma_div", "anchor", "pairing")
 
 
 @dataclass(frozen=True)
-class Masked:
+class MaskerInUse:
     """A masker in use.
 
     Attributes:
@@ -52,8 +52,8 @@ class Masked:
 
 
 def mask_pictures(
-    runs: Iterable[Run], track: Track, remarks: list[str], trust: Collection[str] = ()
-) -> tuple[Picture, ...]:
+    runs: Iterable[ReportRun], track: Track, remarks: list[str], trust: Collection[str] = ()
+) -> tuple[PagePicture, ...]:
     """One picture per masker that hides anything, those of the most runs first.
 
     Args:
@@ -74,15 +74,15 @@ def mask_pictures(
     return tuple(pictures)
 
 
-def maskers_in_use(runs: Iterable[Run]) -> list[Masked]:
+def maskers_in_use(runs: Iterable[ReportRun]) -> list[MaskerInUse]:
     """Distinct maskers, those of the most runs first."""
-    found: dict[str, list[tuple[Run, Mapping[str, Any], Mapping[str, Any]]]] = {}
+    found: dict[str, list[tuple[ReportRun, Mapping[str, Any], Mapping[str, Any]]]] = {}
     for run in runs:
         masker, dataset = (_node(run.config, name) for name in ("masker", "dataset"))
         if masker and dataset and masker.get("sampler") != "none":
             found.setdefault(json.dumps(masker, sort_keys=True), []).append((run, masker, dataset))
     maskers = [
-        Masked(
+        MaskerInUse(
             masker=users[0][1],
             dataset=users[0][2],
             groups=tuple(dict.fromkeys(run.entry.group for run, _, _ in users)),
@@ -100,7 +100,7 @@ def _node(config: Mapping[str, Any], name: str) -> dict[str, Any]:
     }
 
 
-def picture(masked: Masked, remarks: list[str], trust: Collection[str] = ()) -> Picture:
+def picture(masked: MaskerInUse, remarks: list[str], trust: Collection[str] = ()) -> PagePicture:
     """Draws of one masker: RGB above, thermal below, hidden pixels coloured.
 
     Raises:
@@ -130,7 +130,7 @@ def picture(masked: Masked, remarks: list[str], trust: Collection[str] = ()) -> 
     chosen = ", ".join(
         f"{name} {masked.masker[name]}" for name in SETTINGS if masked.masker.get(name) is not None
     )
-    return Picture(
+    return PagePicture(
         title=masked.groups[0],
         caption=(
             f"{chosen}; {masked.runs} run{'s' * (masked.runs > 1)}. {DRAWS} draws on {source}, RGB "

@@ -12,25 +12,24 @@ import numpy as np
 
 from analysis.report.data import RunEntry
 from analysis.report.runs_provenance import (
-    COMMIT_LENGTH,
     COMMIT_TAG,
     as_text,
-    commit_of,
     host_of,
     read_provenance,
     repeat_command,
 )
-from analysis.report.store import Files, StoredRun
+from analysis.report.store import MlflowRun, RunFiles
 from rgbt.checks import InputError, check_choice
 from rgbt.config.stored_config import settings_of
 from rgbt.files.yaml_files import parse_yaml
-from rgbt.metrics import names
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
-from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.percent import in_percent
+from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG
 
 SPLIT = "test"
@@ -42,67 +41,81 @@ ROUNDING = 0.0051
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
-    """A run, opened.
+class ReportRun:
+    """A training of the store with its scores and settings, as the report uses it.
 
     Attributes:
         entry: what the page shows.
-        counts: of the test split; None where there are none.
+        test_counts: that the run ended with; None where there are none.
         absent: how the run scores a class without pixels.
         config: dotted key -> value; empty where the store has no configuration.
         files: its files.
     """
 
     entry: RunEntry
-    counts: Counts | None
+    test_counts: Counts | None
     absent: Absent
     config: Mapping[str, Any]
-    files: Files
+    files: RunFiles
     _evaluations: dict[str, Counts] = field(default_factory=dict)
 
-    def counts_of(self, path: str) -> Counts:
-        """Counts of another evaluation, by the path of their file in the run.
+    @property
+    def key(self) -> str:
+        """Its config key."""
+        return self.entry.key
+
+    @property
+    def commit(self) -> str | None:
+        """Git commit of the code that made it."""
+        return self.entry.commit or None
+
+    def counts(self, path: str = OWN_COUNTS) -> Counts:
+        """Counts of an evaluation, by the path of their file in the run.
 
         Raises:
             InputError: there is no such file, or it is damaged.
         """
+        if path == OWN_COUNTS:
+            if self.test_counts is None:
+                raise InputError(f"run {self.key} has no counts.")
+            return self.test_counts
         if path not in self._evaluations:
             found = self.files.find(path)
             if found is None:
-                raise InputError(f"run {self.entry.key} has no {path}.")
-            self._evaluations[path] = _load(found, self.entry.key)
+                raise InputError(f"run {self.key} has no {path}.")
+            self._evaluations[path] = _load(found, self.key)
         return self._evaluations[path]
 
 
-def open_run(stored: StoredRun, remarks: list[str]) -> Run:
+def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
     """Read one run.
 
     Args:
-        stored: of the kind "run".
+        run: of the kind "run".
         remarks: gets a sentence for everything that is missing or does not agree.
     """
-    key = stored.tags.get("rgbt.key", stored.run_id)
-    config = _config(stored, remarks)
-    counts = _counts(stored, key, remarks)
+    key = run.tags.get("rgbt.key", run.run_id)
+    config = _config(run, remarks)
+    counts = _counts(run, key, remarks)
     counted = "released" if counts is None else counts.absent
     absent = cast("Absent", config.get("metric.absent", counted))
     scores = {} if counts is None else percent_scores(counts, absent)
-    remarks += _disagreements(key, stored.metrics, scores)
-    processes = read_provenance(stored.files, key, remarks)
+    remarks += _disagreements(key, run.metrics, scores)
+    processes = read_provenance(run.files, key, remarks)
     first = processes[0] if processes else {}
-    command = without_passwords(str(first.get("command") or stored.tags.get("rgbt.command", "")))
-    group = group_of(stored.tags, stored.params)
+    command = without_passwords(str(first.get("command") or run.tags.get("rgbt.command", "")))
+    group = group_of(run.tags, run.params)
     entry = RunEntry(
         key=key,
-        name=stored.name,
-        run_id=stored.run_id,
-        status=stored.status,
-        experiment=stored.tags.get("rgbt.experiment", ""),
+        name=run.name,
+        run_id=run.run_id,
+        status=run.status,
+        experiment=run.tags.get("rgbt.experiment", ""),
         scale=_scale(group),
-        seed=_seed(stored.tags.get("rgbt.seed", "")),
+        seed=_seed(run.tags.get("rgbt.seed", "")),
         group=group,
-        studies=tuple(_after(stored.tags, STUDY_TAG)),
-        table_rows=_after(stored.tags, TAG),
+        studies=tuple(_after(run.tags, STUDY_TAG)),
+        table_rows=_after(run.tags, TAG),
         split=SPLIT if counts is None else counts.split,
         partition="" if counts is None else counts.partition,
         classes=() if counts is None else counts.classes,
@@ -112,27 +125,26 @@ def open_run(stored: StoredRun, remarks: list[str]) -> Run:
         region_ious=() if counts is None else _by_region(counts, absent),
         class_region_ious=() if counts is None else _by_class(counts, absent),
         images=0 if counts is None else len(counts.names),
-        commit=commit_of(first) or stored.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
-        started=stored.started,
-        seconds=stored.seconds,
+        commit=commit_of(first) or run.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
+        started=run.started,
+        seconds=run.seconds,
         command=command,
-        repeat=repeat_command(command, config, stored.tags),
+        repeat=repeat_command(command, config, run.tags),
         host=host_of(first),
-        dataset=stored.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
-        config={name: as_text(value) for name, value in config.items()} or dict(stored.params),
+        dataset=run.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
+        config={name: as_text(value) for name, value in config.items()} or dict(run.params),
     )
-    return Run(entry=entry, counts=counts, absent=absent, config=config, files=stored.files)
+    return ReportRun(entry=entry, test_counts=counts, absent=absent, config=config, files=run.files)
 
 
 def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:
     """`rgbt.metrics.scores.summary` in percent; variances stay in squared percent points."""
-    scores = summary(counts, absent)
-    return {n: v if n.split("/")[-1] == names.VAR else 100.0 * v for n, v in scores.items()}
+    return {name: in_percent(name, score) for name, score in summary(counts, absent).items()}
 
 
-def _config(stored: StoredRun, remarks: list[str]) -> dict[str, Any]:
+def _config(run: MlflowRun, remarks: list[str]) -> dict[str, Any]:
     try:
-        text = stored.files.text("config.yaml")
+        text = run.files.text("config.yaml")
         if text is None:
             raise InputError("there is none")
         settings = dict(_leaves(settings_of(parse_yaml(text, "it"), "it"), ""))
@@ -141,7 +153,7 @@ def _config(stored: StoredRun, remarks: list[str]) -> dict[str, Any]:
     except InputError as error:
         said = " ".join(str(error).split()).rstrip(".")
         remarks.append(
-            f"Run '{stored.name}': config.yaml cannot be read ({said}); its parameters are shown."
+            f"Run '{run.name}': config.yaml cannot be read ({said}); its parameters are shown."
         )
         return {}
 
@@ -155,17 +167,16 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield from _leaves(child, f"{path}.{key}" if path else str(key))
 
 
-def _counts(stored: StoredRun, key: str, remarks: list[str]) -> Counts | None:
-    path = f"counts_{SPLIT}.npz"
+def _counts(run: MlflowRun, key: str, remarks: list[str]) -> Counts | None:
     try:
-        found = stored.files.find(path)
+        found = run.files.find(OWN_COUNTS)
         if found is not None:
             return _load(found, key)
     except InputError as error:
-        remarks.append(f"Run '{stored.name}' has no scores: {error}")
+        remarks.append(f"Run '{run.name}' has no scores: {error}")
         return None
-    if stored.status == "FINISHED":
-        remarks.append(f"Run '{stored.name}' has no scores: its {path} is not in the store.")
+    if run.status == "FINISHED":
+        remarks.append(f"Run '{run.name}' has no scores: its {OWN_COUNTS} is not in the store.")
     return None
 
 
@@ -178,19 +189,19 @@ def _load(path: Any, key: str) -> Counts:
 
 
 def _disagreements(
-    key: str, told: Mapping[str, float], scores: Mapping[str, float]
+    key: str, logged: Mapping[str, float], scores: Mapping[str, float]
 ) -> Iterator[str]:
     """A sentence where MLflow shows other scores than the counts give."""
     apart = {
-        name: abs(told[name] - score)
+        name: abs(logged[name] - score)
         for name, score in scores.items()
-        if name in told and not math.isnan(score) and abs(told[name] - score) > ROUNDING
+        if name in logged and not math.isnan(score) and abs(logged[name] - score) > ROUNDING
     }
     if apart:
         worst = max(apart, key=lambda name: apart[name])
         yield (
             f"Run {key}: {len(apart)} scores of its counts are not those in MLflow, such as "
-            f"{worst}: {scores[worst]:.2f}, there {told[worst]:.2f}; the page shows the counts'."
+            f"{worst}: {scores[worst]:.2f}, there {logged[worst]:.2f}; the page shows the counts'."
         )
 
 

@@ -8,12 +8,11 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-from analysis.report.store import Files
+from analysis.report.store import RunFiles
 from rgbt.checks import InputError
 from rgbt.tracking.formats import read_provenance as provenance_of
-from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.provenance import commit_of, without_passwords
 
-COMMIT_LENGTH = 10
 COMMIT_TAG = "mlflow.source.git.commit"
 
 NOT_REPEATED = re.compile(r"-m|--multirun|runs_dir=|out=|fresh=|\+*(tracking|hydra)[./=]")
@@ -69,7 +68,7 @@ def as_text(value: Any) -> str:
     return without_passwords(text)
 
 
-def read_provenance(files: Files, key: str, remarks: list[str]) -> list[dict[str, Any]]:
+def read_provenance(files: RunFiles, key: str, remarks: list[str]) -> list[dict[str, Any]]:
     """What every process that worked on a run noted, first one first; [] where nothing is known.
 
     Args:
@@ -85,15 +84,9 @@ def read_provenance(files: Files, key: str, remarks: list[str]) -> list[dict[str
         return []
     commits = dict.fromkeys(commit_of(process) for process in processes)
     if len(commits) > 1:
-        told = ", then ".join(commit or "no commit" for commit in commits)
-        remarks.append(f"Run {key} was begun and continued by different code: {told}.")
+        named = ", then ".join(commit or "no commit" for commit in commits)
+        remarks.append(f"Run {key} was begun and continued by different code: {named}.")
     return processes
-
-
-def commit_of(process: Mapping[str, Any]) -> str:
-    """Git commit of a process, "+" after it for uncommitted changes; "" where there is none."""
-    commit = process.get("git_commit")
-    return f"{commit[:COMMIT_LENGTH]}{'+' if process.get('git_dirty') else ''}" if commit else ""
 
 
 def host_of(process: Mapping[str, Any]) -> str:

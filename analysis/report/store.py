@@ -13,12 +13,14 @@ from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.files.budgets import TEXT, read_bytes
+from rgbt.tracking.formats import read_result
 from rgbt.tracking.mlflow_client import ENVIRONMENT
-from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.tracker import Tracking
 
 PAGE = 500
-"""Runs asked for at a time."""
+"""Runs of one request."""
 
 MOST_FETCHED = 200_000_000
 """Bytes of a file that is copied from a server; larger ones are not read."""
@@ -28,7 +30,7 @@ REASON_LENGTH = 160
 
 
 @dataclass
-class Files:
+class RunFiles:
     """Files of one MLflow run: in folders that can be read from here, else fetched from the store.
 
     Attributes:
@@ -53,7 +55,11 @@ class Files:
         if self.fetch is None:
             return None
         if path not in self._fetched:
-            self._fetched[path] = _guarded(lambda: self._ask(path), f"'{path}' cannot be fetched")
+            try:
+                self._fetched[path] = self.fetch(path)
+            except Exception as error:  # The border to a store that may fail in any way.
+                said = f"'{path}' cannot be fetched from the store ({_reason(error)})."
+                raise InputError(said) from error
         return self._fetched[path]
 
     def text(self, path: str) -> str | None:
@@ -70,13 +76,9 @@ class Files:
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{found} cannot be read ({error}).") from error
 
-    def _ask(self, path: str) -> Path | None:
-        assert self.fetch is not None, "find() looks for it first"
-        return self.fetch(path)
-
 
 @dataclass(frozen=True, kw_only=True)
-class StoredRun:
+class MlflowRun:
     """One run of MLflow: a training, or the record of a table or study.
 
     Attributes:
@@ -99,7 +101,7 @@ class StoredRun:
     tags: Mapping[str, str]
     params: Mapping[str, str]
     metrics: Mapping[str, float]
-    files: Files
+    files: RunFiles
 
     @property
     def kind(self) -> str:
@@ -107,7 +109,7 @@ class StoredRun:
         return self.tags.get("kind", "run")
 
 
-def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[StoredRun]:
+def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowRun]:
     """Everything in the experiment of a store, newest first.
 
     Args:
@@ -150,8 +152,8 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[StoredR
             f"MLflow at {shown} cannot be read ({_reason(error)}); start its server if it "
             "has one, or name another store with tracking.uri=..."
         ) from error
-    places = _Places(client, runs_dir, copies, _beside(uri))
-    return [_stored(run, places) for run in runs]
+    finder = _FileFinder(client, runs_dir, copies, _beside(uri))
+    return [_mlflow_run(run, finder) for run in runs]
 
 
 def _check_exists(uri: str) -> None:
@@ -185,7 +187,7 @@ def _all_runs(client: Any, experiment_id: str) -> Iterator[Any]:
 
 
 @dataclass(frozen=True)
-class _Places:
+class _FileFinder:
     """Where files of runs may lie.
 
     Attributes:
@@ -200,7 +202,7 @@ class _Places:
     copies: Path
     beside: Path | None
 
-    def files(self, run: Any) -> Files:
+    def files(self, run: Any) -> RunFiles:
         """The files of an MLflow run."""
         run_id, tags = run.info.run_id, run.data.tags
         folders = [
@@ -210,8 +212,8 @@ class _Places:
             folders.append(self.beside / run_id / "artifacts")
         address = urlparse(run.info.artifact_uri or "")
         if address.scheme in ("", "file"):
-            return Files((*folders, Path(unquote(address.path))))
-        return Files(folders, lambda path: self._fetch(run_id, path))
+            return RunFiles((*folders, Path(unquote(address.path))))
+        return RunFiles(folders, lambda path: self._fetch(run_id, path))
 
     def _run_folders(self, tags: Mapping[str, str]) -> Iterator[Path]:
         if "rgbt.key" in tags:
@@ -233,9 +235,7 @@ class _Places:
 
 
 def _is_same(folder: Path, tags: Mapping[str, str], status: str) -> bool:
-    """Whether a run folder holds what MLflow tells: the same configuration on the same images."""
-    from rgbt.tracking.formats import read_result
-
+    """Whether a run folder holds what MLflow shows: the same configuration on the same images."""
     try:
         result = read_result(folder)
     except InputError:
@@ -245,9 +245,9 @@ def _is_same(folder: Path, tags: Mapping[str, str], status: str) -> bool:
     return tags.get("rgbt.dataset", "") in ("", result.get("dataset"))
 
 
-def _stored(run: Any, places: _Places) -> StoredRun:
+def _mlflow_run(run: Any, finder: _FileFinder) -> MlflowRun:
     start, end = run.info.start_time, run.info.end_time
-    return StoredRun(
+    return MlflowRun(
         run_id=run.info.run_id,
         name=str(run.info.run_name or ""),
         status=str(run.info.status),
@@ -256,7 +256,7 @@ def _stored(run: Any, places: _Places) -> StoredRun:
         tags={name: without_passwords(value) for name, value in run.data.tags.items()},
         params={name: without_passwords(value) for name, value in run.data.params.items()},
         metrics=dict(run.data.metrics),
-        files=places.files(run),
+        files=finder.files(run),
     )
 
 
@@ -264,14 +264,6 @@ def _iso(milliseconds: int | None) -> str:
     if not milliseconds:
         return ""
     return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="seconds")
-
-
-def _guarded(work: Callable[[], Path | None], said: str) -> Path | None:
-    """What `work` on the store answers; what it raises becomes a sentence."""
-    try:
-        return work()
-    except Exception as error:  # The border to a store that may fail in any way.
-        raise InputError(f"{said} from the store ({_reason(error)}).") from error
 
 
 def _reason(error: Exception) -> str:

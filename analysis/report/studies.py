@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from analysis.report.data import StudyEntry, TrialEntry
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from rgbt.checks import InputError
 from rgbt.tracking.csv_files import read_csv
 from rgbt.tracking.provenance import without_passwords
@@ -25,7 +25,7 @@ FIGURES = re.compile(r"\n## [^\n]*\n\n!\[", re.MULTILINE)
 """Where the figures of a report begin; they are files of their own and not part of the page."""
 
 
-def study_entries(records: Sequence[StoredRun], remarks: list[str]) -> tuple[StudyEntry, ...]:
+def study_entries(records: Sequence[MlflowRun], remarks: list[str]) -> tuple[StudyEntry, ...]:
     """All studies of the store, by name.
 
     Args:
@@ -33,22 +33,22 @@ def study_entries(records: Sequence[StoredRun], remarks: list[str]) -> tuple[Stu
         remarks: gets a sentence for each that cannot be read.
     """
     found = []
-    for stored in records:
+    for record in records:
         try:
-            found.append(read_study(stored))
+            found.append(read_study(record))
         except InputError as error:
             remarks.append(str(error))
     return tuple(sorted(found, key=lambda each: each.name))
 
 
-def read_study(stored: StoredRun) -> StudyEntry:
+def read_study(record: MlflowRun) -> StudyEntry:
     """Read the record of a study.
 
     Raises:
         InputError: a file is missing or damaged.
     """
-    name = stored.tags.get("rgbt.study", stored.name)
-    note = stored.files.text(MARKDOWN_FILE) or stored.tags.get("mlflow.note.content", "")
+    name = record.tags.get("rgbt.study", record.name)
+    note = record.files.text(MARKDOWN_FILE) or record.tags.get("mlflow.note.content", "")
     head = OBJECTIVES.search(note)
     if head is None:
         raise InputError(
@@ -58,7 +58,7 @@ def read_study(stored: StoredRun) -> StudyEntry:
     wanted = [found for text in head.group(2).split(", ") if (found := OBJECTIVE.fullmatch(text))]
     objectives = tuple(each.group(2) for each in wanted)
     maximize = tuple(each.group(1) == "highest" for each in wanted)
-    text = stored.files.text(TRIALS_FILE)
+    text = record.files.text(TRIALS_FILE)
     if text is None:
         raise InputError(
             f"study '{name}' has no {TRIALS_FILE} in the store; "
@@ -67,7 +67,7 @@ def read_study(stored: StoredRun) -> StudyEntry:
     begun = BEGUN.search(note)
     return StudyEntry(
         name=name,
-        kind=stored.tags.get("rgbt.study.kind", head.group(1)),
+        kind=record.tags.get("rgbt.study.kind", head.group(1)),
         objectives=objectives,
         maximize=maximize,
         trials=_trials(text, name, objectives, maximize),

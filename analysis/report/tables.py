@@ -7,18 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.report.data import CellEntry, TableEntry
-from analysis.report.runs import Run
-from analysis.report.store import StoredRun
+from analysis.report.runs import ReportRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import as_recorded, cell_of, printed_cell
 from analysis.report.tables_files import (
     DEFAULT_SEEDS,
-    NOTHING,
-    Recorded,
+    NO_CELL,
+    RecordedTable,
     read_recorded,
     reproduce_command,
 )
 from analysis.report.tables_intervals import Intervals, Track
-from analysis.report.tables_scored import Draft, asked_of, changed, score_again
+from analysis.report.tables_scored import RescoredTable, asked_of, changed, score_again
 from rgbt.checks import InputError
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
@@ -27,8 +27,8 @@ from sweeps.table.table import Table
 
 
 def table_entries(
-    records: Sequence[StoredRun],
-    runs: Mapping[str, Run],
+    records: Sequence[MlflowRun],
+    runs: Mapping[str, ReportRun],
     resamples: int,
     track: Track,
     remarks: list[str],
@@ -45,7 +45,7 @@ def table_entries(
     files = _load_all(track, remarks)
     recorded = _read_all(records, remarks)
     drafts = {
-        index: Draft(each, score_again(each, files[each.name], runs))
+        index: RescoredTable(each, score_again(each, files[each.name], runs))
         for index, each in enumerate(recorded)
         if each.name in files
     }
@@ -74,17 +74,17 @@ def _load_all(track: Track, remarks: list[str]) -> dict[str, Table]:
     return files
 
 
-def _read_all(records: Sequence[StoredRun], remarks: list[str]) -> list[Recorded]:
+def _read_all(records: Sequence[MlflowRun], remarks: list[str]) -> list[RecordedTable]:
     found = []
-    for stored in records:
+    for record in records:
         try:
-            found.append(read_recorded(stored))
+            found.append(read_recorded(record))
         except InputError as error:
             remarks.append(str(error))
     return sorted(found, key=lambda each: (each.name, each.scale, each.extra))
 
 
-def _ask(draft: Draft, intervals: Intervals) -> None:
+def _ask(draft: RescoredTable, intervals: Intervals) -> None:
     table = draft.scored.table
     for row in table.rows:
         for column in table.columns:
@@ -93,7 +93,7 @@ def _ask(draft: Draft, intervals: Intervals) -> None:
                 intervals.ask(*asked)
 
 
-def _entry(draft: Draft, intervals: Intervals, remarks: list[str]) -> TableEntry:
+def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> TableEntry:
     recorded, scored = draft.recorded, draft.scored
     table = scored.table
     gone = [label for label in recorded.rows() if label not in {row.label for row in table.rows}]
@@ -133,7 +133,7 @@ def _notes(table: Table) -> tuple[str, ...]:
     return (*needed, *table.remarks, *columns, *rows)
 
 
-def _command(recorded: Recorded) -> str:
+def _command(recorded: RecordedTable) -> str:
     seeds = recorded.seeds or DEFAULT_SEEDS
     return reproduce_command(recorded.name, seeds, recorded.scale or DEFAULT_SCALE, recorded.extra)
 
@@ -171,10 +171,10 @@ def _laid_out(name: str, table: Table, **others: Any) -> TableEntry:
     )
 
 
-def _without_file(recorded: Recorded) -> TableEntry:
+def _without_file(recorded: RecordedTable) -> TableEntry:
     """A recorded table whose file is gone: as recorded, without intervals."""
     rows, columns = recorded.rows(), recorded.columns()
-    lines = [[recorded.lines.get((row, column), NOTHING) for column in columns] for row in rows]
+    lines = [[recorded.lines.get((row, column), NO_CELL) for column in columns] for row in rows]
     return TableEntry(
         name=recorded.name,
         paper=recorded.name.rpartition("/")[0],

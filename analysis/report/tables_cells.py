@@ -6,20 +6,20 @@ import math
 from dataclasses import replace
 
 from analysis.report.data import CellEntry
-from analysis.report.tables_files import NOTHING, Line
+from analysis.report.tables_files import NO_CELL, RecordedCell
 from analysis.report.tables_intervals import Intervals
-from analysis.report.tables_scored import Draft, asked_of, values_of
+from analysis.report.tables_scored import RescoredTable, asked_of, values_of
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
 NOT_HERE = "counts of some runs are not in the store; the value is as recorded, without interval."
 
 
-def cell_of(draft: Draft, row: Row, column: Column, intervals: Intervals) -> CellEntry:
+def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals) -> CellEntry:
     """One cell of a table that was run; `intervals` have been computed."""
     scored, place = draft.scored, (row.label, column.name)
     plain = printed_cell(scored, row, column)
-    line, cell = draft.recorded.lines.get(place, NOTHING), scored.cells.get(place)
+    line, cell = draft.recorded.lines.get(place, NO_CELL), scored.cells.get(place)
     if cell is None or cell.seeds < line.seeds:
         values = values_of(draft, row, column, intervals.runs)
         return replace(as_recorded(plain, line), values=values)
@@ -57,7 +57,7 @@ def printed_cell(scored: ScoredTable, row: Row, column: Column) -> CellEntry:
     )
 
 
-def as_recorded(plain: CellEntry, line: Line) -> CellEntry:
+def as_recorded(plain: CellEntry, line: RecordedCell) -> CellEntry:
     """A cell whose runs have no counts here."""
     if line.mean is None:
         return replace(plain, reason=line.reason or plain.reason, runs=line.keys)

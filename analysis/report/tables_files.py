@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from rgbt.checks import InputError
 from rgbt.tracking.csv_files import read_csv
 
@@ -25,7 +25,7 @@ DEFAULT_SEEDS = (0, 1, 2)
 
 
 @dataclass(frozen=True)
-class Line:
+class RecordedCell:
     """One cell as it was recorded; None where there was nothing."""
 
     mean: float | None
@@ -36,11 +36,11 @@ class Line:
     keys: tuple[str, ...]
 
 
-NOTHING = Line(None, None, 0, None, "", ())
+NO_CELL = RecordedCell(None, None, 0, None, "", ())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded:
+class RecordedTable:
     """A table that was run.
 
     Attributes:
@@ -56,7 +56,7 @@ class Recorded:
     name: str
     scale: str
     seeds: tuple[int, ...]
-    lines: Mapping[tuple[str, str], Line]
+    lines: Mapping[tuple[str, str], RecordedCell]
     remarks: tuple[str, ...] = ()
     extra: str = ""
     orders: Mapping[str, float]
@@ -75,30 +75,30 @@ class Recorded:
         return tuple(dict.fromkeys(keys))
 
 
-def read_recorded(stored: StoredRun) -> Recorded:
+def read_recorded(record: MlflowRun) -> RecordedTable:
     """Read the record of a table.
 
     Raises:
         InputError: its CSV is missing or damaged.
     """
-    text = stored.files.text(CSV_FILE)
+    text = record.files.text(CSV_FILE)
     if text is None:
-        raise InputError(f"table '{stored.name}' has no {CSV_FILE} in the store; run it again.")
-    below = _remarks(stored.files.text(MARKDOWN_FILE) or "")
+        raise InputError(f"table '{record.name}' has no {CSV_FILE} in the store; run it again.")
+    below = _remarks(record.files.text(MARKDOWN_FILE) or "")
     extra = [found.group(1) for line in below if (found := EXTRA.fullmatch(line))]
-    orders = {n.removeprefix("order/"): v for n, v in stored.metrics.items() if "order/" in n}
-    return Recorded(
-        name=stored.tags.get("rgbt.table", stored.name),
-        scale=stored.tags.get("rgbt.scale", ""),
-        seeds=tuple(int(seed) for seed in re.findall(r"\d+", stored.tags.get("rgbt.seeds", ""))),
-        lines=_lines(text, stored.name),
+    orders = {n.removeprefix("order/"): v for n, v in record.metrics.items() if "order/" in n}
+    return RecordedTable(
+        name=record.tags.get("rgbt.table", record.name),
+        scale=record.tags.get("rgbt.scale", ""),
+        seeds=tuple(int(seed) for seed in re.findall(r"\d+", record.tags.get("rgbt.seeds", ""))),
+        lines=_lines(text, record.name),
         remarks=tuple(below),
         extra=extra[0] if extra else "",
         orders=orders,
     )
 
 
-def _lines(text: str, name: str) -> dict[tuple[str, str], Line]:
+def _lines(text: str, name: str) -> dict[tuple[str, str], RecordedCell]:
     header, lines = read_csv(text)
     missing = [column for column in HEADER if column not in header]
     if missing:
@@ -111,11 +111,11 @@ def _lines(text: str, name: str) -> dict[tuple[str, str], Line]:
         raise InputError(f"table '{name}': its {CSV_FILE} is damaged ({error}).") from error
 
 
-def _line(line: Mapping[str, str]) -> Line:
+def _line(line: Mapping[str, str]) -> RecordedCell:
     def number(column: str) -> float | None:
         return float(line[column]) if line[column] else None
 
-    return Line(
+    return RecordedCell(
         mean=number("mean"),
         sd=number("sd"),
         seeds=int(line["n"] or 0),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.report.data import Uncertainty
-from analysis.report.runs import Run
+from analysis.report.runs import ReportRun
 from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -16,17 +16,14 @@ from rgbt.metrics.metric import Absent
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Goes over a sequence and shows how far it is: (sequence, what is done)."""
 
-OWN = ""
-"""Path of the evaluation that a run makes itself."""
-
 
 @dataclass(frozen=True)
-class Source:
+class CountsSource:
     """Counts that scores are taken from.
 
     Attributes:
         keys: of the runs, one per seed.
-        paths: of the evaluation in each run, `OWN` for the run's own; two: the first less the
+        paths: of the counts in each run; two: the first less the
             second.
         absent: how a class without pixels scores; None: as the counts say.
     """
@@ -37,7 +34,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Found:
+class CellInterval:
     """An interval, and what it is over; without one, why there is none."""
 
     interval: Interval | None
@@ -55,11 +52,11 @@ class Intervals:
         found: the intervals by source and metric, after `compute`.
     """
 
-    runs: Mapping[str, Run]
-    asked: dict[Source, dict[str, None]] = field(default_factory=dict)
-    found: dict[tuple[Source, str], Found] = field(default_factory=dict)
+    runs: Mapping[str, ReportRun]
+    asked: dict[CountsSource, dict[str, None]] = field(default_factory=dict)
+    found: dict[tuple[CountsSource, str], CellInterval] = field(default_factory=dict)
 
-    def ask(self, source: Source, metric: str) -> None:
+    def ask(self, source: CountsSource, metric: str) -> None:
         """Ask for the interval of a score."""
         self.asked.setdefault(source, {})[metric] = None
 
@@ -77,29 +74,16 @@ class Intervals:
                 counts = [self._counts(source.keys, path) for path in source.paths]
                 found = _resampled(counts, metrics, settings)
             except InputError as error:
-                found = dict.fromkeys(metrics, Found(None, "none", str(error)))
+                found = dict.fromkeys(metrics, CellInterval(None, "none", str(error)))
             self.found |= {(source, metric): each for metric, each in found.items()}
 
     def _counts(self, keys: Sequence[str], path: str) -> list[Counts]:
-        return [counts_of(self.runs[key], path) for key in keys]
-
-
-def counts_of(run: Run, path: str) -> Counts:
-    """Counts of one evaluation of a run.
-
-    Raises:
-        InputError: it has none.
-    """
-    if path != OWN:
-        return run.counts_of(path)
-    if run.counts is None:
-        raise InputError(f"run {run.entry.key} has no counts.")
-    return run.counts
+        return [self.runs[key].counts(path) for key in keys]
 
 
 def _resampled(
     counts: Sequence[Sequence[Counts]], metrics: Sequence[str], settings: Resampling
-) -> dict[str, Found]:
+) -> dict[str, CellInterval]:
     """Intervals of scores, or of the difference of two evaluations of the same runs."""
     if len(counts) == 1:
         estimates = estimate(counts[0], metrics, settings)
@@ -115,9 +99,9 @@ def _resampled(
     }
 
 
-def _covering(images: Interval | None, both: Interval | None, said: str) -> Found:
+def _covering(images: Interval | None, both: Interval | None, said: str) -> CellInterval:
     if both is not None:
-        return Found(both, "images and seeds")
+        return CellInterval(both, "images and seeds")
     if images is not None:
-        return Found(images, "images")
-    return Found(None, "none", f"no interval: {said} are too few.")
+        return CellInterval(images, "images")
+    return CellInterval(None, "none", f"no interval: {said} are too few.")

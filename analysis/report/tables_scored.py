@@ -6,17 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analysis.report.runs import Run
-from analysis.report.tables_files import NOTHING, Recorded
-from analysis.report.tables_intervals import OWN, Source, counts_of
+from analysis.report.runs import ReportRun
+from analysis.report.tables_files import NO_CELL, RecordedTable
+from analysis.report.tables_intervals import CountsSource
 from rgbt.checks import InputError
-from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from sweeps.table.cells import (
     CellId,
     TableCell,
+    counts_path,
     derived,
-    evaluation_of,
     is_counted,
     is_of_runs,
     metric_of,
@@ -29,36 +28,25 @@ AGREES = 1e-4
 
 
 @dataclass(frozen=True)
-class _Opened:
-    """A run as `sweeps.table.scoring` reads one."""
-
-    key: str
-    commit: str | None
-    run: Run
-
-    def counts(self, path: str = OWN) -> Counts:
-        """Counts of an evaluation."""
-        return counts_of(self.run, path)
-
-
-@dataclass(frozen=True)
 class _Outcome:
     """What became of a cell's run, as `sweeps.table.scoring` reads it."""
 
     state: str
     reason: str = ""
-    results: tuple[_Opened, ...] = ()
+    results: tuple[ReportRun, ...] = ()
 
 
 @dataclass(frozen=True)
-class Draft:
+class RescoredTable:
     """A recorded table with its file, scored."""
 
-    recorded: Recorded
+    recorded: RecordedTable
     scored: ScoredTable
 
 
-def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> ScoredTable:
+def score_again(
+    recorded: RecordedTable, table: Table, runs: Mapping[str, ReportRun]
+) -> ScoredTable:
     """Means, ranks and orders from the counts of the runs that the record names.
 
     Args:
@@ -78,7 +66,7 @@ def score_again(recorded: Recorded, table: Table, runs: Mapping[str, Run]) -> Sc
     return score(recorded.name, table, places, scale=recorded.scale, sizes=sizes)
 
 
-def _sizes(recorded: Recorded, table: Table) -> dict[CellId, TableCell]:
+def _sizes(recorded: RecordedTable, table: Table) -> dict[CellId, TableCell]:
     """Columns of parameters as recorded: a network is not known here."""
     names = {column.name for column in table.columns if column.parameters}
     labels = {row.label for row in table.rows}
@@ -90,7 +78,7 @@ def _sizes(recorded: Recorded, table: Table) -> dict[CellId, TableCell]:
 
 
 def _by_seed(
-    keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, Run]
+    keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, ReportRun]
 ) -> dict[int, _Outcome]:
     """What became of every seed of a row; a run that is not here stands for a seed without one."""
     outcomes = {seed: _Outcome("failed", "not finished") for seed in seeds}
@@ -100,50 +88,47 @@ def _by_seed(
     return outcomes | {seed: _outcome(key, runs.get(key)) for seed, key in [*here.items(), *gone]}
 
 
-def _outcome(key: str, run: Run | None) -> _Outcome:
+def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     if run is None:
         return _Outcome("missing", f"run {key} is not in the store")
-    return _Outcome("finished", results=(_Opened(key, run.entry.commit or None, run),))
+    return _Outcome("finished", results=(run,))
 
 
-def asked_of(draft: Draft, row: Row, column: Column) -> tuple[Source, str] | None:
+def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:
     """Source and metric of a cell's interval; None for cells without a value from counts."""
     table, place = draft.scored.table, (row.label, column.name)
-    cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NOTHING)
+    cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NO_CELL)
     if cell is None or not cell.seeds or cell.seeds < line.seeds:
         return None
     columns = _sides(table, column) if column.sources else [column]
     metrics = {metric_of(each, row) for each in columns if each.metric is not None}
     if len(metrics) != 1 or not all(map(is_counted, columns)) or column.mean is not None:
         return None  # a mean, or the difference of two different scores
-    asked = (evaluation_of(each, table) for each in columns)
-    paths = tuple(OWN if each is None else each.path for each in asked)
+    paths = tuple(counts_path(each, table) for each in columns)
     # Of the runs of the row those that the value is a mean of: all of them, see the check above.
     keys = cell.keys if cell.seeds == len(cell.keys) else ()
-    return (Source(keys, paths, table.absent), metrics.pop()) if keys else None
+    return (CountsSource(keys, paths, table.absent), metrics.pop()) if keys else None
 
 
 def values_of(
-    draft: Draft, row: Row, column: Column, runs: Mapping[str, Run]
+    draft: RescoredTable, row: Row, column: Column, runs: Mapping[str, ReportRun]
 ) -> tuple[float | None, ...]:
     """The score of each run of a cell, in the order of its keys; None: it has none."""
-    keys = draft.recorded.lines.get((row.label, column.name), NOTHING).keys
+    keys = draft.recorded.lines.get((row.label, column.name), NO_CELL).keys
     if not is_of_runs(column):
         return ()
     return tuple(_value(draft.scored.table, row, column, runs.get(key)) for key in keys)
 
 
-def _value(table: Table, row: Row, column: Column, run: Run | None) -> float | None:
+def _value(table: Table, row: Row, column: Column, run: ReportRun | None) -> float | None:
     if run is None:
         return None
     if column.sources:
         each = [_value(table, row, side, run) for side in _sides(table, column)]
         found = derived(column, ["" if value is None else value for value in each])
         return None if isinstance(found, str) else found
-    evaluation = evaluation_of(column, table)
-    path = OWN if evaluation is None else evaluation.path
     try:
-        counts = counts_of(run, path)
+        counts = run.counts(counts_path(column, table))
         return value(metric_of(column, row), counts, table.absent or counts.absent)
     except InputError:  # the reason stands in the cell
         return None
@@ -154,12 +139,12 @@ def _sides(table: Table, column: Column) -> list[Column]:
     return [each for name in column.sources for each in table.columns if each.name == name]
 
 
-def changed(draft: Draft) -> list[str]:
+def changed(draft: RescoredTable) -> list[str]:
     """A sentence where counts give other means than were recorded with the table."""
     apart = [
         (place, cell.mean, line.mean)
         for place, cell in draft.scored.cells.items()
-        if (line := draft.recorded.lines.get(place, NOTHING)).mean is not None
+        if (line := draft.recorded.lines.get(place, NO_CELL)).mean is not None
         and cell.seeds == line.seeds
         and not abs(cell.mean - line.mean) <= AGREES
     ]

@@ -34,7 +34,7 @@ from analysis.statistics.judging import (
     every,
     most,
 )
-from analysis.statistics.resampling import MOST_RESAMPLES, Blocks, ValueInterval
+from analysis.statistics.resampling import MOST_RESAMPLES, ConsecutiveBlocks, ValueInterval
 from rgbt.checks import check_range
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -69,7 +69,9 @@ def claims(
         InputError: a number out of range.
     """
     check_resampling(blocks, resamples, level)
-    judge = Judge(stats, Blocks(stats, size=blocks, resamples=resamples, seed=seed), level)
+    judge = Judge(
+        stats, ConsecutiveBlocks(stats, size=blocks, resamples=resamples, seed=seed), level
+    )
     found: list[Claim] = []
     if judge.has_centre:
         found += [_occupancy(judge), *_classes(judge)]

@@ -11,14 +11,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain
 from threading import Lock
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.statistics.data import ALL, SpatialStatistics
-from analysis.statistics.measure import ESTIMATORS, KERNELS, Measured, Meter
+from analysis.statistics.measure import ESTIMATORS, KERNELS, ImageMeasurements, ImageMeter
 from rgbt.checks import InputError, check_range
+from rgbt.dataset import LabelledDataset
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.names import DAY, NIGHT
 from rgbt.types import Sample
@@ -28,33 +28,8 @@ CHUNK = 32
 what a map of bytes can count."""
 
 
-class DataSet(Protocol):
-    """What is asked of a data set (see `rgbt.data.mfnet.MFNet`)."""
-
-    name: str
-    classes: tuple[str, ...]
-    palette: tuple[tuple[int, int, int], ...]
-    unscored: tuple[str, ...]
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        ...
-
-    def read(self, name: str) -> Sample:
-        """One sample; InputError where it cannot be read."""
-        ...
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night; None where the data set does not say."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Hash of the content."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class MeasurementSettings:
     """How a split is measured.
 
     Attributes:
@@ -78,9 +53,9 @@ class Settings:
 
 
 def collect(
-    dataset: DataSet,
+    dataset: LabelledDataset,
     split: str,
-    settings: Settings,
+    settings: MeasurementSettings,
     advance: Callable[[], object] = lambda: None,
     unreadable: Callable[[str], object] = lambda _: None,
 ) -> SpatialStatistics:
@@ -89,7 +64,7 @@ def collect(
     Args:
         dataset: reads labelled pairs, all of one size.
         split: its split.
-        settings: see `Settings`.
+        settings: see `MeasurementSettings`.
         advance: called once per image.
         unreadable: with `skip_unreadable`, called with the sentence about each image left out.
 
@@ -113,9 +88,9 @@ def collect(
     nights = dataset.nights(names)
     classes = len(dataset.classes)
     parts = (ALL,) if nights is None else (DAY, NIGHT)
-    work = _Work(
+    work = _SharedWork(
         dataset=dataset,
-        meter=Meter(region_map, classes, settings.kernel),
+        meter=ImageMeter(region_map, classes, settings.kernel),
         like=first,
         part_of=dict(zip(names, [0] * len(names) if nights is None else nights, strict=True)),
         occupied=np.zeros((len(parts), classes, *region_map.shape), np.int32),
@@ -148,11 +123,11 @@ def collect(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Work:
+class _SharedWork:
     """What the threads share: all of it is read only but the maps, which a lock guards."""
 
-    dataset: DataSet
-    meter: Meter
+    dataset: LabelledDataset
+    meter: ImageMeter
     like: Sample
     part_of: Mapping[str, int]
     occupied: NDArray[np.int32]
@@ -161,7 +136,7 @@ class _Work:
     unreadable: Callable[[str], object]
     lock: Lock = field(default_factory=Lock)
 
-    def measure(self, names: Sequence[str]) -> list[Measured | None]:
+    def measure(self, names: Sequence[str]) -> list[ImageMeasurements | None]:
         """Measurements of up to `CHUNK` images; None for one that is left out."""
         maps = np.zeros(self.occupied.shape, np.uint8)
         found = []
@@ -196,14 +171,16 @@ class _Work:
         return sample
 
 
-def _add_label(maps: NDArray[np.uint8], sample: Sample, measured: Measured) -> None:
+def _add_label(maps: NDArray[np.uint8], sample: Sample, measured: ImageMeasurements) -> None:
     """Add one to the map of its class at every pixel; (K, H, W) in place."""
     assert sample.label is not None, "only labelled samples are measured"
     for index in np.flatnonzero(measured.labels.any(0)):
         np.add(maps[index], (sample.label == index).view(np.uint8), out=maps[index])
 
 
-def _in_threads(work: _Work, names: Sequence[str], workers: int) -> list[Measured | None]:
+def _in_threads(
+    work: _SharedWork, names: Sequence[str], workers: int
+) -> list[ImageMeasurements | None]:
     """`work.measure` of all names, in order; the first error stops what has not begun."""
     # Short lists still keep every thread busy.
     size = max(1, min(CHUNK, -(-len(names) // (4 * workers))))
@@ -215,7 +192,9 @@ def _in_threads(work: _Work, names: Sequence[str], workers: int) -> list[Measure
         pool.shutdown(cancel_futures=True)
 
 
-def _first_readable(dataset: DataSet, names: Sequence[str], settings: Settings) -> Sample:
+def _first_readable(
+    dataset: LabelledDataset, names: Sequence[str], settings: MeasurementSettings
+) -> Sample:
     """The sample whose size the others must have."""
     first = ""
     for name in names:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.statistics.data import ALL, SpatialStatistics
-from analysis.statistics.resampling import MIN_BLOCKS, Blocks, Scale, ValueInterval
+from analysis.statistics.resampling import MIN_BLOCKS, ConsecutiveBlocks, Scale, ValueInterval
 
 Verdict = Literal["holds", "does not hold", "cannot be decided on this sample"]
 HOLDS: Verdict = "holds"
@@ -84,7 +84,7 @@ class Claim:
 class Judge:
     """A sample with its resamples; turns resampled numbers into findings."""
 
-    def __init__(self, stats: SpatialStatistics, blocks: Blocks, level: float) -> None:
+    def __init__(self, stats: SpatialStatistics, blocks: ConsecutiveBlocks, level: float) -> None:
         self.stats = stats
         self.blocks = blocks
         self.level = level

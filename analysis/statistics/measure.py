@@ -83,7 +83,7 @@ class RegionSums:
         return np.asarray(by_region, np.float64)
 
 
-class Measured(NamedTuple):
+class ImageMeasurements(NamedTuple):
     """One image: labels (R, K) and ignored (R,) pixels; the rest (2, R), see `data`."""
 
     labels: Ints
@@ -93,7 +93,7 @@ class Measured(NamedTuple):
     noise: dict[str, Floats]
 
 
-class Meter:
+class ImageMeter:
     """Measures images of one size; what depends on the regions alone is computed once.
 
     Args:
@@ -124,14 +124,16 @@ class Meter:
         self._region_begins = np.zeros(region_map.size, bool)
         self._region_begins[np.r_[0, changes]] = True
 
-    def __call__(self, sample: Sample) -> Measured:
+    def __call__(self, sample: Sample) -> ImageMeasurements:
         """The measurements of one labelled pair of the size of the region map."""
         assert sample.label is not None, "only labelled samples are measured"
         labels, ignored = self.count_labels(sample.label)
         grey = cv2.cvtColor(sample.rgb, cv2.COLOR_RGB2GRAY)
         by_image = [self.measure(np.asarray(grey, np.uint8)), self.measure(sample.thermal)]
         laplacian, mean, *noise = (np.stack(rows) for rows in zip(*by_image, strict=True))
-        return Measured(labels, ignored, laplacian, mean, dict(zip(ESTIMATORS, noise, strict=True)))
+        return ImageMeasurements(
+            labels, ignored, laplacian, mean, dict(zip(ESTIMATORS, noise, strict=True))
+        )
 
     def measure(self, image: Image) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Laplacian variance, mean, and noise by every estimator of `ESTIMATORS`, each (R,)."""

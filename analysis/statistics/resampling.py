@@ -34,7 +34,7 @@ class ValueInterval(NamedTuple):
     high: float
 
 
-class Blocks:
+class ConsecutiveBlocks:
     """Blocks of images and how often each resample draws each of them.
 
     The images of a part (day, night; all where the data set does not tell) are sorted by name and

@@ -29,7 +29,7 @@ BAND = 1.96
 
 
 @dataclass(frozen=True)
-class Blocks:
+class ImageBlocks:
     """A partition of N images.
 
     Attributes:
@@ -45,7 +45,7 @@ class Blocks:
     reason: str = ""
 
 
-class Frames(NamedTuple):
+class SequenceFrames(NamedTuple):
     """Images of one sequence in the order of their frames: numbers, and places in the split."""
 
     frames: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Frames(NamedTuple):
 
 def make_blocks(
     names: Sequence[str], choice: NamedBlocks | int, series: NDArray[np.float64]
-) -> Blocks:
+) -> ImageBlocks:
     """The blocks that `choice` asks for (see `Resampling.blocks`).
 
     Args:
@@ -146,7 +146,7 @@ def _autocovariance(
     return float(sum(products)) / len(centred)
 
 
-def _automatic(sequences: Sequence[Frames], series: NDArray[np.float64]) -> Blocks:
+def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64]) -> ImageBlocks:
     """Runs of consecutive frames, or pieces of them where one run is too long for that."""
     runs = [run for each in sequences for run in _runs(each)]
     sizes = [len(run) for run in runs]
@@ -172,7 +172,7 @@ def _measured_length(series: NDArray[np.float64], runs: Sequence[NDArray[np.int6
     return wanted
 
 
-def _runs(sequence: Frames) -> list[NDArray[np.int64]]:
+def _runs(sequence: SequenceFrames) -> list[NDArray[np.int64]]:
     """Places of the frames that follow one another without a gap (`GAP`)."""
     steps = np.diff(sequence.frames)
     if not len(steps):
@@ -186,7 +186,7 @@ def _range(sizes: Sequence[int]) -> str:
     return str(most) if least == most else f"{least} to {most}"
 
 
-def _without_frames(names: Sequence[str], choice: NamedBlocks | int) -> Blocks:
+def _without_frames(names: Sequence[str], choice: NamedBlocks | int) -> ImageBlocks:
     if choice == "auto":
         reason = f"Names such as '{names[0]}' hold no frame number that others continue; {ALONE}."
         return _singles(len(names), " (their names tell no neighbours)", reason)
@@ -196,7 +196,7 @@ def _without_frames(names: Sequence[str], choice: NamedBlocks | int) -> Blocks:
     )
 
 
-def _sequences(names: Sequence[str]) -> list[Frames] | None:
+def _sequences(names: Sequence[str]) -> list[SequenceFrames] | None:
     """The frames of every sequence; None where names tell no neighbours.
 
     The frame is the last number in the names that is not the same in all of them; names that are
@@ -220,7 +220,7 @@ def _sequences(names: Sequence[str]) -> list[Frames] | None:
         return None
     ordered = [sorted(frames) for frames in found.values()]
     return [
-        Frames(
+        SequenceFrames(
             frames=np.array([frame for frame, _ in each], np.float64),
             places=np.array([place for _, place in each], np.int64),
         )
@@ -228,7 +228,7 @@ def _sequences(names: Sequence[str]) -> list[Frames] | None:
     ]
 
 
-def _pieces(sequences: Sequence[NDArray[np.int64]], length: int) -> Blocks:
+def _pieces(sequences: Sequence[NDArray[np.int64]], length: int) -> ImageBlocks:
     """Sequences cut into pieces of nearly equal size, at most `length` each."""
     pieces = [
         piece for each in sequences for piece in np.array_split(each, math.ceil(len(each) / length))
@@ -237,12 +237,14 @@ def _pieces(sequences: Sequence[NDArray[np.int64]], length: int) -> Blocks:
     return _joined(sum(map(len, sequences)), pieces, said)
 
 
-def _joined(count: int, pieces: Sequence[NDArray[np.int64]], said: str, reason: str = "") -> Blocks:
+def _joined(
+    count: int, pieces: Sequence[NDArray[np.int64]], said: str, reason: str = ""
+) -> ImageBlocks:
     index = np.empty(count, np.int64)
     for number, piece in enumerate(pieces):
         index[piece] = number
-    return Blocks(index, len(pieces), said, reason)
+    return ImageBlocks(index, len(pieces), said, reason)
 
 
-def _singles(count: int, remark: str = "", reason: str = "") -> Blocks:
-    return Blocks(np.arange(count), count, f"{count} single images{remark}", reason)
+def _singles(count: int, remark: str = "", reason: str = "") -> ImageBlocks:
+    return ImageBlocks(np.arange(count), count, f"{count} single images{remark}", reason)

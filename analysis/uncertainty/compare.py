@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from analysis.uncertainty.blocks import FEWEST
 from analysis.uncertainty.estimate import Estimate, by_part, estimate_of, image_spread
-from analysis.uncertainty.images import Images, prepare
+from analysis.uncertainty.images import CommonImages, prepare
 from analysis.uncertainty.intervals import (
     Interval,
     Values,
@@ -73,7 +73,7 @@ class Comparison:
         differences: in the order of the metrics asked for.
         images: number of images.
         said: how they were drawn, e.g. "393 single images".
-        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
+        reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
         partition: of the regions, e.g. "ring5".
         level: of the intervals.
     """
@@ -118,7 +118,7 @@ def compare(
     if paired and len(a) != len(b):
         raise ValueError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
     found: dict[str, Difference] = {}
-    described: dict[str | None, Images] = {}
+    described: dict[str | None, CommonImages] = {}
     for group in by_part(metrics):
         images = prepare([a, b], group[0], settings)
         if images.blocks.count < FEWEST:
@@ -144,7 +144,9 @@ def compare(
     )
 
 
-def _differences(images: Images, asked: Sequence[Asked], *, paired: bool) -> Iterator[Difference]:
+def _differences(
+    images: CommonImages, asked: Sequence[Asked], *, paired: bool
+) -> Iterator[Difference]:
     a, b = images.drawn(asked)
     swapped_a, swapped_b = images.swapped(asked)
     every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
@@ -160,7 +162,7 @@ def _differences(images: Images, asked: Sequence[Asked], *, paired: bool) -> Ite
 
 
 def _with_intervals(
-    images: Images,
+    images: CommonImages,
     plain: Difference,
     resampled: tuple[Values, Values],
     points: tuple[Values, ...],

@@ -9,7 +9,7 @@ from itertools import groupby
 
 import numpy as np
 
-from analysis.uncertainty.images import Images, prepare
+from analysis.uncertainty.images import CommonImages, prepare
 from analysis.uncertainty.intervals import (
     Interval,
     Spread,
@@ -40,7 +40,7 @@ class Estimate:
         both: interval over images and seeds (Student with Satterthwaite's degrees of freedom, not
             narrower than `trainings`); None where one of the two is.
         said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
-        reason: why so, see `analysis.uncertainty.blocks.Blocks.reason`.
+        reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
     """
 
     value: float
@@ -88,7 +88,7 @@ def by_part(metrics: Sequence[str]) -> list[list[Asked]]:
 
 
 def estimate_of(
-    images: Images, asked: Asked, points: Values, resampled: Values, without: Values
+    images: CommonImages, asked: Asked, points: Values, resampled: Values, without: Values
 ) -> Estimate:
     """The estimate that one row of `Drawn` makes."""
     settings, value = images.settings, float(points.mean())
@@ -116,7 +116,7 @@ def estimate_of(
     )
 
 
-def image_spread(images: Images, resampled: Values) -> Spread:
+def image_spread(images: CommonImages, resampled: Values) -> Spread:
     """Standard error over the draw of the images.
 
     Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error.

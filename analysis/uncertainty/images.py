@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.uncertainty.blocks import FEWEST, Blocks, make_blocks
+from analysis.uncertainty.blocks import FEWEST, ImageBlocks, make_blocks
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -26,7 +26,7 @@ Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ResampledScores:
     """Scores of one method, percent; NaN: nothing to score.
 
     Attributes:
@@ -45,7 +45,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Images:
+class CommonImages:
     """Counts of M methods, each with its seeds, on the same images.
 
     Attributes:
@@ -63,17 +63,17 @@ class Images:
     shape: tuple[int, int, int]
     like: Counts
     images: int
-    blocks: Blocks
+    blocks: ImageBlocks
     settings: Resampling
     absent: Absent
 
-    def drawn(self, asked: Sequence[Asked]) -> list[Drawn]:
+    def drawn(self, asked: Sequence[Asked]) -> list[ResampledScores]:
         """The scores of every method, as they are and with images drawn anew or left out."""
         if self.blocks.count < FEWEST:
             nothing = np.empty((len(asked), 0))
-            return [Drawn(points, nothing, nothing) for points in self.points(asked)]
+            return [ResampledScores(points, nothing, nothing) for points in self.points(asked)]
         parts = (self.points(asked), self.resampled(asked), self.without_each(asked))
-        return [Drawn(*each) for each in zip(*parts, strict=True)]
+        return [ResampledScores(*each) for each in zip(*parts, strict=True)]
 
     def points(self, asked: Sequence[Asked]) -> list[Scores]:
         """Per method (metrics, S): the score of every seed over all images."""
@@ -127,7 +127,9 @@ class Images:
         return np.stack([values(each, *given) for each in asked])
 
 
-def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampling) -> Images:
+def prepare(
+    methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampling
+) -> CommonImages:
     """Counts of the images that `asked` is over, summed inside blocks.
 
     Args:
@@ -147,12 +149,12 @@ def prepare(methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampl
         np.stack([counts.counts.reshape(len(first.names), -1) for counts in seeds])
         for seeds in parts
     ]
-    single = Images(
+    single = CommonImages(
         methods=tuple(each.astype(np.float64) for each in flat),
         shape=(regions, classes, classes),
         like=first,
         images=len(first.names),
-        blocks=Blocks(np.arange(len(first.names)), len(first.names), ""),
+        blocks=ImageBlocks(np.arange(len(first.names)), len(first.names), ""),
         settings=settings,
         absent=settings.absent or convention(counts for seeds in alike for counts in seeds),
     )
@@ -173,7 +175,7 @@ WATCHED_PAIRS = (parse(names.TC), parse(names.CA))
 """The same for counts of pairs of frames."""
 
 
-def _influence(single: Images) -> Scores:
+def _influence(single: CommonImages) -> Scores:
     """(L, N) how much each image moves the scores of every method, and their difference."""
     if single.settings.blocks != "auto":
         return np.empty((0, single.images))
@@ -184,7 +186,7 @@ def _influence(single: Images) -> Scores:
     return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
 
 
-def _summed(method: NDArray[np.float64], blocks: Blocks) -> NDArray[np.float64]:
+def _summed(method: NDArray[np.float64], blocks: ImageBlocks) -> NDArray[np.float64]:
     """(S, B, F) from (S, N, F)."""
     order = np.argsort(blocks.index, kind="stable")
     starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))

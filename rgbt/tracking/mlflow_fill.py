@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
@@ -26,8 +26,7 @@ from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, u
 from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced import description_of
 from rgbt.tracking.tables import ResultTables, result_grids
-
-Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+from rgbt.tracking.tracker import Status
 
 PARAM_LENGTH = 500
 """Characters of a parameter's value that are sent; MLflow's pages show far fewer."""

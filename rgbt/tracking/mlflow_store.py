@@ -12,48 +12,19 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from rgbt.checks import InputError
 from rgbt.ranges import Text
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_client import Store, locked, open_store
-from rgbt.tracking.mlflow_fill import Sent, Status, fill, read_sent, write_sent
+from rgbt.tracking.mlflow_fill import Sent, fill, read_sent, write_sent
 from rgbt.tracking.mlflow_server import pages_of, python_command
 from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
 from rgbt.tracking.provenance import without_passwords
-
-Link = tuple[str, str]
-"""(name, command or address), for the last lines of a run."""
+from rgbt.tracking.tracker import Link, Status
 
 PAUSE_S = 300.0
 """Seconds a running training leaves a store alone after it failed."""
-
-
-class Tracking(Protocol):
-    """What a run tells its tracker. None of these ever raises because a store is away."""
-
-    def start(
-        self,
-        folder: RunFolder,
-        run_name: str,
-        tags: Mapping[str, str],
-        params: Mapping[str, object],
-    ) -> None:
-        """Begin, or continue, the run of `folder`."""
-        ...
-
-    def update(self) -> None:
-        """Something new lies in the folder; called after every evaluation."""
-        ...
-
-    def finish(self, status: Status) -> None:
-        """The process leaves the run, which is finished, failed or was stopped (killed)."""
-        ...
-
-    def links(self) -> list[Link]:
-        """Where a person looks at the run."""
-        ...
 
 
 class NoTracking:

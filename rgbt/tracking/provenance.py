@@ -9,12 +9,14 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+COMMIT_LENGTH = 10
 
 PACKAGE = Path(__file__).resolve().parents[1]
 CODE = (".py", ".csv")
@@ -45,6 +47,12 @@ def provenance() -> dict[str, Any]:
         "packages": _packages(),
         **_machine(),
     }
+
+
+def commit_of(process: Mapping[str, Any]) -> str:
+    """Git commit of a process, "+" after it for uncommitted changes; "" where there is none."""
+    commit = process.get("git_commit")
+    return f"{commit[:COMMIT_LENGTH]}{'+' if process.get('git_dirty') else ''}" if commit else ""
 
 
 @cache

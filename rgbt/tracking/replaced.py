@@ -8,13 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.terminal import tell
-
-if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_store import Tracking
+from rgbt.tracking.tracker import Tracking
 
 REPLACED = "replaced"
 TAG = "rgbt.replaced"

@@ -22,12 +22,11 @@ from rgbt.tracking.formats import (
 )
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.percent import in_percent
+from rgbt.tracking.provenance import commit_of
 from rgbt.tracking.tables import ResultTables
 
 CHECKPOINT = "best.pt"
 """The network that evaluations are made with; other machines do not get it."""
-
-COMMIT_LENGTH = 10
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class RunResult:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run has its result."""
-        return (self.folder / "result.json").exists()
+        """Whether the run has its result; InputError where that is damaged."""
+        return read_result(self.folder) is not None
 
     @property
     def result(self) -> dict[str, Any]:
@@ -119,10 +118,7 @@ class RunResult:
     @property
     def commit(self) -> str | None:
         """Git commit of the code that made it; "+" is added for changes that were not committed."""
-        first = next(iter(self.provenance), {})
-        commit = first.get("git_commit")
-        dirty = "+" if first.get("git_dirty") else ""
-        return None if commit is None else f"{commit[:COMMIT_LENGTH]}{dirty}"
+        return commit_of(next(iter(self.provenance), {})) or None
 
     @property
     def other_code(self) -> str | None:

@@ -16,11 +16,12 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_client import StoreBusyError
-from rgbt.tracking.mlflow_fill import Status, read_sent
+from rgbt.tracking.mlflow_fill import read_sent
 from rgbt.tracking.mlflow_server import ui_command
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import HIDDEN, without_passwords
 from rgbt.tracking.replaced import REPLACED, runs_dir_of
+from rgbt.tracking.tracker import Status
 
 EXPERIMENT = "rgbt"
 

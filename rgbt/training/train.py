@@ -32,7 +32,6 @@ from rgbt.runtime.signals import deferred
 from rgbt.spec.naming import describe, group_of
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.folder import Description, RunFolder
-from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
@@ -40,6 +39,7 @@ from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import result_view, show, tell
+from rgbt.tracking.tracker import Tracking
 from rgbt.training.overview import announce_training
 from rgbt.transforms.view_sets import ViewSets
 
@@ -66,7 +66,7 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         folder = RunFolder(spec.folder)
         folder.clean()
         _show_again(folder, tracking, description)
-        warn_of_result(folder.path)
+        warn_of_result(spec.folder)
         _warn_of_other_files(folder, spec)
         _warn_of_missing_consistency(folder, spec.consistency.build())
     else:

@@ -22,7 +22,7 @@ from sweeps.table.scoring import ScoredTable, score
 from sweeps.worker.point_list import Outcome, other_code_line
 
 if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_store import Tracking
+    from rgbt.tracking.tracker import Tracking
 
 
 def publish_table(

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rgbt.tracking.mlflow_server import pages_of
-from rgbt.tracking.mlflow_store import Link, MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_view import run_path
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.terminal import tell
+from rgbt.tracking.tracker import Link, Tracking
 
 if TYPE_CHECKING:
     from rgbt.tracking.mlflow_client import Store

@@ -9,12 +9,12 @@ from typing import TypeVar
 
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_fill import Status
-from rgbt.tracking.mlflow_store import MlflowTracking, Tracking
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced import replace_finished
 from rgbt.tracking.run_result import RunResult
 from rgbt.tracking.terminal import tell
+from rgbt.tracking.tracker import Status, Tracking
 
 FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
 FETCHED = ".fetched"

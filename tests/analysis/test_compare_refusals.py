@@ -149,4 +149,4 @@ def test_out_that_is_a_file(call: Call, files: tuple[str, str], tmp_path: Path):
 def test_a_file_of_another_split(call: Call, files: tuple[str, str]):
     code, _, err = call(ENTRY, *files, "split=val")
     assert code == 2
-    assert_one_sentence(err, "is of split 'test', but split=val was asked for")
+    assert_one_sentence(err, "is of split 'test', not of split=val")

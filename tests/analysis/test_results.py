@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.results import Stored, groups_in, label_of, open_counts
+from analysis.results import NamedCounts, groups_in, label_of, open_counts
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import Description, RunFolder
@@ -52,8 +52,8 @@ def runs(stored: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(stored, tmp_path / "runs"))
 
 
-def holds(stored: Stored, seed: int) -> bool:
-    return bool((stored.counts.counts == some(seed).counts).all())
+def holds(named: NamedCounts, seed: int) -> bool:
+    return bool((named.counts.counts == some(seed).counts).all())
 
 
 @pytest.mark.parametrize("form", ["{runs}/aaa1", "aaa1", "mlflow-aaa1"])

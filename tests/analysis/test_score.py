@@ -15,7 +15,7 @@ import pytest
 
 from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import score_folder
-from analysis.predictions.table import Cell
+from analysis.predictions.table import ScoreKey
 from analysis.score import entry, score_tables
 from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
@@ -129,13 +129,13 @@ def test_each_convention_has_intervals_of_its_own() -> None:
     for absent in ("released", "exclude"):
         expected = estimate([counts], ["mIoU", "region/2"], replace(settings, absent=absent))
         for region, metric in ((None, "mIoU"), (2, "region/2")):
-            score = table.scores[Cell(region=region, absent=absent)]
+            score = table.scores[ScoreKey(region=region, absent=absent)]
             interval = expected[metric].images
             assert interval is not None
             assert (score.low, score.high) == (interval.low, interval.high)
             assert score.value == pytest.approx(expected[metric].value)
-    assert table.scores[Cell(region=2)].high <= 50
-    assert table.scores[Cell(region=2, absent="exclude")].low > 90
+    assert table.scores[ScoreKey(region=2)].high <= 50
+    assert table.scores[ScoreKey(region=2, absent="exclude")].low > 90
 
 
 def test_what_was_left_out_is_said_in_the_terminal_and_in_the_file(

@@ -12,7 +12,7 @@ import pytest
 from analysis.compare import absent_classes, entry
 from analysis.figures import classes, consistency, inputs, maps, panels, profiles, trends
 from analysis.predictions.maps import PixelMaps, iou_map
-from analysis.predictions.table import Cell, score_table
+from analysis.predictions.table import ScoreKey, score_table
 from analysis.predictions.text import convention_line, region_grid, tidy_csv
 from analysis.report.runs import open_run
 from analysis.uncertainty import Resampling, compare, estimate
@@ -141,14 +141,14 @@ def test_means_over_different_classes_are_refused(tmp_path: Path) -> None:
 
 def test_score_table_by_hand() -> None:
     table = score_table(counts_of(), "ours")
-    assert table.scores[Cell()].value == pytest.approx(MEAN)
-    assert table.scores[Cell(region=1)].value == pytest.approx(LEFT_MEAN)
-    assert table.scores[Cell(region=2)].value == pytest.approx(RIGHT_MEAN)
+    assert table.scores[ScoreKey()].value == pytest.approx(MEAN)
+    assert table.scores[ScoreKey(region=1)].value == pytest.approx(LEFT_MEAN)
+    assert table.scores[ScoreKey(region=2)].value == pytest.approx(RIGHT_MEAN)
     acc = 100 * (10 / 12 + 3 / 6 + 2 / 2) / 3
-    assert table.scores[Cell(metric="Acc")].value == pytest.approx(acc)
+    assert table.scores[ScoreKey(metric="Acc")].value == pytest.approx(acc)
     spread = ((LEFT_MEAN - RIGHT_MEAN) / 2) ** 2
-    assert table.scores[Cell(metric="Var")].value == pytest.approx(spread)
-    left = Cell(region=1, absent="exclude")
+    assert table.scores[ScoreKey(metric="Var")].value == pytest.approx(spread)
+    left = ScoreKey(region=1, absent="exclude")
     assert table.scores[left].value == pytest.approx(1.5 * LEFT_MEAN)
     assert table.scores[replace(left, class_name="void")].value == pytest.approx(100 * 5 / 8)
     labels = [row[0] for row in region_grid(table).rows]

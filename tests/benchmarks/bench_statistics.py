@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from analysis.statistics.collect import Settings, collect
+from analysis.statistics.collect import MeasurementSettings, collect
 from analysis.statistics.data import SpatialStatistics
 from analysis.statistics.measure import ESTIMATORS, MEDIAN_OF_NORMAL
 from rgbt.data.mfnet import MFNet
@@ -140,7 +140,9 @@ def main() -> int:
     region_map = RINGS.map(HW)
 
     def ours(dataset: Any, workers: int) -> Callable[[], SpatialStatistics]:
-        return lambda: collect(dataset, "train", Settings(regions=RINGS, workers=workers))
+        return lambda: collect(
+            dataset, "train", MeasurementSettings(regions=RINGS, workers=workers)
+        )
 
     ours(InMemory(samples[:10]), 1)()
     print(f"{IMAGES} images of {HW[0]}x{HW[1]}, both modalities, 9 rings, all estimators")

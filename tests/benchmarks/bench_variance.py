@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.estimate import image_spread
-from analysis.uncertainty.images import Images, prepare
+from analysis.uncertainty.images import CommonImages, prepare
 from analysis.uncertainty.intervals import Values, corrected, over_images
 from rgbt.metrics.named import parse
 from tests.analysis.uncertainty.simulated_regions import Tilted
@@ -46,7 +46,9 @@ class Tally:
         return f"{100 * np.mean(self.held):.0f} / {np.mean(self.widths):.1f}"
 
 
-def forms(images: Images, value: float, resampled: Values, without: Values) -> dict[str, Interval]:
+def forms(
+    images: CommonImages, value: float, resampled: Values, without: Values
+) -> dict[str, Interval]:
     """Intervals of a variance or of a difference of variances."""
     low, high = np.quantile(resampled, QUANTILES)
     none = np.empty(0)  # without acceleration: BC
@@ -63,7 +65,7 @@ def forms(images: Images, value: float, resampled: Values, without: Values) -> d
 
 
 def forms_of_variance(
-    images: Images, rows: Mapping[str, tuple[Values, ...]]
+    images: CommonImages, rows: Mapping[str, tuple[Values, ...]]
 ) -> dict[str, Interval]:
     """The same, cut at 0 and with the estimate inside, and forms that need a positive score."""
     points, resampled, without = rows["Var"]

@@ -14,7 +14,7 @@ import pytest
 from analysis.figures import __main__ as figures
 from analysis.figures.__main__ import entry
 from analysis.figures.catalogue import FIGURES
-from analysis.predictions.scoring import Options, score_folder
+from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.statistics.data import SpatialStatistics
 from rgbt.config.options import types_of
 from rgbt.data.mfnet import MFNet
@@ -40,7 +40,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert label is not None
             wrong = (label + shift * (np.arange(96) < index)) % 9
             cv2.imwrite(str(folder / method / f"{name}.png"), wrong.astype(np.uint8))
-        scored = score_folder(folder / method, dataset, "test", Options(regions=5, threads=1))
+        scored = score_folder(
+            folder / method, dataset, "test", ScoringOptions(regions=5, threads=1)
+        )
         for each in scored.counts:
             each.save(folder / method / f"counts_{each.partition}.npz")
         assert scored.maps is not None
@@ -241,8 +243,8 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
         ("spatialseg/fig5", ["metric=vertical5"], "over ring5, not over vertical5; leave metric="),
         ("spatialseg/fig5", ["metric=ring5", "metric.regions=4"], "over ring5, not over ring4"),
         ("spatialseg/fig3", ["metric=ring9"], "was measured over ring5, not over ring9"),
-        ("regions/profile", ["split=val"], "counts_ring5.npz is of split 'test', but split=val"),
-        ("regions/heat", ["split=val"], "counts_ring5.npz is of split 'test', but split=val"),
+        ("regions/profile", ["split=val"], "counts_ring5.npz is of split 'test', not of split=val"),
+        ("regions/heat", ["split=val"], "counts_ring5.npz is of split 'test', not of split=val"),
         ("spatialseg/fig4", ["names=00001N,00002D"], "shows one image, got 2"),
         ("crm/fig5", ["names=00001N, 00002D"], "shows one image, got 2"),
         ("spatialseg/fig4", ["names=00099D"], "split 'test' has no image '00099D'"),
@@ -254,9 +256,9 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
         ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
         ("regions/profile", ["runs={folder}/a/pairs.npz"], "'region/1' is a score of single"),
         ("regions/heat", ["runs={folder}/a/pairs.npz"], "'aligned3' is not a partition"),
-        ("temporal/fig5", ["runs={folder}/a/counts_ring5.npz"], "by ring5, but frames=aligned was"),
-        ("temporal/fig5", ["frames=released"], "by aligned3, but frames=released was asked for"),
-        ("temporal/fig5", ["split=val"], "is of split 'test', but split=val was asked for"),
+        ("temporal/fig5", ["runs={folder}/a/counts_ring5.npz"], "by ring5, not frames=aligned"),
+        ("temporal/fig5", ["frames=released"], "by aligned3, not frames=released"),
+        ("temporal/fig5", ["split=val"], "is of split 'test', not of split=val"),
         ("regions/profile", ["level=high"], "'level' must be a number"),
         ("regions/profile", ["band=seeds"], "band=seeds needs at least two seeds, but 'A' has one"),
     ],

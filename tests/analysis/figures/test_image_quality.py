@@ -9,7 +9,7 @@ import pytest
 
 from analysis.figures.image_quality import draw, laplacian_series, snr_series
 from analysis.statistics.data import SpatialStatistics
-from analysis.statistics.resampling import Blocks
+from analysis.statistics.resampling import ConsecutiveBlocks
 from rgbt.checks import InputError
 from tests.analysis.figures.drawn import statistics, strips, texts
 
@@ -23,8 +23,8 @@ def measured() -> SpatialStatistics:
     return statistics(LABELS, strips(3), NIGHT)
 
 
-def blocks(stats: SpatialStatistics) -> Blocks:
-    return Blocks(stats, size=2, resamples=400)
+def blocks(stats: SpatialStatistics) -> ConsecutiveBlocks:
+    return ConsecutiveBlocks(stats, size=2, resamples=400)
 
 
 def test_laplacian_by_hand(measured: SpatialStatistics) -> None:
@@ -80,7 +80,10 @@ def test_intervals_hold_the_value_and_are_wider_for_fewer_images(
     assert fewer.laplacian.shape[0] == 10
     relative = [
         float(np.log(series.bands["rgb", "all"][1] / series.bands["rgb", "all"][0])[0])
-        for series in (data, laplacian_series(fewer, Blocks(fewer, size=1, resamples=400)))
+        for series in (
+            data,
+            laplacian_series(fewer, ConsecutiveBlocks(fewer, size=1, resamples=400)),
+        )
     ]
     assert relative[1] > relative[0] > 0
 

@@ -19,8 +19,8 @@ from analysis.figures.maps import (
     occupancy_over,
 )
 from analysis.predictions.maps import PixelMaps
-from analysis.predictions.scoring import Options, score_folder
-from analysis.predictions.table import Cell, score_table
+from analysis.predictions.scoring import ScoringOptions, score_folder
+from analysis.predictions.table import ScoreKey, score_table
 from analysis.statistics.derive import region_occupancy
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
@@ -73,12 +73,14 @@ def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absen
         label[rng.random(label.shape) < 0.1] = 255
         cv2.imwrite(str(tmp_path / "labels" / f"{name}.png"), label)
         cv2.imwrite(str(tmp_path / "ours" / f"{name}.png"), predicted)
-    scored = score_folder(tmp_path / "ours", MFNet(str(tmp_path)), "test", Options(regions=5))
+    scored = score_folder(
+        tmp_path / "ours", MFNet(str(tmp_path)), "test", ScoringOptions(regions=5)
+    )
     assert scored.maps is not None
     rings = Regions(partition="ring", regions=5, aspect="image", absent=absent)
     heat = iou_heat(scored.maps, rings)
     table = score_table(scored.counts[0], "ours").scores
-    wanted = [table[Cell(absent=absent, region=region)].value for region in (1, 5, None)]
+    wanted = [table[ScoreKey(absent=absent, region=region)].value for region in (1, 5, None)]
     np.testing.assert_allclose([100 * heat.centre, 100 * heat.edge, 100 * heat.whole], wanted)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.figures.panels import (
-    Panel,
+    QualitativePanel,
     draw,
     image_mious,
     most_different,
@@ -28,7 +28,7 @@ def dataset(write_mfnet) -> MFNet:
     return MFNet(str(write_mfnet({"test": NAMES}, hw=(24, 32))))
 
 
-def made(dataset: MFNet, names: list[str] = NAMES, **methods) -> Panel:
+def made(dataset: MFNet, names: list[str] = NAMES, **methods) -> QualitativePanel:
     return panel(dataset, methods, names, RINGS)
 
 

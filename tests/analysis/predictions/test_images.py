@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from analysis.predictions.images import Format, Reader, check_one_kind, read_header
+from analysis.predictions.images import Format, PredictionReader, check_one_kind, read_header
 from rgbt.checks import InputError
 
 CLASSES = ("ground", "car", "person")
@@ -17,8 +17,8 @@ INDICES = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
 COLOURS = np.array(PALETTE, np.uint8)[INDICES]
 
 
-def reader(form: Format = "auto") -> Reader:
-    return Reader(CLASSES, PALETTE, form)
+def reader(form: Format = "auto") -> PredictionReader:
+    return PredictionReader(CLASSES, PALETTE, form)
 
 
 def grey(path: Path, values: np.ndarray = INDICES) -> Path:
@@ -126,7 +126,7 @@ def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> No
 
 
 def test_two_classes_of_one_colour_cannot_be_told_by_colour(tmp_path: Path) -> None:
-    twice = Reader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
+    twice = PredictionReader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
     np.testing.assert_array_equal(twice.read(grey(tmp_path / "index.png")), INDICES)
     with pytest.raises(InputError, match=r"gives car and person the same colour"):
         twice.read(grey(tmp_path / "colour.png", COLOURS))

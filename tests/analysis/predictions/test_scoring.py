@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from analysis.predictions.maps import iou_map
-from analysis.predictions.scoring import Options, score_folder
+from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Regions
 from tests.analysis.predictions.conftest import LABELS, PALETTE, PREDICTIONS, Write
 
-STRIPS = Options(partitions=("vertical", "horizontal"), regions=2)
+STRIPS = ScoringOptions(partitions=("vertical", "horizontal"), regions=2)
 
 
 def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
@@ -75,8 +75,10 @@ def test_how_files_are_read_and_called_can_be_chosen(tiny: MFNet, write: Write) 
     three = np.dstack([np.array(PREDICTIONS["00002N"], np.uint8)] * 3)
     cv2.imwrite(str(folder / "00002N_out.png"), three)
     with pytest.raises(InputError, match=r"one channel \(.*00001D_out.*others with colours"):
-        score_folder(folder, tiny, "test", Options(regions=2, suffix="_out"))
-    chosen = Options(partitions=("vertical",), regions=2, suffix="_out", form="index", name="mine")
+        score_folder(folder, tiny, "test", ScoringOptions(regions=2, suffix="_out"))
+    chosen = ScoringOptions(
+        partitions=("vertical",), regions=2, suffix="_out", form="index", name="mine"
+    )
     scored = score_folder(folder, tiny, "test", chosen)
     np.testing.assert_array_equal(scored.counts[0].whole().sum(0), [26, 4, 1])
     assert scored.name == "mine"
@@ -94,7 +96,7 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
     folder = write(dict(zip(names, predictions, strict=True)))
     dataset = MFNet(str(root))
     one, two = (
-        score_folder(folder, dataset, "test", Options(threads=threads)) for threads in (1, 2)
+        score_folder(folder, dataset, "test", ScoringOptions(threads=threads)) for threads in (1, 2)
     )
     for counts, again in zip(one.counts, two.counts, strict=True):
         aspect = "image" if counts.partition == "ring5" else None
@@ -123,7 +125,7 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
 
 def test_left_out_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
     folder = write({"00002N": PREDICTIONS["00002N"]})
-    options = Options(partitions=("vertical",), regions=2, missing="leave_out")
+    options = ScoringOptions(partitions=("vertical",), regions=2, missing="leave_out")
     scored = score_folder(folder, tiny, "test", options)
     assert scored.counts[0].names == ("00002N",)
     assert scored.counts[0].night == (True,)
@@ -140,7 +142,7 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
         InputError, match=r"00001D\.png is 2x2 pixels but its label is 4x4.*nearest"
     ):
         score_folder(folder, tiny, "test", STRIPS)
-    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
     scored = score_folder(folder, tiny, "test", options)
     # Each predicted pixel stands for 2 x 2: all of the car, all of the person are right.
     first = scored.counts[0].counts[0]
@@ -150,7 +152,7 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
 
 def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> None:
     folder = write({name: np.zeros((8, 4), np.uint8) for name in ("00001D", "00002N")})
-    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
     with pytest.raises(InputError, match="is 8x4 pixels and its label 4x4, which is another shape"):
         score_folder(folder, tiny, "test", options)
 
@@ -158,7 +160,7 @@ def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> Non
 def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> None:
     """3 columns on 4: centres at 0.375, 1.125, 1.875 and 2.625 lie in columns 0, 1, 1, 2."""
     folder = write({name: [[0, 1, 2]] * 3 for name in PREDICTIONS})
-    options = Options(partitions=("vertical",), regions=2, resize="nearest")
+    options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
     second = score_folder(folder, tiny, "test", options).counts[0].counts[1]  # label 0 everywhere
     np.testing.assert_array_equal(second[:, 0], [[4, 4, 0], [0, 4, 4]])
 
@@ -186,8 +188,8 @@ def test_progress_is_told_once_per_image(tiny: MFNet, write: Write) -> None:
 
 def test_unknown_choices_name_the_known_ones() -> None:
     with pytest.raises(InputError, match="'color' is not a choice; did you mean 'colour'"):
-        Options(form="color")  # type: ignore[arg-type]
+        ScoringOptions(form="color")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="'leave' is not a choice"):
-        Options(missing="leave")  # type: ignore[arg-type]
+        ScoringOptions(missing="leave")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="'linear' is not a choice"):
-        Options(resize="linear")  # type: ignore[arg-type]
+        ScoringOptions(resize="linear")  # type: ignore[arg-type]

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.predictions.table import Cell, ScoreTable, interval_cells, score_table, with_intervals
+from analysis.predictions.table import (
+    ScoreKey,
+    ScoreTable,
+    interval_cells,
+    score_table,
+    with_intervals,
+)
 from analysis.predictions.text import (
     COLUMNS,
     accuracy_grid,
@@ -43,7 +49,7 @@ def table() -> ScoreTable:
 
 def test_scores_by_hand(table: ScoreTable) -> None:
     def score(**keys: object) -> float:
-        return table.scores[replace(Cell(images="day"), **keys)].value  # type: ignore[arg-type]
+        return table.scores[replace(ScoreKey(images="day"), **keys)].value  # type: ignore[arg-type]
 
     # Day is the first image alone. Left: ground 4/5, car 3/4, no person; right: 4/5, 0/1, 1/3.
     assert score(region=1, class_name="ground") == pytest.approx(80)
@@ -63,7 +69,7 @@ def test_scores_by_hand(table: ScoreTable) -> None:
     assert score(region=2, class_name="car", absent="exclude") == 0
     assert np.isnan(score(region=2, class_name="car", metric="Acc", absent="exclude"))
     # All images: 16 more of ground that are right.
-    assert table.scores[Cell(class_name="ground")].value == pytest.approx(100 * 24 / 26)
+    assert table.scores[ScoreKey(class_name="ground")].value == pytest.approx(100 * 24 / 26)
     assert table.num_images == {"all": 2, "day": 1, "night": 1}
 
 

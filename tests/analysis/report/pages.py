@@ -17,7 +17,7 @@ import numpy as np
 from analysis.report.data import (
     CellEntry,
     DifferenceEntry,
-    Picture,
+    PagePicture,
     ReportData,
     RunEntry,
     StudyEntry,
@@ -269,13 +269,13 @@ def grid(runs: Sequence[RunEntry]) -> StudyEntry:
     )
 
 
-def mask(patch: int) -> Picture:
+def mask(patch: int) -> PagePicture:
     """A mask of random square patches, as CRM Fig. 5 shows."""
     cells = numpy_generator(0, "mask", patch).random((120 // patch + 1, 160 // patch + 1)) < 0.5
     image = np.kron(cells, np.ones((patch, patch)))[:120, :160].astype(np.uint8) * 255
     png = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
     caption = f"Half of the cells of {patch} pixels are masked in RGB, the others in thermal."
-    return Picture(
+    return PagePicture(
         title=f"Patches of {patch} pixels",
         caption=caption,
         address=f"data:image/png;base64,{png}",

@@ -11,7 +11,7 @@ import yaml
 from optuna.distributions import FloatDistribution
 from optuna.trial import create_trial
 
-from analysis.report.store import Files
+from analysis.report.store import RunFiles
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
 from rgbt.randomness import numpy_generator
@@ -223,9 +223,9 @@ def record_search(runs_dir: Path, tracking: MlflowTracking) -> None:
     )
 
 
-def files_of(folder: Path, **texts: str) -> Files:
-    """Files in a folder: dots of the names are written as two underscores."""
+def files_of(folder: Path, **texts: str) -> RunFiles:
+    """RunFiles in a folder: dots of the names are written as two underscores."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name.replace("__", ".")).write_text(text)
-    return Files((folder,))
+    return RunFiles((folder,))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.report import tables
-from analysis.report.collect import Asked, collect
+from analysis.report.collect import ReportRequest, collect
 from analysis.report.data import CellEntry, ReportData, RunEntry, TableEntry
 from analysis.report.store import read_store
 from analysis.uncertainty import Resampling, compare, estimate
@@ -42,7 +42,9 @@ def tracker(runs_dir: Path, **changed: Any) -> MlflowTracking:
 
 
 def collected(runs_dir: Path, tracking: Any = None) -> ReportData:
-    asked = Asked(tracking or tracker(runs_dir), runs_dir, RESAMPLES, "python -m analysis.report")
+    asked = ReportRequest(
+        tracking or tracker(runs_dir), runs_dir, RESAMPLES, "python -m analysis.report"
+    )
     return collect(asked, quiet)
 
 

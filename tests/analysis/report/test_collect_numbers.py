@@ -13,15 +13,16 @@ import pytest
 from analysis.report import collect
 from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import cell_of
-from analysis.report.tables_files import Line, Recorded
-from analysis.report.tables_intervals import OWN, Intervals, Source
-from analysis.report.tables_scored import Draft, asked_of, score_again, values_of
+from analysis.report.tables_files import RecordedCell, RecordedTable
+from analysis.report.tables_intervals import CountsSource, Intervals
+from analysis.report.tables_scored import RescoredTable, asked_of, score_again, values_of
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.randomness import numpy_generator
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import TABLE, counts_of, files_of
 from tests.analysis.report.test_collect_parts import run_of, stored
@@ -51,7 +52,7 @@ def test_variances_of_parts_are_no_percent() -> None:
 @pytest.mark.parametrize("absent", ["released", "exclude"])
 def test_intervals_score_absent_classes_as_the_table_does(absent: Any) -> None:
     runs = {f"k{seed}": run_of({}, seed, without_a_class(seed)) for seed in range(2)}
-    intervals, source = Intervals(runs), Source(tuple(runs), (OWN,), absent)
+    intervals, source = Intervals(runs), CountsSource(tuple(runs), (OWN_COUNTS,), absent)
     intervals.ask(source, "mIoU")
     intervals.compute(200, quiet)
     counts = [without_a_class(seed) for seed in range(2)]
@@ -71,7 +72,7 @@ def test_differences_score_absent_classes_as_the_runs_do() -> None:
     entries = difference_entries([run for side in sides for run in side], 200, quiet)
     effect = next(each.effect for each in entries if each.topic == choice.topic)
     expected = compare(
-        *([run.counts for run in side if run.counts] for side in sides),
+        *([run.counts() for run in side] for side in sides),
         metrics=["mIoU"],
         settings=Resampling(resamples=200, absent="exclude"),
     ).differences[0]
@@ -80,19 +81,19 @@ def test_differences_score_absent_classes_as_the_runs_do() -> None:
     assert "not corrected" in effect
 
 
-def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -> Draft:
+def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -> RescoredTable:
     """Row A with one run per seed, recorded with `seeds` of them."""
     path = tmp_path / "t.yaml"
     path.write_text(text)
-    line = Line(1.0, None, seeds, None, "", tuple(runs))
-    recorded = Recorded(
+    line = RecordedCell(1.0, None, seeds, None, "", tuple(runs))
+    recorded = RecordedTable(
         name="own/t",
         scale="paper",
         seeds=tuple(range(seeds)),
         lines={("A", column): line for column in ("mIoU", "rgb", "drop")},
         orders={},
     )
-    return Draft(recorded, score_again(recorded, load_table(str(path)), runs))
+    return RescoredTable(recorded, score_again(recorded, load_table(str(path)), runs))
 
 
 def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
@@ -126,13 +127,13 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
     path = tmp_path / "t.yaml"
     path.write_text(TABLE.replace("needs: the consistency metrics", "parameters: true"))
     lines = {
-        ("A", "TC"): Line(54.36, None, 0, None, "", ()),
-        ("B", "TC"): Line(44.56, None, 0, None, "", ()),
-        ("C", "TC"): Line(None, None, 0, None, "", ()),
+        ("A", "TC"): RecordedCell(54.36, None, 0, None, "", ()),
+        ("B", "TC"): RecordedCell(44.56, None, 0, None, "", ()),
+        ("C", "TC"): RecordedCell(None, None, 0, None, "", ()),
     }
-    recorded = Recorded(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
+    recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
     scored = score_again(recorded, load_table(str(path)), {})
-    found = Draft(recorded, scored)
+    found = RescoredTable(recorded, scored)
     assert {place: cell.mean for place, cell in scored.cells.items()} == {
         ("A", "TC"): 54.36,
         ("B", "TC"): 44.56,
@@ -163,7 +164,7 @@ def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path
     assert values_of(found, row, column, runs) == ()  # recorded without the column
     assert found.scored.cells["A", "TC"].mean == pytest.approx(sum(expected) / 2)
     asked = asked_of(found, row, column)
-    source = Source(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), None)
+    source = CountsSource(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), None)
     assert asked == (source, "class/car/TC")
     intervals = Intervals(runs)
     intervals.ask(*asked)
@@ -186,10 +187,10 @@ def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> No
 def test_of_a_run_that_is_there_twice_the_finished_one_is_shown(
     order: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one: StoredRun = stored(files_of(tmp_path), rgbt__key="k0")
+    one: MlflowRun = stored(files_of(tmp_path), rgbt__key="k0")
     both = [replace(one, status="FAILED", run_id="failed"), replace(one, run_id="finished")]
 
-    def opened(each: StoredRun, remarks: list[str]) -> Any:
+    def opened(each: MlflowRun, remarks: list[str]) -> Any:
         del remarks
         run = run_of({}, 0)
         return replace(run, entry=replace(run.entry, status=each.status, run_id=each.run_id))

@@ -13,20 +13,21 @@ from analysis.report import masks
 from analysis.report.data import RunEntry
 from analysis.report.differences import Choice, Side, find_pairs, load_choices
 from analysis.report.masks import data_address, mask_pictures, maskers_in_use
-from analysis.report.runs import Run
-from analysis.report.runs_provenance import commit_of, host_of, read_provenance, repeat_command
-from analysis.report.store import Files, StoredRun
+from analysis.report.runs import ReportRun
+from analysis.report.runs_provenance import host_of, read_provenance, repeat_command
+from analysis.report.store import MlflowRun, RunFiles
 from analysis.report.studies import pareto_front, read_study
 from analysis.report.tables_files import read_recorded, reproduce_command
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
 from rgbt.metrics.counts import Counts
+from rgbt.tracking.provenance import commit_of
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
 from tests.composed import composed as configuration
 
 
-def stored(files: Files, **tags: str) -> StoredRun:
-    return StoredRun(
+def stored(files: RunFiles, **tags: str) -> MlflowRun:
+    return MlflowRun(
         run_id="id",
         name="made",
         status="FINISHED",
@@ -39,7 +40,7 @@ def stored(files: Files, **tags: str) -> StoredRun:
     )
 
 
-def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) -> Run:
+def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) -> ReportRun:
     """A run with that configuration, by dotted key."""
     entry = RunEntry(
         key=f"k{seed}",
@@ -68,12 +69,12 @@ def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) 
         dataset="",
         config={},
     )
-    return Run(
+    return ReportRun(
         entry=entry,
-        counts=counts or counts_of(seed),
+        test_counts=counts or counts_of(seed),
         absent="released",
         config={"seed": seed, **config},
-        files=Files(()),
+        files=RunFiles(()),
     )
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from analysis.report import collect as collecting
-from analysis.report.store import Files, StoredRun, read_store
+from analysis.report.store import MlflowRun, RunFiles, read_store
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from tests.analysis.report.stores import RGB, RGB_FILE
 
 
-def read(runs_dir: Path, uri: str | None = None) -> list[StoredRun]:
+def read(runs_dir: Path, uri: str | None = None) -> list[MlflowRun]:
     given: dict[str, Any] = {"artifact_uri": None, "experiment": "rgbt", "runs_dir": str(runs_dir)}
     return read_store(MlflowTracking(uri, **given), runs_dir, runs_dir)
 
@@ -47,10 +47,10 @@ def test_evaluation_path_is_that_of_sweeps() -> None:
 
 
 def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stored(run_id: str, **tags: str) -> StoredRun:
+    def stored(run_id: str, **tags: str) -> MlflowRun:
         known = {"run_id": run_id, "name": run_id, "status": "RUNNING", "started": ""}
-        return StoredRun(
-            **known, seconds=None, tags=tags, params={}, metrics={}, files=Files((), None)
+        return MlflowRun(
+            **known, seconds=None, tags=tags, params={}, metrics={}, files=RunFiles((), None)
         )
 
     both = [stored("new"), stored("old", **{"rgbt.replaced": "true"})]
@@ -59,6 +59,6 @@ def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(collecting, entries, lambda *_: ())
     tracking = MlflowTracking("sqlite:///x", artifact_uri=None, experiment="r", runs_dir="x")
     data = collecting.collect(
-        collecting.Asked(tracking, tmp_path, 1, ""), lambda things, _: list(things)
+        collecting.ReportRequest(tracking, tmp_path, 1, ""), lambda things, _: list(things)
     )
     assert [run.run_id for run in data.runs] == ["new"]

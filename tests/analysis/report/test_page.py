@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from analysis.report import page
-from analysis.report.data import Picture, ReportData
+from analysis.report.data import PagePicture, ReportData
 from rgbt.checks import InputError
 from tests.analysis.report import pages
 
@@ -128,7 +128,7 @@ def test_folder_that_cannot_be_made_is_one_sentence(data: ReportData, tmp_path: 
 
 
 def test_picture_outside_the_data_is_refused(data: ReportData) -> None:
-    far = Picture(title="m", caption="", address="https://x.org/m.png", width=1, height=1)
+    far = PagePicture(title="m", caption="", address="https://x.org/m.png", width=1, height=1)
     with pytest.raises(ValueError, match="picture m: https"):
         page.page_text(replace(data, masks=(far,)))
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from analysis.report import page, tables
-from analysis.report.collect import Asked, collect
+from analysis.report.collect import ReportRequest, collect
 from analysis.report.data import ReportData
-from analysis.report.store import StoredRun
+from analysis.report.store import MlflowRun
 from analysis.report.tables_files import CSV_FILE, HEADER
 from rgbt.tracking.mlflow_store import MlflowTracking
 from tests.analysis.report.stores import files_of, record_search, write_run
@@ -34,7 +34,7 @@ def collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReportData:
     record_search(tmp_path / "runs", tracking)
     # Reading all published tables takes a second.
     monkeypatch.setattr(tables, "table_names", list)
-    asked = Asked(tracking, tmp_path / "runs", 100, "python -m analysis.report")
+    asked = ReportRequest(tracking, tmp_path / "runs", 100, "python -m analysis.report")
     return collect(asked, quiet)
 
 
@@ -77,7 +77,7 @@ def test_overrides_of_a_table_stand_beside_its_name(
         "short": "- Every row of ours was run with trainer.max_steps=9 loss.spatial.alpha=1.\n",
     }
     records = [
-        StoredRun(
+        MlflowRun(
             run_id=variant,
             name=f"{name} demo",
             status="FINISHED",

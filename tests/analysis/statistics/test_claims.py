@@ -7,7 +7,7 @@ import pytest
 
 from analysis.statistics.claims import claims
 from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Judge, decide, every, most
-from analysis.statistics.resampling import Blocks, ValueInterval
+from analysis.statistics.resampling import ConsecutiveBlocks, ValueInterval
 from rgbt.checks import InputError
 from tests.analysis.statistics.scenes import made
 
@@ -164,7 +164,7 @@ def test_verdicts() -> None:
 def test_a_mean_gets_the_t_interval_of_its_blocks() -> None:
     values = np.random.default_rng(0).normal(size=60)
     stats = made(images=60, night=False)
-    blocks = Blocks(stats, size=10, resamples=20_000)
+    blocks = ConsecutiveBlocks(stats, size=10, resamples=20_000)
     means = values.reshape(6, 10).mean(1)
     reach = 2.570581835636314 * means.std(ddof=1) / math.sqrt(6)  # t of 5 degrees, 97.5 %
     found = blocks.interval(blocks.mean(values))
@@ -174,7 +174,7 @@ def test_a_mean_gets_the_t_interval_of_its_blocks() -> None:
 
 def test_freedom_is_blocks_less_strata() -> None:
     """Day and night of 3 blocks each: 6 - 2 degrees, t = 2.776; the smaller stratum enlarges."""
-    blocks = Blocks(made(images=30), size=5, resamples=100)
+    blocks = ConsecutiveBlocks(made(images=30), size=5, resamples=100)
     samples = np.array([10.0, 9.0, 11.0, 9.0, 11.0])  # a standard error of 1
     found = blocks.interval(samples)
     reach = 2.7764451051977987 * math.sqrt(3 / 2)
@@ -185,7 +185,7 @@ def test_freedom_is_blocks_less_strata() -> None:
 
 def _judge(regions: int) -> Judge:
     stats = made(images=IMAGES, regions=regions, night=False)  # 12 blocks: 11 degrees of freedom
-    return Judge(stats, Blocks(stats, size=10, resamples=100), 0.95)
+    return Judge(stats, ConsecutiveBlocks(stats, size=10, resamples=100), 0.95)
 
 
 def test_of_many_steps_each_has_to_be_surer() -> None:
@@ -212,7 +212,7 @@ def test_centre_and_edge_are_thirds_of_the_regions(regions: int, third: int) -> 
 def test_blocks_are_neighbours_in_name_within_day_and_night() -> None:
     """Images listed backwards: blocks follow the names, and never join day and night."""
     stats = made(images=10)
-    blocks = Blocks(stats, size=2, resamples=100)
+    blocks = ConsecutiveBlocks(stats, size=2, resamples=100)
     assert blocks.sizes() == (3, 3)
     assert blocks.sizes("day") == (3,)
     present = np.zeros(10, bool)
@@ -254,7 +254,9 @@ def test_intervals_cover_what_they_should() -> None:
         values = np.exp(0.4 * scene + 0.2 * rng.normal(size=100))
         stats = made(images=100)
         for size in (10, 1):
-            blocks = Blocks(stats, size=size, resamples=400, seed=int(rng.integers(2**31)))
+            blocks = ConsecutiveBlocks(
+                stats, size=size, resamples=400, seed=int(rng.integers(2**31))
+            )
             ratio = blocks.mean(values, "day") / blocks.mean(values, "night")
             found = blocks.interval(ratio, scale="ratio")
             if size == 10:

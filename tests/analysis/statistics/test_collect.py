@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from analysis.statistics import derive
-from analysis.statistics.collect import CHUNK, Settings, collect
+from analysis.statistics.collect import CHUNK, MeasurementSettings, collect
 from analysis.statistics.data import SpatialStatistics
-from analysis.statistics.measure import ESTIMATORS, Meter
+from analysis.statistics.measure import ESTIMATORS, ImageMeter
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Regions
 from tests.analysis.statistics.scenes import InMemory, made, random_sample
 
 RINGS = Regions(partition="ring", regions=3, aspect="image", absent="released")
-SETTINGS = Settings(regions=RINGS, workers=1)
+SETTINGS = MeasurementSettings(regions=RINGS, workers=1)
 
 
 def memory(names: list[str], hw: tuple[int, int] = (24, 32)) -> InMemory:
@@ -43,7 +43,7 @@ def test_every_image_in_order_and_maps_by_part() -> None:
     stats = collect(dataset, "train", SETTINGS)
     assert stats.names == tuple(dataset.samples)
     assert stats.night.tolist() == [name.endswith("N") for name in stats.names]
-    meter = Meter(stats.region_map, 9)
+    meter = ImageMeter(stats.region_map, 9)
     for n, sample in enumerate(dataset.samples.values()):
         measured = meter(sample)
         np.testing.assert_array_equal(stats.labels[n], measured.labels)

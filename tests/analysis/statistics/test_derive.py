@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.statistics import derive
-from analysis.statistics.collect import Settings, collect
+from analysis.statistics.collect import MeasurementSettings, collect
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
 from rgbt.types import Sample
@@ -33,7 +33,9 @@ def planted(shares: tuple[float, ...], images: int, rng: np.random.Generator) ->
 
 def test_planted_occupancy_is_found() -> None:
     shares = (0.5, 0.3, 0.2, 0.05)
-    stats = collect(planted(shares, 6, np.random.default_rng(0)), "train", Settings(regions=RINGS))
+    stats = collect(
+        planted(shares, 6, np.random.default_rng(0)), "train", MeasurementSettings(regions=RINGS)
+    )
     np.testing.assert_allclose(derive.region_occupancy(stats), shares, atol=1e-3)
     map_ = derive.occupancy_map(stats)
     by_region = [map_[stats.region_map == r].mean() for r in range(4)]
@@ -53,7 +55,7 @@ def test_an_ignored_pixel_is_no_background() -> None:
         for n, label in enumerate(labels)
     ]
     whole = Regions(partition="vertical", regions=2, aspect=None, absent="released")
-    stats = collect(InMemory(samples), "train", Settings(regions=whole))
+    stats = collect(InMemory(samples), "train", MeasurementSettings(regions=whole))
     map_ = derive.occupancy_map(stats)
     np.testing.assert_allclose(map_[:, 0], [1 / 2, 2 / 3])
     assert map_[0, 1] == pytest.approx(1 / 3)
@@ -128,6 +130,6 @@ def test_unknown_words_are_refused(call, message: str) -> None:
 
 def test_a_part_without_images_is_refused() -> None:
     dataset = InMemory([random_sample("1D", (24, 32), np.random.default_rng(0))])
-    stats = collect(dataset, "train", Settings(regions=RINGS))
+    stats = collect(dataset, "train", MeasurementSettings(regions=RINGS))
     with pytest.raises(InputError, match="part=night: split 'train' of memory holds no such image"):
         derive.region_occupancy(stats, "night")

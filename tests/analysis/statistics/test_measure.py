@@ -10,7 +10,7 @@ from analysis.statistics.measure import (
     HAAR_BINS,
     MEDIAN_OF_NORMAL,
     TALLEST_BAND,
-    Meter,
+    ImageMeter,
     RegionSums,
     grouped_median,
 )
@@ -71,7 +71,7 @@ def reference(image: np.ndarray, region_map: np.ndarray, eight: bool) -> list[li
 def test_measure_against_a_loop_over_pixels(partition, regions, hw, kernel) -> None:
     region_map = regions_map(partition, regions, hw)
     image = random_sample("a", hw, np.random.default_rng(1)).thermal
-    found = Meter(region_map, 9, kernel).measure(image)
+    found = ImageMeter(region_map, 9, kernel).measure(image)
     expected = reference(image, region_map, kernel == "eight")
     for ours, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, wanted, rtol=1e-12)
@@ -82,7 +82,7 @@ def test_laplacian_variance_by_hand() -> None:
     # +10; but the border is mirrored, so the pixels above and below see it twice: +20 each.
     image = np.zeros((3, 5), np.uint8)
     image[1, 2] = 10
-    laplacian, mean, *_ = Meter(np.zeros((3, 5), np.uint8), 2).measure(image)
+    laplacian, mean, *_ = ImageMeter(np.zeros((3, 5), np.uint8), 2).measure(image)
     values = np.array([-40, 10, 10, 20, 20, *[0] * 10])
     assert laplacian[0] == pytest.approx((values**2).sum() / 15 - (values.sum() / 15) ** 2)
     assert mean[0] == pytest.approx(10 / 15)
@@ -92,7 +92,7 @@ def test_rgb_is_measured_as_grey() -> None:
     sample = random_sample("a", (8, 8), np.random.default_rng(0))
     red = np.zeros((8, 8, 3), np.uint8)
     red[..., 0] = 200
-    measured = Meter(np.zeros((8, 8), np.uint8), 9)(
+    measured = ImageMeter(np.zeros((8, 8), np.uint8), 9)(
         type(sample)(red, sample.thermal, sample.label, "a")
     )
     assert measured.mean[0, 0] == 60  # 0.299 * 200 = 59.8
@@ -109,7 +109,7 @@ def test_planted_noise_is_found_in_every_region(shape: str) -> None:
     if shape == "gradient":
         clean += np.linspace(-40, 40, hw[1]) + np.linspace(-20, 20, hw[0])[:, None]
     noisy = clean + rng.normal(size=hw) * sigmas[region_map]
-    found = Meter(region_map, 9).measure(np.clip(noisy.round(), 0, 255).astype(np.uint8))
+    found = ImageMeter(region_map, 9).measure(np.clip(noisy.round(), 0, 255).astype(np.uint8))
     np.testing.assert_allclose(found[IMMERKAER], sigmas, rtol=0.04)
     np.testing.assert_allclose(found[MAD], sigmas, rtol=0.04)
     if shape == "flat":
@@ -121,7 +121,7 @@ def test_planted_noise_is_found_in_every_region(shape: str) -> None:
 def test_noise_of_a_straight_edge_and_of_nothing() -> None:
     image = np.full((40, 40), 50, np.uint8)
     image[:, 20:] = 200
-    found = Meter(np.zeros((40, 40), np.uint8), 9).measure(image)
+    found = ImageMeter(np.zeros((40, 40), np.uint8), 9).measure(image)
     assert found[IMMERKAER][0] == 0
     # All magnitudes are 0: the median lies in the middle of [0, 0.5).
     assert found[MAD][0] == pytest.approx(0.25 / 2 / MEDIAN_OF_NORMAL)
@@ -141,7 +141,7 @@ def test_grouped_median_by_hand() -> None:
 def test_labels_are_counted_by_region() -> None:
     region_map = regions_map("ring", 3, (24, 32))
     sample = random_sample("a", (24, 32), np.random.default_rng(3))
-    labels, ignored = Meter(region_map, 9).count_labels(sample.label)
+    labels, ignored = ImageMeter(region_map, 9).count_labels(sample.label)
     for r in range(3):
         inside = sample.label[region_map == r]
         assert labels[r].tolist() == [int((inside == k).sum()) for k in range(9)]
@@ -170,7 +170,7 @@ def test_sums_of_a_map_without_any_order() -> None:
 def test_largest_values_do_not_overflow() -> None:
     """A checkerboard of 0 and 255 has the largest Laplacian there is, over 300 rows."""
     image = (np.indices((300, 300)).sum(0) % 2 * 255).astype(np.uint8)
-    found = Meter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
+    found = ImageMeter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
     assert found[0][0] == pytest.approx(1020.0**2)
 
 
@@ -186,7 +186,7 @@ def test_sums_of_many_rows_do_not_overflow() -> None:
 def test_a_region_without_a_window_has_no_noise() -> None:
     region_map = np.zeros((4, 4), np.uint8)
     region_map[3, 3] = 1  # neither inside the border nor the first pixel of a block
-    found = Meter(region_map, 9).measure(np.zeros((4, 4), np.uint8))
+    found = ImageMeter(region_map, 9).measure(np.zeros((4, 4), np.uint8))
     assert np.isnan(found[IMMERKAER][1])
     assert np.isnan(found[MAD][1])
     assert len(found) == 2 + len(ESTIMATORS)
@@ -194,4 +194,4 @@ def test_a_region_without_a_window_has_no_noise() -> None:
 
 def test_refuses_an_unknown_kernel() -> None:
     with pytest.raises(InputError, match="kernel: 'for' is not a choice; did you mean 'four'"):
-        Meter(np.zeros((4, 4), np.uint8), 9, "for")
+        ImageMeter(np.zeros((4, 4), np.uint8), 9, "for")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.uncertainty.blocks import FEWEST, Blocks, block_length, make_blocks
+from analysis.uncertainty.blocks import FEWEST, ImageBlocks, block_length, make_blocks
 from rgbt.checks import InputError
 
 NOTHING = np.empty((0, 0))
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[3]
 LISTS = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"
 
 
-def members(blocks: Blocks, names: list[str]) -> set[frozenset[str]]:
+def members(blocks: ImageBlocks, names: list[str]) -> set[frozenset[str]]:
     assert blocks.index.shape == (len(names),)
     assert set(blocks.index.tolist()) == set(range(blocks.count))
     return {

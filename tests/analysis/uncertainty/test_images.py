@@ -10,7 +10,7 @@ import pytest
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty import images as room
-from analysis.uncertainty.images import Images, _influence, common, prepare
+from analysis.uncertainty.images import CommonImages, _influence, common, prepare
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
@@ -213,7 +213,7 @@ def test_half_of_the_blocks_are_exchanged(monkeypatch: pytest.MonkeyPatch):
 # Draws.
 
 
-def numbers(images: Images) -> np.ndarray:
+def numbers(images: CommonImages) -> np.ndarray:
     return np.concatenate([*images.resampled(ASKED), *images.swapped(ASKED)])
 
 

@@ -1,4 +1,4 @@
-"""From arguments to single figures of the papers, each read from `Given`.
+"""The figures of the papers, each made from what was given on the command line.
 
 Everything heavy is imported when a figure is made, so that the list of figures is there at once.
 """
@@ -7,7 +7,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from analysis.figures.inputs import Given, check_one_dataset
+from analysis.figures.figure_spec import (
+    DATASET_AND_METRIC,
+    OF_RUNS,
+    RUNS,
+    SPATIAL,
+    STATISTICS,
+    figure,
+)
+from analysis.figures.inputs import FigureInput, check_one_dataset
+from analysis.figures.qualitative import qualitative
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
@@ -17,7 +26,15 @@ PARTS = ("all", "day", "night")
 STRIPS_AND_RINGS = ("vertical", "horizontal", "ring")
 
 
-def spatialseg_fig1(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig1",
+    "pixel-level IoU and sample occupancy, with centre, edge and mean",
+    f"maps= (of analysis.score) for (a); {STATISTICS} for (b)",
+    keys=("maps", "part", *SPATIAL),
+    groups=DATASET_AND_METRIC,
+    idle=(),
+)
+def spatialseg_fig1(given: FigureInput) -> Figure:
     """Heat maps of IoU and of sample occupancy."""
     from analysis.figures import maps
 
@@ -44,7 +61,14 @@ def spatialseg_fig1(given: Given) -> Figure:
     return maps.draw_heats(heats)
 
 
-def spatialseg_fig2(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig2",
+    "IoU, accuracy and occupancy over vertical, horizontal and ring regions",
+    f"methods=label:folder (of analysis.score); {STATISTICS}",
+    keys=("methods", "regions", "absent", *SPATIAL),
+    groups=("dataset",),
+)
+def spatialseg_fig2(given: FigureInput) -> Figure:
     """IoU, accuracy and occupancy over three partitions."""
     from analysis.figures import trends
     from analysis.figures.maps import occupancy_over
@@ -67,7 +91,15 @@ def spatialseg_fig2(given: Given) -> Figure:
     return trends.draw(series, splits=(statistics.split, of_methods.split))
 
 
-def spatialseg_fig3(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig3",
+    "occupancy of each class by region, and the mIoU of a method",
+    f"{STATISTICS}; methods=label:folder for the mIoU",
+    keys=("methods", "part", "absent", *SPATIAL),
+    groups=DATASET_AND_METRIC,
+    metric="ring9",
+)
+def spatialseg_fig3(given: FigureInput) -> Figure:
     """Occupancy of each class, and mIoU, by region."""
     from analysis.figures import classes
 
@@ -86,7 +118,15 @@ def spatialseg_fig3(given: Given) -> Figure:
     return classes.draw(made, splits=(statistics.split, method[1].split if method else ""))
 
 
-def spatialseg_fig4(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig4",
+    "the regions, numbered, over a heat map or an image; any partition with metric=",
+    "maps=, statistics= or dataset= (with names=)",
+    keys=("maps", "names", *SPATIAL),
+    groups=DATASET_AND_METRIC,
+    metric="ring9",
+)
+def spatialseg_fig4(given: FigureInput) -> Figure:
     """A partition over a heat map or an image."""
     from analysis.figures import maps
     from analysis.predictions.maps import iou_map
@@ -116,29 +156,57 @@ def spatialseg_fig4(given: Given) -> Figure:
     return maps.draw_regions(maps.RegionPicture(picture, region_map, given.regions.name, what))
 
 
-def spatialseg_fig5(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig5",
+    "Laplacian variance by region: RGB and thermal, all, day, night",
+    STATISTICS,
+    keys=SPATIAL,
+    groups=DATASET_AND_METRIC,
+    metric="ring9",
+)
+def spatialseg_fig5(given: FigureInput) -> Figure:
     """Laplacian variance by region."""
     from analysis.figures import image_quality
-    from analysis.statistics.resampling import Blocks
+    from analysis.statistics.resampling import ConsecutiveBlocks
 
     statistics = given.statistics(by_region=True)
-    return image_quality.draw(image_quality.laplacian_series(statistics, Blocks(statistics)))
+    return image_quality.draw(
+        image_quality.laplacian_series(statistics, ConsecutiveBlocks(statistics))
+    )
 
 
-def spatialseg_fig6(given: Given) -> Figure:
+@figure(
+    "spatialseg/fig6",
+    "signal-to-noise ratio by region: RGB and thermal, all, day, night",
+    STATISTICS,
+    keys=("estimator", "average", *SPATIAL),
+    groups=DATASET_AND_METRIC,
+    metric="ring9",
+)
+def spatialseg_fig6(given: FigureInput) -> Figure:
     """Signal-to-noise ratio by region."""
     from analysis.figures import image_quality
     from analysis.statistics.derive import AVERAGES
     from analysis.statistics.measure import ESTIMATORS
-    from analysis.statistics.resampling import Blocks
+    from analysis.statistics.resampling import ConsecutiveBlocks
 
     estimator, average = given.get("estimator", ESTIMATORS[0]), given.get("average", AVERAGES[0])
     statistics = given.statistics(by_region=True)
-    series = image_quality.snr_series(statistics, Blocks(statistics), estimator, average)
+    series = image_quality.snr_series(statistics, ConsecutiveBlocks(statistics), estimator, average)
     return image_quality.draw(series)
 
 
-def temporal_fig5(given: Given) -> Figure:
+spatialseg_fig8 = qualitative("spatialseg/fig8", "qualitative results")
+spatialseg_fig9 = qualitative("spatialseg/fig9", "qualitative results on another data set")
+
+
+@figure(
+    "temporal/fig5",
+    "TC and CA of variants by class",
+    f"{RUNS}, with counts of pairs of frames (python -m rgbt.consistency)",
+    keys=("frames", *OF_RUNS),
+)
+def temporal_fig5(given: FigureInput) -> Figure:
     """TC and CA by class."""
     from analysis.figures import consistency
 
@@ -148,15 +216,20 @@ def temporal_fig5(given: Given) -> Figure:
     return consistency.draw(consistency.class_consistency(runs, absent))
 
 
-def multihead_fig3(given: Given) -> Figure:
-    """Gradients of two losses."""
-    from analysis.figures import gradients
-
-    del given  # analytic: made from nothing
-    return gradients.draw(gradients.gradient_curves())
+temporal_fig6 = qualitative(
+    "temporal/fig6", "qualitative results, one column per image with layout=columns"
+)
+crm_fig4 = qualitative("crm/fig4", "qualitative results")
 
 
-def crm_fig5(given: Given) -> Figure:
+@figure(
+    "crm/fig5",
+    "masks: a square, and patches of 8, 16, 32 and 64 pixels, on a pair of images",
+    "dataset=",
+    keys=("names", "split", "patches", "seed"),
+    groups=("dataset",),
+)
+def crm_fig5(given: FigureInput) -> Figure:
     """Masks on a pair of images."""
     from analysis.figures import masks
     from rgbt.config.command import built
@@ -169,7 +242,20 @@ def crm_fig5(given: Given) -> Figure:
     return masks.draw(masks.mask_examples(sample, maskers, multiple, given.get("seed", 0)))
 
 
-def _one_name(given: Given) -> str:
+@figure(
+    "multihead/fig3",
+    "gradients of entropy minimisation and maximum squares loss",
+    "nothing: analytic",
+)
+def multihead_fig3(given: FigureInput) -> Figure:
+    """Gradients of two losses."""
+    from analysis.figures import gradients
+
+    del given  # analytic: made from nothing
+    return gradients.draw(gradients.gradient_curves())
+
+
+def _one_name(given: FigureInput) -> str:
     names = given.names(1)
     if len(names) > 1:
         raise InputError(f"names: figure={given.figure} shows one image, got {len(names)}.")
