@@ -59,9 +59,9 @@ def main(options: Options, overrides: list[str]) -> int:
         consistency_title,
         count_pairs,
     )
-    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.run_folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     split, frames, out = options.split, options.frames, options.out
     if not any(item.split("=")[0] == "consistency" for item in overrides):
@@ -76,8 +76,8 @@ def main(options: Options, overrides: list[str]) -> int:
     pairs = count_pairs(session, session.model, request, frames)
     table = consistency_table(pairs.counts, session.regions.absent)
     title = consistency_title(pairs, opened.label, session.dataset.name)
-    show(rich_table(consistency_grid(table, title)))
-    show(place_lines(files.write(pairs)))
+    print_rich(rich_table(consistency_grid(table, title)))
+    print_rich(path_lines(files.write(pairs)))
     if frames == "virtual" and network.run and not (out or files.suffixes):
         add_to_result(RunFolder(opened.folder.parent), session, split, table)
     return 0

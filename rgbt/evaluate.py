@@ -61,7 +61,7 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation.segmentation import evaluate
     from rgbt.evaluation.segmentation_files import counts_path, overview
-    from rgbt.tracking.terminal import show
+    from rgbt.tracking.terminal import print_rich
     from rgbt.training.overview import announce_network
 
     if options.out is not None and options.out.is_dir():
@@ -73,7 +73,7 @@ def main(options: Options, overrides: list[str]) -> int:
     path = options.out or counts_path(opened, network, request, result)
     path.parent.mkdir(parents=True, exist_ok=True)
     result.counts.save(path)
-    show(overview(opened, request, result, path))
+    print_rich(overview(opened, request, result, path))
     return 0
 
 

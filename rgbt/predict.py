@@ -95,7 +95,7 @@ def _pseudo_labels(
     options: Options, opened: TrainedNetwork, request: EvaluationRequest, labelling: Labelling
 ) -> None:
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     session, splits = opened.session, opened.session.dataset.splits
     if request.split not in splits or options.rgb or options.thermal:
@@ -106,8 +106,8 @@ def _pseudo_labels(
     key_or_file = opened.folder.parent.name if options.run else opened.label
     teacher = teacher_of(key_or_file, session.model)
     labels = write_pseudo_labels(session, teacher, request, labelling, options.out)
-    show(rich_table(summary(labels)))
-    show(place_lines([("pseudo-labels", str(labels.folder.resolve()))]))
+    print_rich(rich_table(summary(labels)))
+    print_rich(path_lines([("pseudo-labels", str(labels.folder.resolve()))]))
 
 
 entry = PlainCommand(Options, main)

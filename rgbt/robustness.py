@@ -64,8 +64,8 @@ def main(options: Options, overrides: list[str]) -> int:
         robustness_title,
         write_tables,
     )
-    from rgbt.tracking.folder import find_run
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.run_folder import find_run
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     words, overrides = split_overrides(overrides)
     split, out = options.split, options.out
@@ -91,8 +91,8 @@ def main(options: Options, overrides: list[str]) -> int:
         measured = measure(opened.session, split, corruptions, folder)
         grid = robustness_grid(measured, robustness_title(opened, split))
         write_tables(measured, grid, folder / stem)
-        show(rich_table(grid))
-        show(place_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
+        print_rich(rich_table(grid))
+        print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
     return 0
 
 

@@ -26,7 +26,7 @@ from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
 from rgbt.spec.corruption_names import row_name
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import Grid, number
+from rgbt.tracking.tables import TextTable, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -264,7 +264,7 @@ def numbers(data: Sequence[Panel]) -> dict[str, str]:
         rows.append((*said, *cells))
     title = "mIoU in percent, mean ± standard deviation over seeds (percent of the clean mIoU)"
     methods = [curve.method for curve in data[0].curves]
-    grid = Grid(title, (ROW, "severity", *methods), tuple(rows))
+    grid = TextTable(title, (ROW, "severity", *methods), tuple(rows))
     return {".md": grid.to_markdown(), ".csv": csv_text(lines)}
 
 

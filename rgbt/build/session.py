@@ -37,7 +37,7 @@ from rgbt.metrics.metric import Regions
 from rgbt.build.initial_weights import start_from_weights
 from rgbt.randomness import derive
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.pictures import Example, Legend
+from rgbt.tracking.pictures import PanelExample, Legend
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import VIEWS, View

@@ -18,14 +18,14 @@ from rgbt.evaluation.temporal_consistency import (
 )
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, partition_name
-from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.formats import read_marker
-from rgbt.tracking.mlflow_fill import read_sent
+from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.pair_pictures import draw_pairs
+from rgbt.tracking.run_files import read_marker
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.sync import Options as SyncOptions
 from rgbt.tracking.sync import status_of, tracking_of
 from rgbt.tracking.tables import ConsistencyTable, without_nan
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PairFiles:
             counts.save(paths[protocol])
         lines = [(f"counts, {protocol}", str(path)) for protocol, path in paths.items()]
         if not pairs.kept:
-            tell("none of the images of the picture could be read; it was not drawn.")
+            info("none of the images of the picture could be read; it was not drawn.")
             return lines
         # Named like the counts that it shows, those of the first protocol.
         first = next(iter(paths.values()))
@@ -126,10 +126,10 @@ def add_to_result(run: RunFolder, session: Session, split: str, table: Consisten
     if kind == "test":
         run.write_tables({**tables, "consistency": without_nan(asdict(table))})
     run.finish(result)
-    if read_sent(run) is None:
+    if read_upload_state(run) is None:
         return
     try:
         tracking_of(run, SyncOptions(run=run.path)).sync(run, status_of(run))
     except Exception as error:  # any store may fail in its own way; the folder has everything
         reason = (str(error).splitlines() or [""])[0]
-        tell(f"MLflow was not updated ({reason}); rgbt sync run={run.path} updates it.")
+        info(f"MLflow was not updated ({reason}); rgbt sync run={run.path} updates it.")

@@ -20,7 +20,7 @@ from rgbt.evaluation.prediction import heads_of, view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import overlay
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from rgbt.types import Sample
 
 
@@ -83,9 +83,9 @@ def write_images(
             written += 1
             display.advance(task)
     for reason in list(images.skipped.values())[:1]:
-        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
+        info(f"{len(images.skipped)} image(s) left out; the first: {reason}")
     for path in images.others[:1]:
-        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
+        info(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
     return f"{written} images in {out.resolve()}"
 
 

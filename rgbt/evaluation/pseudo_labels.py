@@ -45,8 +45,8 @@ from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.tables import Grid, percent
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.tables import TextTable, percent
+from rgbt.tracking.terminal import info
 from rgbt.types import IGNORE, Sample
 
 BEGUN = "pseudo_labels.begun.json"
@@ -159,7 +159,7 @@ def write_pseudo_labels(
     return PseudoLabels(out)
 
 
-def summary(labels: PseudoLabels) -> Grid:
+def summary(labels: PseudoLabels) -> TextTable:
     """Which share of the pixels got which class, and how sure the teacher was of them."""
     manifest = labels.manifest
     by_class = [manifest["by_class"][name] for name in labels.classes]
@@ -174,7 +174,7 @@ def summary(labels: PseudoLabels) -> Grid:
     share = manifest["kept"]
     kept = ("kept", percent(share), _percent(total / share if share else None))
     whole = ("all pixels", percent(1.0), percent(manifest["mean_confidence"]))
-    return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
+    return TextTable(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
 
 
 def _percent(fraction: float | None) -> str:
@@ -249,7 +249,7 @@ def _alone(out: Path) -> Iterator[None]:
         if holder is None:
             yield from _tidied(out)
             return
-    tell(f"{out} is being written by {holder}; waiting for it.")
+    info(f"{out} is being written by {holder}; waiting for it.")
     with holding(out / LOCK, wait_s=math.inf):
         yield from _tidied(out)
 

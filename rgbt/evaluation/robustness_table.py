@@ -10,7 +10,7 @@ from rgbt.evaluation.request import NetworkRequest
 from rgbt.evaluation.robustness import CLEAN, Measured, read_json
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import Grid, percent
+from rgbt.tracking.tables import TextTable, percent
 
 FOLDER = "robustness"
 """Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
@@ -35,7 +35,7 @@ def robustness_title(opened: TrainedNetwork, split: str) -> str:
     return f"Robustness of {opened.label}{seed} ({session.dataset.name}, {split}): mIoU in percent"
 
 
-def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
+def robustness_grid(measured: Sequence[Measured], title: str) -> TextTable:
     """One line per corruption; level 0 is the clean image, level n the n-th severity.
 
     Args:
@@ -57,10 +57,10 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
         lines.append((first.title, severities, *values, *empty))
     lines = lines or [(CLEAN, "", percent(clean.mious["mIoU"]))]
     header = ("", "severities", *(f"level {level}" for level in range(levels + 1)))
-    return Grid(title, header, tuple(lines))
+    return TextTable(title, header, tuple(lines))
 
 
-def write_tables(measured: Sequence[Measured], grid: Grid, path: Path) -> None:
+def write_tables(measured: Sequence[Measured], grid: TextTable, path: Path) -> None:
     """Write the numbers to `path` with .csv added and the table to `path` with .md added."""
     scores = list(measured[0].mious)
     rows: list[tuple[object, ...]] = [("row", "title", "unit", "severity", "view", *scores)]

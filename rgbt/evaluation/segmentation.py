@@ -20,7 +20,7 @@ from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.tracking.pictures import Example, Legend
+from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.types import View
 
@@ -41,7 +41,7 @@ class EvaluationResult:
 
     counts: Counts
     view: View
-    kept: tuple[Example, ...]
+    kept: tuple[PanelExample, ...]
     skipped: tuple[str, ...]
 
 
@@ -65,7 +65,7 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: dict[str, np.ndarray] = {}
-    kept: list[Example] = []
+    kept: list[PanelExample] = []
     heads = heads_of(session, view, request.head)
     with progress() as display:
         total = len(dataset.names(request.split))
@@ -98,10 +98,10 @@ def _counts(session: Session, split: str, counted: dict[str, np.ndarray]) -> Cou
     )
 
 
-def _example(session: Session, name: str, classes: np.ndarray) -> Example:
+def _example(session: Session, name: str, classes: np.ndarray) -> PanelExample:
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
-    return Example(name, sample.rgb, sample.thermal, label, classes)
+    return PanelExample(name, sample.rgb, sample.thermal, label, classes)
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:

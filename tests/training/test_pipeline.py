@@ -22,7 +22,7 @@ from rgbt.spec import upstream
 from rgbt.spec.naming import TAGS, describe
 from rgbt.spec.run_spec import Dependency, RunSpec
 from rgbt.spec.specify import specify
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.training import pipeline
 from tests.commands import Call, Trained, short
 from tests.composed import composed
