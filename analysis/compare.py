@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent
-    from rgbt.tracking.tables import Grid
+    from rgbt.tracking.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.robustness import under
     from analysis.uncertainty import compare
     from analysis.uncertainty.sentence import sentence
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.terminal import print_rich, rich_table
 
     del overrides  # none is heeded
     frames, degradation, severity = options.frames, options.degradation, options.severity
@@ -118,9 +118,9 @@ def main(options: Options, overrides: list[str]) -> int:
     notes = absent_classes([*a, *b], settings.absent)
     grid = replace(comparison_grid(comparison, labels), notes=notes)
     said = sentence(comparison, *labels)
-    show(rich_table(grid))
+    print_rich(rich_table(grid))
     below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
-    show(escape("\n".join(filter(None, below))))
+    print_rich(escape("\n".join(filter(None, below))))
     if options.out is not None:
         _write(options.out, grid, said, comparison)
     return 0
@@ -174,14 +174,14 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
     return [*headlines, *by_region, *parts]
 
 
-def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
+def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     """One line per score.
 
     Args:
         comparison: of two methods.
         labels: what they are called.
     """
-    from rgbt.tracking.tables import Grid, number
+    from rgbt.tracking.tables import TextTable, number
 
     with_seeds = any(difference.both is not None for difference in comparison.differences)
     level = f"{100 * comparison.level:g} %"
@@ -200,7 +200,7 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> Grid:
     )
     title = f"{labels[1]} less {labels[0]}: {drawn}, {comparison.partition}"
     header = ("", *labels, "difference", *over, *more, "p (Holm)")
-    return Grid(title, header, tuple(rows))
+    return TextTable(title, header, tuple(rows))
 
 
 def part_lines(comparison: Comparison) -> list[str]:
@@ -246,7 +246,7 @@ def _counts(
     opened: Sequence[tuple[NamedCounts, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
     from analysis.uncertainty.images import common
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
@@ -257,7 +257,7 @@ def _counts(
         methods = common(methods)
         left = before - len(methods[0][0].names)
         if left:
-            tell(f"{left} of {before} images are not in all counts and were left out.")
+            info(f"{left} of {before} images are not in all counts and were left out.")
     return methods[0], methods[1]
 
 
@@ -311,14 +311,14 @@ def _p(value: float) -> str:
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def _write(out: Path, grid: Grid, said: str, comparison: Comparison) -> None:
+def _write(out: Path, grid: TextTable, said: str, comparison: Comparison) -> None:
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import place_lines, show
+    from rgbt.tracking.terminal import path_lines, print_rich
 
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
     write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
-    show(place_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
+    print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
 
 
 def comparison_csv(comparison: Comparison) -> str:

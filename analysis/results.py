@@ -14,9 +14,9 @@ from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
 from rgbt.spec.naming import GROUP, group_of
-from rgbt.tracking.folder import Description, find_run, runs_in
+from rgbt.tracking.run_folder import Description, find_run, runs_in
 from rgbt.tracking.run_result import RunResult
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 
 SEED = "rgbt.seed"
 
@@ -83,7 +83,7 @@ def open_counts(
     _check_trainings_differ(text, found)
     labels = dict.fromkeys(each.label for each in found)
     if len(labels) > 1:
-        tell(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
+        info(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
     return tuple(found)
 
 
@@ -193,7 +193,7 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
     path = _pairs_of_frames(run, split, frames) if frames else _single_frames(run, split)
     if not run.is_finished:
-        tell(f"{run.folder} is not finished; its counts are those of its last evaluation.")
+        info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     description = _description(run)
     seed = description.tags.get(SEED, "")
     return NamedCounts(

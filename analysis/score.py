@@ -175,7 +175,7 @@ def score_tables(
 
 def write_counts(scored: FolderScores, out: Path) -> None:
     """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     out.mkdir(parents=True, exist_ok=True)
     # The predictions may be other ones than at the last time: earlier counts and maps would pass
@@ -184,7 +184,7 @@ def write_counts(scored: FolderScores, out: Path) -> None:
     new = {f"counts_{counts.partition}.npz" for counts in scored.counts}
     gone = sorted(path.name for path in earlier if path.name not in new)
     if gone:
-        tell(f"removed from {out}, because counted by an earlier call: {', '.join(gone)}.")
+        info(f"removed from {out}, because counted by an earlier call: {', '.join(gone)}.")
     for path in (*earlier, out / "maps.npz"):
         path.unlink(missing_ok=True)
     for counts in scored.counts:
@@ -210,7 +210,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
     from analysis.predictions.text import convention_line, grids, markdown, tidy_csv
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     places = []
     if out is not None:
@@ -223,11 +223,11 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
         places += [("counts", f"{out}/ ({', '.join(counts)})")] if counts else []
     for table in tables:
         said = "\n".join(filter(None, (convention_line(table), table.intervals)))
-        show(Group(*map(rich_table, grids(table)), Text(f"{said}\n")))
+        print_rich(Group(*map(rich_table, grids(table)), Text(f"{said}\n")))
     if remarks:
-        show(Text("\n".join(remarks)))
+        print_rich(Text("\n".join(remarks)))
     if places:
-        show(place_lines(places))
+        print_rich(path_lines(places))
 
 
 def _scored(options: ScoringOptions, overrides: list[str]) -> FolderScores:
@@ -258,7 +258,7 @@ def _counting(options: ScoringOptions) -> Counting:
 
 def _stored(options: ScoringOptions, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     default = ScoringOptions()
     without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]
@@ -269,7 +269,7 @@ def _stored(options: ScoringOptions, overrides: list[str]) -> list[tuple[str, Co
             "leave it out, or give a folder with predictions=..."
         )
     found = open_counts(options.counts, options.runs_dir, options.split)
-    tell(
+    info(
         "stored counts hold one partition and no map by pixel; for the others write predictions "
         "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
     )

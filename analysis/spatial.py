@@ -77,7 +77,7 @@ def main(options: Options, overrides: list[str]) -> int:
     All estimators and averages are measured; the last table shows what depends on them.
     """
     from analysis.statistics.claims import check_resampling, claims
-    from rgbt.tracking.terminal import place_lines, show
+    from rgbt.tracking.terminal import path_lines, print_rich
 
     check_out(options.out)
     check_resampling(options.blocks, options.resamples, options.level)
@@ -94,7 +94,7 @@ def main(options: Options, overrides: list[str]) -> int:
     _print(stats, found, (options.estimator, options.average), options.level)
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        show(place_lines(_write(stats, found, options, options.out)))
+        print_rich(path_lines(_write(stats, found, options, options.out)))
     return 0
 
 
@@ -130,13 +130,13 @@ def _collect(
     dataset: LabelledDataset, split: str, settings: MeasurementSettings
 ) -> SpatialStatistics:
     from analysis.statistics.collect import collect
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     left_out: list[str] = []
     with progress("measuring", len(dataset.names(split))) as advance:
         stats = collect(dataset, split, settings, advance, left_out.append)
     for sentence in sorted(left_out):
-        tell(f"left out: {sentence}")
+        info(f"left out: {sentence}")
     return stats
 
 
@@ -147,7 +147,7 @@ def _print(
     from rich.console import Group
 
     from analysis.statistics import tables
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.terminal import print_rich, rich_table
 
     shown = [claim for claim in found if not claim.estimator or _way(claim) == way]
     grids = [
@@ -157,7 +157,7 @@ def _print(
         tables.claims_grid(shown, level),
         tables.estimator_grid(found),
     ]
-    show(Group(tables.heading(stats), *map(rich_table, grids)))
+    print_rich(Group(tables.heading(stats), *map(rich_table, grids)))
 
 
 def _write(

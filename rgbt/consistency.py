@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rgbt.build.session import Session
     from rgbt.evaluation.temporal_consistency import Pairs
     from rgbt.metrics.pairs import Protocol
-    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.run_folder import RunFolder
     from rgbt.tracking.tables import ConsistencyTable
 
 
@@ -65,9 +65,9 @@ def main(options: Options, overrides: list[str]) -> int:
         consistency_table,
         count_pairs,
     )
-    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.run_folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
@@ -89,8 +89,8 @@ def main(options: Options, overrides: list[str]) -> int:
     partition = found.counts[PROTOCOLS[frames][0]].partition
     what = partition.partition("-")[2] or "published"
     title = f"Consistency of {stored.label} ({session.dataset.name}, {split}; {frames}: {what})"
-    show(rich_table(consistency_grid(table, title)))
-    show(place_lines(_write(found, session, folder, beside)))
+    print_rich(rich_table(consistency_grid(table, title)))
+    print_rich(path_lines(_write(found, session, folder, beside)))
     if frames == "virtual" and options.run and not (options.out or beside):
         _add_to_result(RunFolder(stored.folder.parent), session, split, table)
     return 0
@@ -116,7 +116,7 @@ def _write(
     """Write counts and picture; (what, where) of each. `beside` ends their names."""
     from rgbt.build.session import legend_of
     from rgbt.tracking.pair_pictures import draw_pairs
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     folder.mkdir(parents=True, exist_ok=True)
     places: list[tuple[str, str]] = []
@@ -125,7 +125,7 @@ def _write(
         counts.save(path)
         places.insert(0, (f"counts, {protocol}", str(path)))
     if not found.kept:
-        tell("none of the images of the picture could be read; it was not drawn.")
+        info("none of the images of the picture could be read; it was not drawn.")
         return places
     # Named like the counts that it shows, those of the first protocol.
     picture = path.with_name(path.stem.replace("consistency_", "pairs_") + ".png")
@@ -138,11 +138,11 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
     from dataclasses import asdict
 
     from rgbt.evaluation.temporal_consistency import consistency_values
-    from rgbt.tracking.mlflow_fill import read_sent
+    from rgbt.tracking.mlflow_upload import read_upload_state
     from rgbt.tracking.sync import Options as SyncOptions
     from rgbt.tracking.sync import status_of, tracking_of
     from rgbt.tracking.tables import without_nan
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     result, tables = run.result(), run.tables()
     kinds = {session.trainer.selection_split: "val", "test": "test"}
@@ -153,13 +153,13 @@ def _add_to_result(run: RunFolder, session: Session, split: str, table: Consiste
     if kind == "test":
         run.write_tables({**tables, "consistency": without_nan(asdict(table))})
     run.finish(result)
-    if read_sent(run) is None:
+    if read_upload_state(run) is None:
         return
     try:
         tracking_of(run, SyncOptions(run=run.path)).sync(run, status_of(run))
     except Exception as error:  # any store may fail in its own way; the folder has everything
         reason = (str(error).splitlines() or [""])[0]
-        tell(f"MLflow was not told ({reason}); rgbt sync run={run.path} does.")
+        info(f"MLflow was not told ({reason}); rgbt sync run={run.path} does.")
 
 
 def _name(protocol: Protocol, session: Session, split: str, beside: list[str]) -> str:
@@ -187,7 +187,7 @@ def _keep_other_motions(session: Session, path: Path) -> None:
 
 def _other_images(folder: Path, session: Session) -> list[str]:
     """Part of a file's name where a run is measured on images that it was not trained with."""
-    from rgbt.tracking.formats import read_marker
+    from rgbt.tracking.run_files import read_marker
 
     marker, found = read_marker(folder.parent), session.dataset.fingerprint()
     if marker is None or marker["files"] == found:

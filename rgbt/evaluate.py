@@ -64,7 +64,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.build.session import evaluate, result_tables, view_of
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.corrupted import own_words
-    from rgbt.tracking.terminal import result_view, show
+    from rgbt.tracking.terminal import print_rich, result_view
     from rgbt.training.overview import announce_network
 
     if options.out is not None and options.out.is_dir():
@@ -100,7 +100,7 @@ def main(options: Options, overrides: list[str]) -> int:
     places = [*([("heads", heads)] if heads else []), ("counts", str(path))]
     if found.skipped:
         places.append(("left out", f"{len(found.skipped)} images that cannot be read"))
-    show(result_view(tables, path.parent, places))
+    print_rich(result_view(tables, path.parent, places))
     return 0
 
 

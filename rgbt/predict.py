@@ -108,7 +108,7 @@ def main(options: Options, overrides: list[str]) -> int:
 def _pseudo_labels(options: Options, stored: TrainedNetwork, label_map: LabelMap | None) -> None:
     from rgbt.build.session import view_of
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     session, split = stored.session, options.input
     if split not in session.dataset.splits or options.rgb or options.thermal:
@@ -127,8 +127,8 @@ def _pseudo_labels(options: Options, stored: TrainedNetwork, label_map: LabelMap
         label_map,
         _head(options),
     )
-    show(rich_table(summary(found)))
-    show(place_lines([("pseudo-labels", str(found.folder.resolve()))]))
+    print_rich(rich_table(summary(found)))
+    print_rich(path_lines([("pseudo-labels", str(found.folder.resolve()))]))
 
 
 def _pictures(options: Options, session: Session, label_map: LabelMap | None) -> None:
@@ -158,12 +158,12 @@ def _pictures(options: Options, session: Session, label_map: LabelMap | None) ->
 
 
 def _tell_what_was_left_out(images: ToPredict) -> None:
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     for reason in list(images.skipped.values())[:1]:
-        tell(f"{len(images.skipped)} image(s) left out; the first: {reason}")
+        info(f"{len(images.skipped)} image(s) left out; the first: {reason}")
     for path in images.others[:1]:
-        tell(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
+        info(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
 
 
 def _chosen(options: Options, session: Session) -> ToPredict:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rgbt.build.load_run import TrainedNetwork
     from rgbt.evaluation.corrupted import Chosen
     from rgbt.evaluation.robustness import Measured
-    from rgbt.tracking.tables import Grid
+    from rgbt.tracking.tables import TextTable
 
 FOLDER = "robustness"
 """Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
@@ -75,8 +75,8 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.corrupted import own_words
     from rgbt.evaluation.robustness import measure
-    from rgbt.tracking.folder import find_run
-    from rgbt.tracking.terminal import place_lines, rich_table, show
+    from rgbt.tracking.run_folder import find_run
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     words, overrides = own_words(overrides)
     trust = parse_trust(options.trust)
@@ -96,8 +96,8 @@ def main(options: Options, overrides: list[str]) -> int:
         some = [] if options.degradations == "all" else chosen
         stem = "_".join(["robustness", *(each.row for each in some)])
         _write_tables(measured, grid, folder / stem)
-        show(rich_table(grid))
-        show(place_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
+        print_rich(rich_table(grid))
+        print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))
     return 0
 
 
@@ -168,7 +168,7 @@ def _title(stored: TrainedNetwork, split: str) -> str:
     return f"Robustness of {stored.label}{seed} ({session.dataset.name}, {split}): mIoU in percent"
 
 
-def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
+def robustness_grid(measured: Sequence[Measured], title: str) -> TextTable:
     """One line per degradation; level 0 is the clean image, level n the n-th severity.
 
     Args:
@@ -176,7 +176,7 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
         title: shown above.
     """
     from rgbt.evaluation.robustness import CLEAN
-    from rgbt.tracking.tables import Grid, percent
+    from rgbt.tracking.tables import TextTable, percent
 
     clean, *others = measured
     rows: dict[str, list[Measured]] = {}
@@ -193,10 +193,10 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> Grid:
         lines.append((asked.title, severities, *values, *empty))
     lines = lines or [(CLEAN, "", percent(clean.mious["mIoU"]))]
     header = ("", "severities", *(f"level {level}" for level in range(levels + 1)))
-    return Grid(title, header, tuple(lines))
+    return TextTable(title, header, tuple(lines))
 
 
-def _write_tables(measured: Sequence[Measured], grid: Grid, place: Path) -> None:
+def _write_tables(measured: Sequence[Measured], grid: TextTable, place: Path) -> None:
     """The numbers and the table in `place` with .csv and .md."""
     from rgbt.files.atomic import write_atomic
     from rgbt.tracking.csv_files import csv_text

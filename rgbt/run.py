@@ -19,12 +19,12 @@ def main(config: DictConfig) -> int:
     # torch is imported here, after --help
     from rgbt.spec.naming import tags_from_environment
     from rgbt.spec.specify import specify
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
     from rgbt.training.pipeline import run_pipeline
 
     run = specify(config, task_overrides())
     if run.pretrained is not None and not run.uses_pretrained:
-        tell(f"pretrained={run.pretrained} is ignored: {run.name} does not start from it.")
+        info(f"pretrained={run.pretrained} is ignored: {run.name} does not start from it.")
     run_pipeline(run, tags_from_environment())
     return 0
 

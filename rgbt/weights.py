@@ -53,19 +53,19 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     from rgbt.checkpoints.read import read
     from rgbt.checkpoints.recognise import recognise
     from rgbt.checkpoints.view import PLAN_HEADER, facts_view, plan_rows
-    from rgbt.tracking.tables import Grid
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.tables import TextTable
+    from rgbt.tracking.terminal import print_rich, rich_table
 
     contents = read(options.file)
     facts = recognise(contents)
-    show(facts_view(contents, facts))
+    print_rich(facts_view(contents, facts))
     found = _network(contents, facts, overrides, parse_trust(options.trust))
     if found is None:
         return 0
     node, name = found
     _, plan, remarks = plan_for(_built(node), contents, tuple(node.get("fresh") or ()))
-    show(rich_table(Grid(f"into {name}", PLAN_HEADER, plan_rows(plan))))
-    show(Text("".join(f"remark  {remark}\n" for remark in remarks), end=""))
+    print_rich(rich_table(TextTable(f"into {name}", PLAN_HEADER, plan_rows(plan))))
+    print_rich(Text("".join(f"remark  {remark}\n" for remark in remarks), end=""))
     return 0 if plan.fits else 1
 
 
@@ -131,8 +131,8 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
     from rgbt.checkpoints.layout import family_named
     from rgbt.checkpoints.read import read
     from rgbt.checkpoints.release import CONVENTIONS, save
-    from rgbt.tracking.folder import find_run
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.run_folder import find_run
+    from rgbt.tracking.terminal import info
 
     del overrides  # none is heeded
     folder = find_run(options.run, options.runs_dir)
@@ -154,12 +154,12 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
     remark = save(out, options.format, family, contents.tensors, note)
     others = differences(model, CONVENTIONS.get((options.format, family), ()))
     if others:
-        tell(
+        info(
             f"the authors' code does {' '.join(others)}, this run did something else; there its "
             "scores will not be ours."
         )
     if remark:
-        tell(f"{remark}.")
+        info(f"{remark}.")
     sys.stdout.write(f"{out}\n")
     return 0
 

@@ -47,21 +47,21 @@ def main(options: Options, overrides: list[str]) -> int:
 def _preview(wanted: TableRequest, workspace: Workspace, settings: SweepSettings) -> int:
     from rich.text import Text
 
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.terminal import print_rich, rich_table
     from sweeps.rendering.preview import cells_grid, summary
     from sweeps.worker.point_list import preview_points
 
     outcomes = preview_points(point_list(wanted, workspace, runs_of(workspace)), settings)
     if outcomes:
-        show(rich_table(cells_grid(wanted, outcomes)))
-    show(Text("\n".join(summary(wanted, outcomes, settings.workers))))
+        print_rich(rich_table(cells_grid(wanted, outcomes)))
+    print_rich(Text("\n".join(summary(wanted, outcomes, settings.workers))))
     return 0
 
 
 def _preview_all(
     options: Options, extra: tuple[str, ...], workspace: Workspace, settings: SweepSettings
 ) -> int:
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.terminal import print_rich, rich_table
     from sweeps.rendering.preview import tables_grid
     from sweeps.table.load_table import table_names
     from sweeps.worker.point_list import preview_points
@@ -73,7 +73,7 @@ def _preview_all(
     surveyed = [
         (wanted, preview_points(point_list(wanted, workspace, runs), settings)) for wanted in every
     ]
-    show(rich_table(tables_grid(surveyed, settings.workers)))
+    print_rich(rich_table(tables_grid(surveyed, settings.workers)))
     return 0
 
 

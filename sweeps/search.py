@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from sweeps import attributes as names
 from sweeps.run_specs import PlannedRun, plan_run, specify_run
 from sweeps.settings import SweepSettings
@@ -82,7 +82,7 @@ def search(wanted: Search, settings: SweepSettings) -> None:
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     store = TrialStore(study, storage, Owner.this_process())
-    tell(f"study {wanted.study}: run the same command on other machines to share it.")
+    info(f"study {wanted.study}: run the same command on other machines to share it.")
     _drive(wanted, settings, store)
     _check_result(store, wanted.study)
     runs_dir = wanted.runs.runs_dir
@@ -177,6 +177,6 @@ def _check_result(store: TrialStore, name: str) -> None:
     states = Counter(trial.state.name for trial in trials)
     failed = [trial for trial in trials if trial.state.name == "FAIL"]
     for trial in failed[:5]:
-        tell(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
+        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {name} has finished; see the reasons above.")

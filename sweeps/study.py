@@ -25,7 +25,7 @@ from sweeps.worker.storage import JOURNAL, load_study, open_storage, study_names
 if TYPE_CHECKING:
     import optuna
 
-    from rgbt.tracking.tables import Grid
+    from rgbt.tracking.tables import TextTable
     from rgbt.tracking.tracker import Link, Tracking
     from sweeps.report.figures import StudyFigure
     from sweeps.report.study_data import Importances, StudyData
@@ -89,7 +89,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     from rich.text import Text
 
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.terminal import print_rich, rich_table
     from sweeps.report.figures import draw
     from sweeps.report.records import record
     from sweeps.report.study_data import importances, read
@@ -104,7 +104,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     text = markdown(data, grids, said)
     write_atomic(out / "study.md", (text + gallery(pictures)).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
-    show(Group(*map(rich_table, grids), Text("\n".join(said))))
+    print_rich(Group(*map(rich_table, grids), Text("\n".join(said))))
     drawn = [picture.path for picture in pictures if picture.path is not None]
     links = record(
         tracking,
@@ -119,7 +119,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     return [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}"), *links]
 
 
-def markdown(data: StudyData, grids: Sequence[Grid], said: Sequence[str]) -> str:
+def markdown(data: StudyData, grids: Sequence[TextTable], said: Sequence[str]) -> str:
     """The report in Markdown, without figures: MLflow's descriptions cannot show them."""
     from sweeps.report.tables import markdown_table
 
@@ -191,9 +191,9 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
 
 def show_links(places: Sequence[Link]) -> None:
     """Print where everything is, one "name  place" pair per line."""
-    from rgbt.tracking.terminal import place_lines, show
+    from rgbt.tracking.terminal import path_lines, print_rich
 
-    show(place_lines(places))
+    print_rich(path_lines(places))
 
 
 entry = PlainCommand(Options, main, heeds=("tracking",))

@@ -16,8 +16,8 @@ from omegaconf import DictConfig
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names
 from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.tables import ABSENT, Grid, number
-from rgbt.tracking.terminal import rich_table, show, tell
+from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tracking.terminal import info, print_rich, rich_table
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
@@ -75,7 +75,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     _refuse_search_settings(settings)
     points = _points(settings, fixed, swept)
     if len(points) == 1:
-        tell("no list of values was given (such as seed=0,1,2): this is one point.")
+        info("no list of values was given (such as seed=0,1,2): this is one point.")
     name = settings.study or _name(config, list(points[0].params), [p.overrides for p in points])
     kind = "list" if settings.points else "grid"
     _grid(_point_list(name, kind, points, (runs, base)), settings)
@@ -146,11 +146,11 @@ def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
 def _grid(points: PointList, settings: SweepSettings) -> None:
     outcomes = preview_points(points, settings)
     if settings.dry_run:
-        show(rich_table(grid_table(points, outcomes)))
+        print_rich(rich_table(grid_table(points, outcomes)))
         seconds = estimated_seconds(outcomes, settings.workers)
         missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
         guess = "" if seconds is None else f", about {duration(seconds)}"
-        tell(f"{missing} of {len(outcomes)} points would be run{guess}.")
+        info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         _warn_other_code(outcomes)
         return
     wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
@@ -158,13 +158,13 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         # Before anything is run: a typing error should not cost hours of other runs.
         raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
     outcomes = run_points(points, settings)
-    show(rich_table(group_grid(points.title, outcomes)))
+    print_rich(rich_table(group_grid(points.title, outcomes)))
     unfinished = unfinished_grid(outcomes)
     if unfinished.rows:
-        show(rich_table(unfinished))
+        print_rich(rich_table(unfinished))
     _warn_other_code(outcomes)
     command = study_command(points.study, points.runs.runs_dir, settings.storage)
-    tell(f"study {points.study}; its figures: {command}")
+    info(f"study {points.study}; its figures: {command}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(
@@ -176,10 +176,10 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
 def _warn_other_code(outcomes: Sequence[Outcome]) -> None:
     line = other_code_line(outcomes)
     if line:
-        tell(line)
+        info(line)
 
 
-def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> Grid:
+def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> TextTable:
     """A preview, one row per point: its label, its scores on the test split, its state."""
     metrics = (names.MIOU, names.VAR)
     rows = []
@@ -190,7 +190,7 @@ def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> Grid:
         key = outcome.keys[0] if outcome.keys else ABSENT
         state = outcome.reason[:80] if outcome.reason else outcome.state
         rows.append((outcome.point.label, *values, key, state))
-    return Grid(points.title, ("point", *metrics, "run", "state"), tuple(rows))
+    return TextTable(points.title, ("point", *metrics, "run", "state"), tuple(rows))
 
 
 def _name(config: DictConfig, keys: Sequence[str], identity: Any) -> str:

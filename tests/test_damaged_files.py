@@ -233,7 +233,7 @@ def read_label_array(path: Path) -> Any:
 
 
 def run_folder(folder: Path) -> Any:
-    from rgbt.tracking.folder import Description, RunFolder
+    from rgbt.tracking.run_folder import Description, RunFolder
 
     run = RunFolder(folder)
     run.describe(Description("grbm seed=0", {"rgbt.seed": "0"}, {"seed": "0", "scale": "demo"}))
@@ -255,17 +255,17 @@ def run_folder(folder: Path) -> Any:
 
 
 def sent(folder: Path) -> Path:
-    from rgbt.tracking.mlflow_fill import Sent, write_sent
+    from rgbt.tracking.mlflow_upload import UploadState, write_upload_state
 
     run = run_folder(folder)
-    noted = Sent("sqlite:///runs/mlflow.db", "rgbt", experiment_id="1", run_id="0f3a" * 8)
-    write_sent(run, replace(noted, steps={"train": 50}, files={"config.yaml": "ab" * 32}))
+    noted = UploadState("sqlite:///runs/mlflow.db", "rgbt", experiment_id="1", run_id="0f3a" * 8)
+    write_upload_state(run, replace(noted, steps={"train": 50}, files={"config.yaml": "ab" * 32}))
     return Path(run.path / "mlflow.json")
 
 
-def read_sent(path: Path) -> Any:
-    from rgbt.tracking.folder import RunFolder
-    from rgbt.tracking.mlflow_fill import read_sent as read
+def read_upload_state(path: Path) -> Any:
+    from rgbt.tracking.mlflow_upload import read_upload_state as read
+    from rgbt.tracking.run_folder import RunFolder
 
     return plain(read(RunFolder(path.parent)))
 
@@ -279,7 +279,7 @@ def in_run(name: str) -> Callable[[Path], Path]:
 
 def of_run(method: str) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
-        from rgbt.tracking.folder import RunFolder
+        from rgbt.tracking.run_folder import RunFolder
 
         return plain(getattr(RunFolder(path.parent), method)())
 
@@ -288,7 +288,7 @@ def of_run(method: str) -> Callable[[Path], Any]:
 
 def resume(path: Path) -> Any:
     """What is left of the lines where a run resumes at step 30."""
-    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.run_folder import RunFolder
 
     run = RunFolder(path.parent)
     run.truncate_after(30)
@@ -305,7 +305,7 @@ def marker(folder: Path) -> Path:
 
 
 def read_marker(path: Path) -> Any:
-    from rgbt.tracking.folder import RunFolder
+    from rgbt.tracking.run_folder import RunFolder
 
     return plain(RunFolder(path.parent).marker())
 
@@ -512,7 +512,7 @@ KINDS = {
         Kind("run.json", in_run("run.json"), of_run("description")),
         Kind("tables.json", in_run("tables.json"), of_run("tables")),
         Kind("provenance.json", in_run("provenance.json"), of_run("provenance")),
-        Kind("mlflow.json", sent, read_sent),
+        Kind("mlflow.json", sent, read_upload_state),
         Kind("dataset.json", marker, read_marker),
         Kind("pseudo_labels.json", pseudo, read_pseudo),
         Kind("pseudo-label", lambda f: pseudo(f).parent / "labels" / "a.png", read_pseudo),

@@ -14,8 +14,8 @@ from rgbt import evaluate
 from rgbt.metrics.counts import Counts
 from rgbt.spec import source_code
 from rgbt.tracking import other_code
-from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.provenance import code
+from rgbt.tracking.run_folder import RunFolder, runs_in
 from tests.commands import Call, Trained, only_run, short, train
 
 MADE_BY_OTHER_CODE = "This result was made by other code (commit 0000000 of"

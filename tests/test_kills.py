@@ -16,7 +16,7 @@ import pytest
 
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.run_folder import RunFolder
 from sweeps.worker.executors import LocalExecutor, LocalJob
 from tests.commands import only_run
 from tests.conftest import write_data

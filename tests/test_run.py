@@ -403,7 +403,7 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
 
 def test_a_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
     from rgbt.checks import InputError
-    from rgbt.tracking.folder import find_run
+    from rgbt.tracking.run_folder import find_run
 
     folder = tmp_path / "abc"
     folder.mkdir()

@@ -156,11 +156,11 @@ def _draw(figure: str, out: str, given: dict[str, Any], overrides: list[str]) ->
 
 def _list() -> int:
     from analysis.figures.catalogue import FIGURES
-    from rgbt.tracking.tables import Grid
-    from rgbt.tracking.terminal import rich_table, show
+    from rgbt.tracking.tables import TextTable
+    from rgbt.tracking.terminal import print_rich, rich_table
 
     rows = tuple((name, entry.shows, entry.needs) for name, entry in FIGURES.items())
-    show(rich_table(Grid("figures", ("figure", "shows", "made from"), rows)))
+    print_rich(rich_table(TextTable("figures", ("figure", "shows", "made from"), rows)))
     return 0
 
 

@@ -35,7 +35,7 @@ def draw_panel(given: FigureInput) -> Figure:
     """Images, ground truth and predictions."""
     from analysis.figures import panels
     from analysis.predictions.images import PredictionReader
-    from rgbt.tracking.terminal import tell
+    from rgbt.tracking.terminal import info
 
     folders = {
         label: Path(place).expanduser()
@@ -57,7 +57,7 @@ def draw_panel(given: FigureInput) -> Figure:
     made = panels.panel(dataset, readers, names, given.regions)
     for row in made.rows:
         scores = zip(made.methods, row.mious, strict=True)
-        tell(f"{row.name}: " + ", ".join(f"{label} mIoU {each:.1f}" for label, each in scores))
+        info(f"{row.name}: " + ", ".join(f"{label} mIoU {each:.1f}" for label, each in scores))
     return panels.draw(made, layout)
 
 

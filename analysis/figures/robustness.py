@@ -25,7 +25,7 @@ from rgbt.checks import InputError, nearest
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import Grid, number
+from rgbt.tracking.tables import TextTable, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -259,7 +259,7 @@ def numbers(data: Sequence[Panel]) -> dict[str, str]:
         rows.append((*said, *cells))
     title = "mIoU in percent, mean ± standard deviation over seeds (percent of the clean mIoU)"
     methods = [curve.method for curve in data[0].curves]
-    grid = Grid(title, ("degradation", "severity", *methods), tuple(rows))
+    grid = TextTable(title, ("degradation", "severity", *methods), tuple(rows))
     return {".md": grid.to_markdown(), ".csv": csv_text(lines)}
 
 

@@ -12,7 +12,7 @@ from analysis.predictions.table import ALL, Metric, Score, ScoreKey, ScoreTable
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, Grid, class_labels, number
+from rgbt.tracking.tables import ABSENT, TextTable, class_labels, number
 
 COLUMNS = (
     *("method", "split", "partition", "images", "num_images", "region", "class", "metric"),
@@ -22,7 +22,7 @@ WHOLE = "whole"
 """Row or region of the whole image."""
 
 
-def grids(table: ScoreTable) -> tuple[Grid, ...]:
+def grids(table: ScoreTable) -> tuple[TextTable, ...]:
     """The tables of one method on one partition.
 
     Returns:
@@ -32,7 +32,7 @@ def grids(table: ScoreTable) -> tuple[Grid, ...]:
     return region_grid(table), accuracy_grid(table), part_grid(table)
 
 
-def region_grid(table: ScoreTable) -> Grid:
+def region_grid(table: ScoreTable) -> TextTable:
     """Columns: regions and the whole image; rows: mIoU, mAcc, IoU of each class."""
     means: tuple[tuple[str, Metric], ...] = ((MIOU, "IoU"), (MACC, "Acc"))
     rows = []
@@ -42,16 +42,16 @@ def region_grid(table: ScoreTable) -> Grid:
             scores = _by_region(table, ScoreKey(metric=metric, absent=absent))
             rows.append((f"{name}{_ending(absent, conventions)}", *scores))
     title = f"{_title(table)}: mIoU, mAcc and IoU of each class by region"
-    return Grid(title, _header(table), (*rows, *_class_rows(table, "IoU")))
+    return TextTable(title, _header(table), (*rows, *_class_rows(table, "IoU")))
 
 
-def accuracy_grid(table: ScoreTable) -> Grid:
+def accuracy_grid(table: ScoreTable) -> TextTable:
     """Columns: regions and the whole image; rows: accuracy of each class."""
     title = f"{_title(table)}: accuracy of each class by region"
-    return Grid(title, _header(table), _class_rows(table, "Acc"))
+    return TextTable(title, _header(table), _class_rows(table, "Acc"))
 
 
-def part_grid(table: ScoreTable) -> Grid:
+def part_grid(table: ScoreTable) -> TextTable:
     """Rows: all images, day, night; columns: mIoU, variance, mAcc, mIoU of each region."""
     conventions = table.conventions()
     numbers = range(1, table.regions + 1)
@@ -67,7 +67,7 @@ def part_grid(table: ScoreTable) -> Grid:
             # The intervals of regions stand in their own table; here they would be too wide.
             shown = [*map(_with_interval, scores[:2]), *(number(each.value) for each in scores[2:])]
             rows.append((label, *shown))
-    return Grid(f"{_title(table)}: all images, day and night", header, tuple(rows))
+    return TextTable(f"{_title(table)}: all images, day and night", header, tuple(rows))
 
 
 def convention_line(table: ScoreTable) -> str:

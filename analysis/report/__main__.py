@@ -64,7 +64,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.report.collect import ReportRequest, collect
     from analysis.report.page import write_page
     from rgbt.tracking.provenance import command_line
-    from rgbt.tracking.terminal import place_lines, show, tell
+    from rgbt.tracking.terminal import info, path_lines, print_rich
 
     typed = command_line(["python", "-m", "analysis.report", *sys.argv[1:]])
     with Progress(console=Console(stderr=True)) as progress:
@@ -76,16 +76,16 @@ def main(options: Options, overrides: list[str]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
     for remark in data.remarks[:TOLD]:
-        tell(remark)
+        info(remark)
     if len(data.remarks) > TOLD:
-        tell(f"{len(data.remarks) - TOLD} more remarks stand on the page.")
+        info(f"{len(data.remarks) - TOLD} more remarks stand on the page.")
     run = [table for table in data.tables if table.scale]
     held = (
         f"{len(data.runs)} runs, {len(run)} tables with runs, {len(data.tables) - len(run)} "
         f"published alone, {len(data.studies)} studies"
     )
     size = f"{page.stat().st_size / 1e6:.2f} MB"
-    show(place_lines([("page", str(page)), ("size", size), ("holds", held)]))
+    print_rich(path_lines([("page", str(page)), ("size", size), ("holds", held)]))
     return 0
 
 

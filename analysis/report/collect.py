@@ -18,7 +18,7 @@ from analysis.report.tables import table_entries
 from analysis.report.tables_intervals import Track
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.replaced import TAG as REPLACED_TAG
+from rgbt.tracking.replaced_runs import TAG as REPLACED_TAG
 from rgbt.tracking.tracker import Tracking
 
 TITLE = "RGB-thermal segmentation: runs and tables"

@@ -13,10 +13,10 @@ from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.files.budgets import TEXT, read_bytes
-from rgbt.tracking.formats import read_result
 from rgbt.tracking.mlflow_client import ENVIRONMENT
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.run_files import read_result
 from rgbt.tracking.tracker import Tracking
 
 PAGE = 500

@@ -15,7 +15,7 @@ from analysis.statistics import derive
 from analysis.statistics.data import MODALITIES, SpatialStatistics
 from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Finding, Range
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, Grid, number
+from rgbt.tracking.tables import ABSENT, TextTable, number
 
 COLUMNS = 12
 """More regions than this become rows."""
@@ -30,7 +30,7 @@ CSV_COLUMNS = (
 )
 
 
-def occupancy_grids(stats: SpatialStatistics) -> tuple[Grid, ...]:
+def occupancy_grids(stats: SpatialStatistics) -> tuple[TextTable, ...]:
     """Sample occupancy by part, by class, and by class relative to its largest region."""
     rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in stats.subsets()]
     by_class = 100 * derive.class_region_occupancy(stats)
@@ -45,7 +45,7 @@ def occupancy_grids(stats: SpatialStatistics) -> tuple[Grid, ...]:
     )
 
 
-def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple[Grid, ...]:
+def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple[TextTable, ...]:
     """Laplacian variance, noise and signal to noise of both modalities by part."""
     wanted = [(modality, part) for modality in MODALITIES for part in stats.subsets()]
     laplacian = [(f"{m}, {part}", derive.region_laplacian(stats, m, part)) for m, part in wanted]
@@ -56,7 +56,7 @@ def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple
     )
 
 
-def noise_grid(stats: SpatialStatistics, estimator: str) -> Grid:
+def noise_grid(stats: SpatialStatistics, estimator: str) -> TextTable:
     """Noise of both modalities by part; below one grey level rounding is a good part of it."""
     rows = [
         (f"{modality}, {part}", derive.region_noise(stats, modality, part, estimator))
@@ -66,7 +66,7 @@ def noise_grid(stats: SpatialStatistics, estimator: str) -> Grid:
     return region_grid(f"noise, grey levels ({estimator}; rounding alone is 0.29)", rows)
 
 
-def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> Grid:
+def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> TextTable:
     """Signal to noise of both modalities by part."""
     rows = [
         (f"{modality}, {part}", derive.region_snr(stats, modality, part, estimator, average))
@@ -76,7 +76,7 @@ def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> Grid:
     return region_grid(f"signal to noise (Eq. 4; {estimator}, {average})", rows)
 
 
-def entropy_grid(stats: SpatialStatistics) -> Grid:
+def entropy_grid(stats: SpatialStatistics) -> TextTable:
     """Label entropy with and without background by part."""
     rows = [
         (f"{part}, {word} background", derive.label_entropy(stats, part, background))
@@ -86,18 +86,18 @@ def entropy_grid(stats: SpatialStatistics) -> Grid:
     return region_grid("label entropy, bits (Eq. 5)", rows)
 
 
-def region_grid(title: str, rows: Sequence[Row]) -> Grid:
+def region_grid(title: str, rows: Sequence[Row]) -> TextTable:
     """Values by region, and their mean over regions."""
     regions = len(rows[0][1])
     header = ("", *(f"R{index + 1}" for index in range(regions)), "mean")
     lines = [(name, *map(number, (*values, float(values.mean())))) for name, values in rows]
     if regions <= COLUMNS:
-        return Grid(title, header, tuple(lines))
+        return TextTable(title, header, tuple(lines))
     turned = list(zip(header, *lines, strict=True))
-    return Grid(title, turned[0], tuple(turned[1:]))
+    return TextTable(title, turned[0], tuple(turned[1:]))
 
 
-def claims_grid(claims: Sequence[Claim], level: float) -> Grid:
+def claims_grid(claims: Sequence[Claim], level: float) -> TextTable:
     """A line per claim with its verdict, below it a line per number that decides it."""
     rows: list[tuple[str, ...]] = []
     for claim in claims:
@@ -109,10 +109,10 @@ def claims_grid(claims: Sequence[Claim], level: float) -> Grid:
             cells = (_digits(value), ends, _range(each.wanted), SHORT[each.verdict], each.note)
             rows.append((f"   {each.what}", *cells))
     header = ("claim", "value", f"{100 * level:g} % interval", "claimed", "holds", "")
-    return Grid("claims of SpatialSeg, Sec. III", header, tuple(rows))
+    return TextTable("claims of SpatialSeg, Sec. III", header, tuple(rows))
 
 
-def estimator_grid(claims: Sequence[Claim]) -> Grid:
+def estimator_grid(claims: Sequence[Claim]) -> TextTable:
     """How the numbers about noise depend on its estimator and on the average."""
     columns: dict[tuple[str, str], dict[tuple[str, str], Finding]] = {}
     for claim in claims:
@@ -126,7 +126,9 @@ def estimator_grid(claims: Sequence[Claim]) -> Grid:
         cells = [f"{_digits(each.interval.value)} {SHORT[each.verdict]}" for each in found]
         rows.append((what, _range(found[0].wanted), *cells))
     header = ("signal to noise", "claimed", *(f"{name}, {average}" for name, average in ways))
-    return Grid("how it depends on the estimator of the noise and the average", header, tuple(rows))
+    return TextTable(
+        "how it depends on the estimator of the noise and the average", header, tuple(rows)
+    )
 
 
 def markdown(

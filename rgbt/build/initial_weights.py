@@ -14,7 +14,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.spec.run_spec import RunSpec
 from rgbt.config.stored_config import read_settings
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from rgbt.checkpoints.load import load_weights
 from rgbt.checkpoints.report import Report
 
@@ -36,12 +36,12 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
             )
         return None
     report = load_weights(model, source, fresh)
-    tell(report.sentence())
+    info(report.sentence())
     others = differences(spec.model.plain, report.facts.convention)
     if not others and _has_other_inputs(spec.model.plain, report, source):
         others = ["the inputs noted beside it"]
     if others:
-        tell(
+        info(
             f"{source} goes with {' '.join(others)}, this network with something else: its scores "
             "are not those that the weights were trained for."
         )

@@ -18,9 +18,9 @@ from rgbt.metrics.counts import Counts
 from rgbt.spec.load_spec import load_spec
 from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import specify
-from rgbt.tracking.folder import RunFolder, find_run
-from rgbt.tracking.formats import read_marker
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.run_folder import RunFolder, find_run
+from rgbt.tracking.run_files import read_marker
+from rgbt.tracking.terminal import info, warn
 
 CHECKPOINTS = ("best", "last")
 
@@ -142,8 +142,8 @@ def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     before = entries[-1].get("own_code") if entries else None
     if before is not None and before != now:
         modules = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
-        tell(
-            f"warning: {', '.join(modules)} changed after {folder.name} was trained; what is "
+        warn(
+            f"{', '.join(modules)} changed after {folder.name} was trained; what is "
             "computed now is not what this run made. Restore the code, or train again."
         )
 
@@ -161,7 +161,7 @@ def _warn_of_other_splits(folder: Path, session: Session) -> None:
     except (InputError, OSError):
         return  # nothing to compare with
     if before is not None and now != before["names"]:
-        tell(
-            f"warning: the splits of {session.dataset.name} ({session.dataset.root}) are not those "
+        warn(
+            f"the splits of {session.dataset.name} ({session.dataset.root}) are not those "
             f"that {folder.name} was trained with: training images may be evaluated."
         )

@@ -37,7 +37,7 @@ from rgbt.metrics.metric import Regions
 from rgbt.build.initial_weights import start_from_weights
 from rgbt.randomness import derive
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.pictures import Example, Legend
+from rgbt.tracking.pictures import PanelExample, Legend
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import VIEWS, View
@@ -237,7 +237,7 @@ class Evaluation:
     """
 
     counts: Counts
-    kept: tuple[Example, ...]
+    kept: tuple[PanelExample, ...]
     skipped: tuple[str, ...]
 
 
@@ -268,7 +268,7 @@ def evaluate(
     batches = eval_batches(dataset, split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: dict[str, np.ndarray] = {}
-    kept: list[Example] = []
+    kept: list[PanelExample] = []
     view = view or view_of(session)
     heads = heads_of(session, view, head)
     with progress() as display:
@@ -295,10 +295,10 @@ def evaluate(
     return Evaluation(counts, tuple(kept), tuple(batches.skipped))
 
 
-def _example(session: Session, name: str, classes: np.ndarray) -> Example:
+def _example(session: Session, name: str, classes: np.ndarray) -> PanelExample:
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
-    return Example(name, sample.rgb, sample.thermal, label, classes)
+    return PanelExample(name, sample.rgb, sample.thermal, label, classes)
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:

@@ -25,7 +25,7 @@ from rgbt.build.probes import check_cells, check_own_parts, example_hw, first_re
 from rgbt.randomness import derive
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec, labels_key
 from rgbt.build.session import Session, open_session
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import VIEWS, Loadable, Masker, View
 
@@ -171,14 +171,14 @@ def _tell_what_is_not_as_published(session: Session) -> None:
     spec, data = session.spec, session.dataset
     expected: object = spec.scale.pretrained and getattr(session.model, "pretrained_parts", ())
     if expected and session.weights is None:
-        tell(
+        info(
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
             "file with pretrained=..., or expect less than published."
         )
     meant = spec.recipe.dataset
     if spec.scale.name == "paper" and meant != data.name:
         known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
-        tell(
+        info(
             f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
             + (f"choose recipe={data.name}, or " if known else "")
             + "set recipe.train_sizes, crop_hw, batch_size, max_steps and eval_every, then "
@@ -188,7 +188,7 @@ def _tell_what_is_not_as_published(session: Session) -> None:
     if session.trainer.tested == "best" and picked != "test":
         shared = set(data.names(picked)) & set(data.names("test"))
         if shared:
-            tell(
+            info(
                 f"trainer.selection_split={picked}: {len(shared)} of its {len(data.names(picked))} "
                 "images are test images, so that the best checkpoint is picked on what is reported."
             )
@@ -252,7 +252,7 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
         )
     shared = set(session.dataset.names(domain.split)) & set(session.dataset.names("test"))
     if shared:
-        tell(
+        info(
             f"domains.{name}.split={domain.split}: {len(shared)} of its images are test images, "
             "so that the test says nothing of new ones."
         )

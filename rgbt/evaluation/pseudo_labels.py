@@ -44,8 +44,8 @@ from rgbt.engine.progress import progress
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.tables import Grid, percent
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.tables import TextTable, percent
+from rgbt.tracking.terminal import info
 from rgbt.types import IGNORE, Sample, View
 
 BEGUN = "pseudo_labels.begun.json"
@@ -159,7 +159,7 @@ def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where 
     return PseudoLabels(out)
 
 
-def summary(found: PseudoLabels) -> Grid:
+def summary(found: PseudoLabels) -> TextTable:
     """Which share of the pixels got which class, and how sure the teacher was of them."""
     said = found.manifest
     by_class = [said["by_class"][name] for name in found.classes]
@@ -173,7 +173,7 @@ def summary(found: PseudoLabels) -> Grid:
     total = sum(each["share"] * (each["mean_confidence"] or 0.0) for each in by_class)
     kept = ("kept", percent(said["kept"]), _percent(total / said["kept"] if said["kept"] else None))
     whole = ("all pixels", percent(1.0), percent(said["mean_confidence"]))
-    return Grid(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
+    return TextTable(title, ("class", "pixels", "confidence"), (*rows, kept, whole))
 
 
 def _percent(fraction: float | None) -> str:
@@ -246,7 +246,7 @@ def _alone(out: Path) -> Iterator[None]:
         if holder is None:
             yield from _tidied(out)
             return
-    tell(f"{out} is being written by {holder}; waiting for it.")
+    info(f"{out} is being written by {holder}; waiting for it.")
     with holding(out / LOCK, wait_s=math.inf):
         yield from _tidied(out)
 

@@ -55,14 +55,14 @@ description holds it too.
 
 
 @dataclass(frozen=True)
-class Store:
+class MlflowStore:
     """An open store: MLflow's client and the experiment that runs go to."""
 
     client: Any
     experiment_id: str
 
 
-def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
+def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowStore:
     """Connect, making database and experiment where they do not exist.
 
     Args:
@@ -88,7 +88,7 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> Store:
     for name, value in tags.items():
         if found.tags.get(name) != value:
             client.set_experiment_tag(found.experiment_id, name, value)
-    return Store(client, str(found.experiment_id))
+    return MlflowStore(client, str(found.experiment_id))
 
 
 def check_reachable(uri: str) -> None:

@@ -6,15 +6,15 @@ import time
 from datetime import datetime
 from typing import Any
 
-from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_client import Store
-from rgbt.tracking.replaced import description_of, key_of
+from rgbt.tracking.mlflow_client import MlflowStore
+from rgbt.tracking.replaced_runs import shown_description, shown_key
+from rgbt.tracking.run_folder import RunFolder
 
 NAME_LENGTH = 250
 """Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
 
 
-def noted_run(store: Store, run_id: str) -> Any:
+def noted_run(store: MlflowStore, run_id: str) -> Any:
     """The run that ``mlflow.json`` names; None where the store does not have it any more.
 
     A run that was deleted in the pages takes nothing more; its folder gets a new one.
@@ -32,7 +32,7 @@ def noted_run(store: Store, run_id: str) -> Any:
     return run if run.info.lifecycle_stage == "active" else None
 
 
-def unnoted_run(store: Store, folder: RunFolder) -> Any:
+def unnoted_run(store: MlflowStore, folder: RunFolder) -> Any:
     """A run made for this folder by a process that was killed before it noted the run's id.
 
     Without this look it would stay in the pages as running for ever. The time of the first start
@@ -45,9 +45,9 @@ def unnoted_run(store: Store, folder: RunFolder) -> Any:
     return same[0] if same else None
 
 
-def new_run(store: Store, folder: RunFolder) -> Any:
+def new_run(store: MlflowStore, folder: RunFolder) -> Any:
     """A new run for this folder; `unnoted_run` finds it."""
-    description = description_of(folder)
+    description = shown_description(folder)
     assert description is not None, f"{folder.path}: describe() comes before fill()"
     return store.client.create_run(
         store.experiment_id,
@@ -59,7 +59,7 @@ def new_run(store: Store, folder: RunFolder) -> Any:
 
 def identity(folder: RunFolder) -> dict[str, str]:
     """Tags by which `unnoted_run` finds a run, set in the call that makes it."""
-    return {"rgbt.key": key_of(folder), "rgbt.folder": str(folder.path)}
+    return {"rgbt.key": shown_key(folder), "rgbt.folder": str(folder.path)}
 
 
 def short_name(name: str) -> str:

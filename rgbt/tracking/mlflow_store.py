@@ -15,12 +15,12 @@ from pathlib import Path
 
 from rgbt.checks import InputError
 from rgbt.ranges import Text
-from rgbt.tracking.folder import Description, RunFolder
-from rgbt.tracking.mlflow_client import Store, locked, open_store
-from rgbt.tracking.mlflow_fill import Sent, fill, read_sent, write_sent
+from rgbt.tracking.mlflow_client import MlflowStore, locked, open_store
 from rgbt.tracking.mlflow_server import pages_of, python_command
+from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, upload, write_upload_state
 from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.run_folder import Description, RunFolder
 from rgbt.tracking.tracker import Link, Status
 
 PAUSE_S = 300.0
@@ -72,7 +72,7 @@ class MlflowTracking:
         default_place = None if is_server else (root / "mlartifacts").as_uri()
         self.artifact_uri = default_place if artifact_uri is None else artifact_uri
         self.experiment = experiment
-        self._store: Store | None = None
+        self._store: MlflowStore | None = None
         self._folder: RunFolder | None = None
         self._quiet_until = 0.0
         self._warned = False
@@ -87,7 +87,7 @@ class MlflowTracking:
         """Begin the MLflow run of `folder`, or continue the one it already has."""
         self._folder = folder
         folder.describe(described(run_name, tags, params))
-        write_sent(folder, self._sent(folder))
+        write_upload_state(folder, self._sent(folder))
         self.update()
 
     def update(self) -> None:
@@ -122,23 +122,25 @@ class MlflowTracking:
         # A training and a sync by hand may meet in one folder.
         with locked(folder.path / "mlflow.lock"):
             sent = self._sent(folder)
-            fill(store, folder, sent, status)
+            upload(store, folder, sent, status)
         return sent.run_id
 
-    def store(self) -> Store:
+    def store(self) -> MlflowStore:
         """The open store, made where it does not exist; raises what MLflow raises."""
         if self._store is None:
             self._store = open_store(self.uri, self.artifact_uri, self.experiment)
         return self._store
 
-    def _sent(self, folder: RunFolder) -> Sent:
+    def _sent(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""
         uri, place = without_passwords(self.uri), self.artifact_uri
-        fresh = Sent(uri, self.experiment, None if place is None else without_passwords(place))
+        fresh = UploadState(
+            uri, self.experiment, None if place is None else without_passwords(place)
+        )
         try:
-            sent = read_sent(folder)
+            sent = read_upload_state(folder)
         except InputError as error:
-            # Repaired by the next write: `fill` finds the run by its key and sends everything.
+            # Repaired by the next write: `upload` finds the run by its key and sends everything.
             sys.stderr.write(f"rgbt: {error}\n")
             return fresh
         # A version that hid less may have stored it: both are compared as they are hidden now.

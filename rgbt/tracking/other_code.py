@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rgbt.tracking.formats import read_provenance
 from rgbt.tracking.provenance import code
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.run_files import read_provenance
+from rgbt.tracking.terminal import info, warn
 
 COMMIT_LENGTH = 7
 
@@ -40,7 +40,7 @@ def warn_of_result(folder: Path) -> None:
     """Say so where a finished run was made by other code."""
     made_by = other_code(folder)
     if made_by is not None:
-        tell(
+        info(
             f"This result was made by other code ({made_by}); fresh=true trains again and keeps "
             "the old run."
         )
@@ -50,8 +50,8 @@ def warn_of_steps(folder: Path, step: int) -> None:
     """Say so where a run that resumes at a step was trained by other code before."""
     made_by = other_code(folder)
     if made_by is not None:
-        tell(
-            f"warning: the first {step} steps were trained by other code ({made_by}); to train all "
+        warn(
+            f"the first {step} steps were trained by other code ({made_by}); to train all "
             f"steps by the present code, remove {folder} and rerun the command."
         )
 

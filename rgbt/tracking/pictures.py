@@ -34,7 +34,7 @@ HALF_SPAN = 15.0
 
 
 @dataclass(frozen=True)
-class Example:
+class PanelExample:
     """One image of a qualitative panel.
 
     Attributes:
@@ -110,7 +110,7 @@ def overlay(rgb: Image, label: Image, palette: Image, alpha: float = 0.6) -> Ima
     return np.where(painted, np.rint(mixed), rgb).astype(np.uint8)
 
 
-def draw_panel(examples: Sequence[Example], legend: Legend, path: Path) -> None:
+def draw_panel(examples: Sequence[PanelExample], legend: Legend, path: Path) -> None:
     """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below.
 
     Raises:

@@ -1,6 +1,6 @@
 """A finished run, read from its folder: the one type for it in rgbt, sweeps and analysis.
 
-`rgbt.tracking.folder.RunFolder` writes the folder of a run in progress.
+`rgbt.tracking.run_folder.RunFolder` writes the folder of a run in progress.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.folder import Description
-from rgbt.tracking.formats import (
+from rgbt.tracking.other_code import other_code
+from rgbt.tracking.percent import in_percent
+from rgbt.tracking.provenance import commit_of
+from rgbt.tracking.run_files import (
     ADVICE,
     read_description,
     read_marker,
@@ -20,9 +22,7 @@ from rgbt.tracking.formats import (
     read_result,
     read_tables,
 )
-from rgbt.tracking.other_code import other_code
-from rgbt.tracking.percent import in_percent
-from rgbt.tracking.provenance import commit_of
+from rgbt.tracking.run_folder import Description
 from rgbt.tracking.tables import ResultTables
 
 CHECKPOINT = "best.pt"

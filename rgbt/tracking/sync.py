@@ -14,13 +14,13 @@ from typing import Annotated
 from rgbt.checks import InputError
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.tracking.folder import RunFolder, runs_in
 from rgbt.tracking.mlflow_client import StoreBusyError
-from rgbt.tracking.mlflow_fill import read_sent
 from rgbt.tracking.mlflow_server import ui_command
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.provenance import HIDDEN, without_passwords
-from rgbt.tracking.replaced import REPLACED, runs_dir_of
+from rgbt.tracking.replaced_runs import REPLACED, runs_dir_of
+from rgbt.tracking.run_folder import RunFolder, runs_in
 from rgbt.tracking.tracker import Status
 
 EXPERIMENT = "rgbt"
@@ -67,7 +67,7 @@ def tracking_of(folder: RunFolder, options: Options) -> MlflowTracking:
     Raises:
         InputError: the store needs a password, which is not kept in the folder.
     """
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     uri = options.uri or (sent.uri if sent else None)
     artifact_uri = None
     if sent is not None and uri is not None:

@@ -140,7 +140,7 @@ class ResultTables:
 
 
 @dataclass(frozen=True)
-class Grid:
+class TextTable:
     """A table of text: first column labels, the others numbers; footnotes."""
 
     title: str
@@ -156,7 +156,7 @@ class Grid:
         return "\n".join([f"**{self.title}**", "", *lines, *notes]) + "\n"
 
 
-def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> Grid:
+def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> TextTable:
     """Per-region rows, one below the other, in the form of the papers' tables.
 
     Args:
@@ -177,10 +177,10 @@ def region_grid(rows: Sequence[RegionTable], title: str = "IoU by region") -> Gr
         (row.row_label, *map(percent, (*row.region_ious, row.miou)), number(row.variance))
         for row in rows
     )
-    return Grid(title, header, text)
+    return TextTable(title, header, text)
 
 
-def class_grid(tables: ResultTables) -> Grid:
+def class_grid(tables: ResultTables) -> TextTable:
     """IoU and accuracy by class over the image, then the class's IoU in every region; percent.
 
     Classes that are left out of the means say so.
@@ -196,17 +196,17 @@ def class_grid(tables: ResultTables) -> Grid:
     ]
     regions = tables.regions
     mean = ("mean", percent(regions.miou), "", *map(percent, regions.region_ious))
-    return Grid("IoU and accuracy by class", header, (*rows, mean), classes.notes)
+    return TextTable("IoU and accuracy by class", header, (*rows, mean), classes.notes)
 
 
-def subset_grid(tables: ResultTables) -> Grid:
+def subset_grid(tables: ResultTables) -> TextTable:
     """MIoU of all images and of each subset, percent."""
     subsets = {"all images": tables.regions.miou, **tables.classes.subset_mious}
     rows = tuple((name, percent(value)) for name, value in subsets.items())
-    return Grid("mIoU by subset", ("images", "mIoU"), rows)
+    return TextTable("mIoU by subset", ("images", "mIoU"), rows)
 
 
-def consistency_grid(table: ConsistencyTable, title: str) -> Grid:
+def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
     """TC and CA by class, one pair of columns per protocol; percent."""
     header = ("class", *(f"{score} {protocol}" for protocol in table.tc for score in ("TC", "CA")))
     columns = [
@@ -215,10 +215,10 @@ def consistency_grid(table: ConsistencyTable, title: str) -> Grid:
     means = [value for p in table.tc for value in (table.mean_tc[p], table.mean_ca[p])]
     labels = class_labels(table.names, table.unscored)
     rows = [(name, *map(percent, row)) for name, *row in zip(labels, *columns, strict=True)]
-    return Grid(title, header, (*rows, ("mean", *map(percent, means))))
+    return TextTable(title, header, (*rows, ("mean", *map(percent, means))))
 
 
-def result_grids(tables: ResultTables) -> tuple[Grid, ...]:
+def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:
     """The tables that stand at the end of a run."""
     where = f"{tables.split}, step {tables.step}"
     grids = (

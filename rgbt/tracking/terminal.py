@@ -14,8 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from rgbt.tracking.fit import SHORTEST, blocks, is_text, shortened
-from rgbt.tracking.tables import Grid, ResultTables, result_grids
+from rgbt.tracking.column_layout import SHORTEST, blocks, is_text, shortened
+from rgbt.tracking.tables import ResultTables, TextTable, result_grids
 
 WIDTH = 10_000
 """Columns where stdout is no terminal: a file takes lines of any length."""
@@ -31,19 +31,24 @@ Column = tuple[str, ...]
 """Header and cells of a column."""
 
 
-def tell(sentence: str) -> None:
+def info(sentence: str) -> None:
     """A line on stderr that is no error."""
     sys.stderr.write(f"rgbt: {sentence}\n")
 
 
-def rich_table(grid: Grid) -> RenderableType:
+def warn(sentence: str) -> None:
+    """A warning on stderr."""
+    info(f"warning: {sentence}")
+
+
+def rich_table(grid: TextTable) -> RenderableType:
     """A grid as a table that fits the console: labels and sentences left, numbers right."""
-    return _Fitted(grid)
+    return _FittedTable(grid)
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    grid: Grid
+class _FittedTable:
+    grid: TextTable
 
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
@@ -57,7 +62,7 @@ class _Fitted:
             yield Text("\n".join(f" {note}" for note in self.grid.notes), "dim")
 
 
-def _table(grid: Grid) -> Table:
+def _table(grid: TextTable) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
     for index, (name, *cells) in enumerate(zip(grid.header, *grid.rows, strict=True)):
         is_left = index == 0 or any(map(is_text, cells))
@@ -67,7 +72,7 @@ def _table(grid: Grid) -> Table:
     return table
 
 
-def fitted(grid: Grid, width: int) -> list[Grid]:
+def fitted(grid: TextTable, width: int) -> list[TextTable]:
     """A grid whose lines take at most `width` characters, as one or several below each other.
 
     Words are shortened first: labels, headers and sentences. Where that is not enough, the last
@@ -115,9 +120,9 @@ def _words_cut(cells: Sequence[str], limits: Sequence[int], *, every: bool) -> l
     return [short.get(cell, cell) for cell in cells]
 
 
-def _part(columns: Sequence[Column], indices: Sequence[int], title: str) -> Grid:
+def _part(columns: Sequence[Column], indices: Sequence[int], title: str) -> TextTable:
     header, *rows = zip(*(columns[index] for index in indices), strict=True)
-    return Grid(title, header, tuple(rows))
+    return TextTable(title, header, tuple(rows))
 
 
 def _taken(columns: Sequence[Column]) -> int:
@@ -140,10 +145,10 @@ def final_lines(folder: Path, links: Sequence[tuple[str, str]]) -> Text:
         folder: the run folder.
         links: what the tracker answered (`links()`): (name, command or address).
     """
-    return place_lines([("run folder", str(folder)), *links])
+    return path_lines([("run folder", str(folder)), *links])
 
 
-def place_lines(places: Sequence[tuple[str, str]]) -> Text:
+def path_lines(places: Sequence[tuple[str, str]]) -> Text:
     """Where things are, one "name  place" pair per line."""
     width = max(len(name) for name, _ in places)
     return Text("\n".join(f"{name:<{width}}  {place}" for name, place in places), no_wrap=True)
@@ -156,6 +161,6 @@ def result_view(
     return Group(*map(rich_table, result_grids(tables)), final_lines(folder, links))
 
 
-def show(renderable: RenderableType) -> None:
+def print_rich(renderable: RenderableType) -> None:
     """Print results to stdout: tables fit the terminal, and no line of text is cut or broken."""
     Console(width=line_width()).print(renderable, soft_wrap=True)

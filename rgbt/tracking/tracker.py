@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, Protocol
 
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.run_folder import RunFolder
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 

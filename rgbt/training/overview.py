@@ -11,7 +11,7 @@ from torch import nn
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.build.training_setup import TrainingSetup
-from rgbt.tracking.terminal import place_lines
+from rgbt.tracking.terminal import path_lines
 
 MILLION = 1e6
 
@@ -33,7 +33,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ),
         ("folder", str(folder)),
     ]
-    _write(name, *(f"  {line}" for line in place_lines(lines).plain.splitlines()))
+    _write(name, *(f"  {line}" for line in path_lines(lines).plain.splitlines()))
 
 
 def announce_network(network: TrainedNetwork) -> None:

@@ -23,7 +23,7 @@ from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
 from rgbt.files.atomic import is_held
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
 from rgbt.tracking.other_code import other_code
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info, warn
 from rgbt.training.train import train
 
 POLL_S = 1.0
@@ -82,8 +82,8 @@ def _warn_of_other_code(run: RunSpec) -> None:
         spec = dependency.run
         made_by = other_code(spec.folder) if spec.is_finished else None
         if made_by is not None:
-            tell(
-                f"warning: the upstream run {spec.folder} ({dependency.key}) was made by other "
+            warn(
+                f"the upstream run {spec.folder} ({dependency.key}) was made by other "
                 f"code ({made_by}) and is used as it is; to train it again, run "
                 f"+experiment={spec.name} with fresh=true."
             )
@@ -101,12 +101,12 @@ def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
 
 
 def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
-    tell(f"{run.name} depends on {spec.name}, which is trained first: {spec.folder}")
+    info(f"{run.name} depends on {spec.name}, which is trained first: {spec.folder}")
     is_waiting = False
     while not spec.is_finished:
         if is_held(spec.folder / "lock"):
             if not is_waiting:
-                tell(f"{spec.folder} is being trained by another process; waiting for it.")
+                info(f"{spec.folder} is being trained by another process; waiting for it.")
             is_waiting = True
             time.sleep(POLL_S)
             continue

@@ -37,14 +37,14 @@ from rgbt.metrics.pairs import file_name
 from rgbt.runtime.signals import deferred
 from rgbt.spec.naming import describe, group_of
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
-from rgbt.tracking.pictures import Example, RegionHeat, draw_panel, draw_region_heat
+from rgbt.tracking.pictures import PanelExample, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
-from rgbt.tracking.replaced import replace_finished
+from rgbt.tracking.replaced_runs import replace_finished
+from rgbt.tracking.run_folder import Description, RunFolder
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
-from rgbt.tracking.terminal import result_view, show, tell
+from rgbt.tracking.terminal import info, print_rich, result_view, warn
 from rgbt.tracking.tracker import Tracking
 from rgbt.training.overview import announce_training
 from rgbt.transforms.view_sets import ViewSets
@@ -93,13 +93,13 @@ def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> Non
     assert tables is not None, "a finished run has its tables"
     heads = domains.told(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
-    show(result_view(ResultTables.from_json(tables), folder.path, links))
+    print_rich(result_view(ResultTables.from_json(tables), folder.path, links))
 
 
 def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
     known = folder.description()
     assert known is not None, "a finished run has its description"
-    tell(f"{requested.name} is finished; showing its result. Another seed is another run: seed=1.")
+    info(f"{requested.name} is finished; showing its result. Another seed is another run: seed=1.")
     # A point of a grid may be the default of an experiment: the longer name says what it varies.
     lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
     shown = requested if lengths[0] > lengths[1] else known
@@ -117,7 +117,7 @@ def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
     except InputError:
         return  # a result can be shown without its data
     if result is not None and result["dataset"] != now:
-        tell(
+        info(
             f"it was made on other files of the data set ({result['dataset'][:8]}, now "
             f"{now[:8]}); to train on these: runs_dir=..., or dataset.name=..."
         )
@@ -127,7 +127,7 @@ def _warn_of_missing_consistency(folder: RunFolder, views: ViewSets) -> None:
     """A finished run is not evaluated again: say which command measures its consistency."""
     paths = [folder.path / file_name("aligned", split, views.mark) for split in views.splits]
     if views.sets and not all(path.is_file() for path in paths):
-        tell(
+        info(
             "its consistency on these views and splits has not been measured; to add it: "
             f"python -m rgbt.consistency run={folder.path} split=..."
         )
@@ -217,7 +217,7 @@ class Run:
                 "set another name (dataset.name=...)."
             )
         if before["files"] != found["files"]:
-            tell(f"files of {dataset.root} have changed since this run was started.")
+            info(f"files of {dataset.root} have changed since this run was started.")
         self.folder.mark(**found)
         config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
         self.folder.write_config(without_passwords(config))
@@ -228,8 +228,8 @@ class Run:
         trainer = self._trainer(session, state)
         if trainer.resume(state):
             if trainer.checkpoints.warning:
-                tell(trainer.checkpoints.warning)
-            tell(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
+                info(trainer.checkpoints.warning)
+            info(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
         self.folder.begin_at(state.step)
         warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
@@ -245,19 +245,19 @@ class Run:
         step = state.step
         before = self.folder.truncate_after(step, state.evaluated_step)
         if before.reached > step:
-            tell(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
+            info(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
         logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
         every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
-            tell(
-                f"warning: {self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
+            warn(
+                f"{self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
                 f"checkpoint is of step {step}; the lines between are missing, counts and "
                 "checkpoint are not affected."
             )
         if before.damaged:
             more = f" and {len(before.damaged) - 1} more" if len(before.damaged) > 1 else ""
-            tell(
-                f"warning: {self.folder.path / 'metrics.jsonl'} was damaged "
+            warn(
+                f"{self.folder.path / 'metrics.jsonl'} was damaged "
                 f"({before.damaged[0]}{more}); "
                 "these lines are left out, metrics.jsonl.damaged holds the file as it was."
             )
@@ -273,7 +273,7 @@ class Run:
             cache = (
                 "" if session.loading.cache else "data.cache=auto decodes every image once, and "
             )
-            tell(
+            info(
                 f"{np.median(shares):.0%} of the time of a step was waiting for images; {cache}"
                 "data.num_workers=... gives more processes to reading them."
             )
@@ -318,7 +318,7 @@ class Run:
                 found = count_pairs(session, session.model, split, "virtual", keep=keep)
             except InputError as error:
                 # The training is done, and is not lost for what is measured beside.
-                tell(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
+                info(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
                 continue
             for protocol, counts in found.counts.items():
                 path = self.folder.path / file_name(protocol, split, session.consistency.mark)
@@ -347,7 +347,7 @@ class Run:
         if found.kept:
             self._draw(session, tables, found.kept)
         else:
-            tell("none of the images of the panel could be read; no pictures were drawn.")
+            info("none of the images of the panel could be read; no pictures were drawn.")
 
     def _of_target(
         self, session: Session, model: nn.Module, split: str, place: Path
@@ -365,7 +365,7 @@ class Run:
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}
 
-    def _draw(self, session: Session, tables: ResultTables, kept: Sequence[Example]) -> None:
+    def _draw(self, session: Session, tables: ResultTables, kept: Sequence[PanelExample]) -> None:
         draw_panel(kept, legend_of(session.dataset), self.folder.figure_path("panel"))
         heat = RegionHeat(
             title=f"{self.description.name}: IoU by region, {session.dataset.name} {tables.split}",

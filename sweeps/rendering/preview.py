@@ -6,7 +6,7 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 
-from rgbt.tracking.tables import ABSENT, Grid
+from rgbt.tracking.tables import ABSENT, TextTable
 from sweeps.table.parameter_counts import SCALE
 from sweeps.table.request import TableRequest
 from sweeps.worker.list_source import State
@@ -17,7 +17,7 @@ STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
 
 
-def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
+def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> TextTable:
     """One line per run: state, seconds or the reason why it failed, command."""
     rows = [
         (
@@ -30,10 +30,12 @@ def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> Grid:
         for outcome in outcomes
     ]
     title = f"{request.name}, scale={request.scale}: runs of the cells"
-    return Grid(title, ("cell", "state", "seconds", "run", "reason"), tuple(rows))
+    return TextTable(title, ("cell", "state", "seconds", "run", "reason"), tuple(rows))
 
 
-def tables_grid(previews: Sequence[tuple[TableRequest, Sequence[Outcome]]], workers: int) -> Grid:
+def tables_grid(
+    previews: Sequence[tuple[TableRequest, Sequence[Outcome]]], workers: int
+) -> TextTable:
     """One line per table: rows, runs by state, estimated time."""
     rows = []
     for request, outcomes in previews:
@@ -45,7 +47,7 @@ def tables_grid(previews: Sequence[tuple[TableRequest, Sequence[Outcome]]], work
         time = known if outcomes else ABSENT
         rows.append((request.name, f"{runnable} of {len(request.table.rows)}", *counts, time))
     header = ("table", "rows to run", *STATES, "time left")
-    return Grid("Runs of all tables", header, tuple(rows))
+    return TextTable("Runs of all tables", header, tuple(rows))
 
 
 def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:

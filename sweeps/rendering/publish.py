@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.files.atomic import write_atomic
-from rgbt.tracking.terminal import line_width, place_lines, show, tell
+from rgbt.tracking.terminal import info, line_width, path_lines, print_rich
 from sweeps.rendering.figure import draw_table
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
@@ -42,12 +42,12 @@ def publish_table(
     runs, sizes = request.runs(outcomes), parameter_cells(request)
     scored = score(request.name, request.table, runs, scale=request.scale, sizes=sizes)
     rendered = render_table(scored, request.typed_overrides())
-    show(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
+    print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
     failed = _report_missing(scored, outcomes)
     try:
         files = write_files(scored, rendered, out)
     except OSError as error:
-        tell(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
+        info(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
         return 1
     links = record(
         tracking,
@@ -63,7 +63,7 @@ def publish_table(
         note=markdown(rendered),
     )
     links = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
-    show(place_lines(links))
+    print_rich(path_lines(links))
     return 1 if failed else 0
 
 
@@ -96,18 +96,18 @@ def _report_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:
     others = [outcome for outcome in outcomes if outcome.state in ("running", "waiting")]
     empty = any(cell.mark == NO_VALUE for cell in scored.cells.values())
     if failed:
-        tell(
+        info(
             f"{len(failed)} of {len(outcomes)} runs failed, see the footnotes; rerun the command "
             "with retry=failed to retry them."
         )
     if others:
-        tell(
+        info(
             f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them, or "
             "they have not begun; rerun the command later, or with wait=true."
         )
     if empty:
-        tell("some cells have no value although nothing is missing, see the footnotes.")
+        info("some cells have no value although nothing is missing, see the footnotes.")
     other = other_code_line(outcomes)
     if other:
-        tell(other)
+        info(other)
     return bool(failed) or empty

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rgbt.metrics import names
-from rgbt.tracking.tables import ABSENT, Grid, number
+from rgbt.tracking.tables import ABSENT, TextTable, number
 from sweeps.point import Point
 from sweeps.rendering.text_cell import TextCell
 from sweeps.table.cells import TableCell, Value, over_seeds
@@ -14,7 +14,7 @@ from sweeps.worker.point_list import Outcome
 MOST_REGIONS = 99
 
 
-def group_grid(title: str, outcomes: Sequence[Outcome]) -> Grid:
+def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     """Scores on the test split by configuration.
 
     Args:
@@ -38,17 +38,17 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> Grid:
         beside = [] if has_seeds else [" ".join(key) or ABSENT]
         rows.append((label, seeds, *map(_shown, cells), *beside))
     header = ("configuration", "seeds", *metrics, *([] if has_seeds else ["run"]))
-    return Grid(title, header, tuple(rows))
+    return TextTable(title, header, tuple(rows))
 
 
-def unfinished_grid(outcomes: Sequence[Outcome]) -> Grid:
+def unfinished_grid(outcomes: Sequence[Outcome]) -> TextTable:
     """Points without a result and why; no rows where all are finished."""
     rows = tuple(
         (each.point.label, each.state, " ".join(each.keys) or ABSENT, each.reason)
         for each in outcomes
         if each.state != "finished"
     )
-    return Grid("Points without a result", ("point", "state", "run", "reason"), rows)
+    return TextTable("Points without a result", ("point", "state", "run", "reason"), rows)
 
 
 def configuration(point: Point) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from rich.text import Text as RichText
 
-from rgbt.tracking.fit import SHORTEST, blocks, shortened
+from rgbt.tracking.column_layout import SHORTEST, blocks, shortened
 from rgbt.tracking.terminal import WIDTH
 from sweeps.rendering.line_builder import BESIDE_OURS, WITH_SD
 from sweeps.rendering.rendered_table import RenderedTable
@@ -27,7 +27,7 @@ LEGENDS = ("Bold: best, underlined: second best.", "*: best, _: second best.")
 
 
 def terminal(rendered: RenderedTable, *, plain: bool = False, width: int = WIDTH) -> RichText:
-    """The table for `rgbt.tracking.terminal.show`.
+    """The table for `rgbt.tracking.terminal.print_rich`.
 
     Args:
         rendered: the table.

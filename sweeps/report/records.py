@@ -13,11 +13,11 @@ from rgbt.tracking.mlflow_server import pages_of
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_view import run_path
 from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Link, Tracking
 
 if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_client import Store
+    from rgbt.tracking.mlflow_client import MlflowStore
 
 Kind = Literal["table", "study"]
 
@@ -67,7 +67,7 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
         store.client.set_terminated(run_id)
     except Exception as error:  # The border to a store that may fail in any way.
         reason = (str(error).splitlines() or [""])[0][:120]
-        tell(
+        info(
             f"the {kind} was not sent to MLflow ({type(error).__name__}: "
             f"{without_passwords(reason)}); the same command sends it later."
         )
@@ -77,7 +77,7 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
     return [page] if shown.command is None else [("open MLflow", shown.command), page]
 
 
-def _run(store: Store, name: str) -> str:
+def _run(store: MlflowStore, name: str) -> str:
     """The run that holds `name`, made where there is none."""
     found = _oldest(store, name)
     if found is not None:
@@ -92,7 +92,7 @@ def _run(store: Store, name: str) -> str:
     return kept
 
 
-def _oldest(store: Store, name: str) -> str | None:
+def _oldest(store: MlflowStore, name: str) -> str | None:
     runs = store.client.search_runs(
         [store.experiment_id],
         filter_string=f'tags.`{RECORD}` = "{name}"',

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.metrics import names as metric_names
 from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, Grid, number
+from rgbt.tracking.tables import ABSENT, TextTable, number
 from sweeps import attributes
 from sweeps.report.study_data import Importances, StudyData, pruning_savings, short_names
 
@@ -36,13 +36,13 @@ WORDS = {
 """Optuna's states as people are told them."""
 
 
-def tables(data: StudyData, shares: Importances) -> list[Grid]:
+def tables(data: StudyData, shares: Importances) -> list[TextTable]:
     """What the terminal and the Markdown file show, in order; empty tables are left out."""
     found = [counts_grid(data), trials_grid(data), failed_grid(data), importance_grid(data, shares)]
     return [grid for grid in found if grid.rows]
 
 
-def counts_grid(data: StudyData) -> Grid:
+def counts_grid(data: StudyData) -> TextTable:
     """Number of trials by state, and the share of training steps that pruning saved."""
     counts = data.counts()
     saved = pruning_savings(data)
@@ -51,10 +51,10 @@ def counts_grid(data: StudyData) -> Grid:
     if saved is not None and saved.trials:
         header.append("steps saved by pruning")
         row.append(f"{saved.share:.0%}")
-    return Grid(f"Study {data.name} ({data.kind})", tuple(header), (tuple(row),))
+    return TextTable(f"Study {data.name} ({data.kind})", tuple(header), (tuple(row),))
 
 
-def trials_grid(data: StudyData) -> Grid:
+def trials_grid(data: StudyData) -> TextTable:
     """The trials that a person wants to see.
 
     Of a search the best `TOP` by the objective, or the Pareto front of several; of a grid or list
@@ -74,7 +74,7 @@ def trials_grid(data: StudyData) -> Grid:
     return _grid(data, title, best, with_label=not data.distributions)
 
 
-def failed_grid(data: StudyData) -> Grid:
+def failed_grid(data: StudyData) -> TextTable:
     """Failed trials with their reasons; not those whose point a later trial stands for."""
     failed = [trial for trial in data.latest if trial.state.name == "FAIL"]
     again = data.counts()["FAIL"] - len(failed)
@@ -82,17 +82,17 @@ def failed_grid(data: StudyData) -> Grid:
     rows = [
         (_clipped(_reason(t)), str(t.number), data.label(t), _runs(t), _seconds(t)) for t in failed
     ]
-    return Grid(title, ("reason", "trial", "point", "runs", "seconds"), tuple(rows))
+    return TextTable(title, ("reason", "trial", "point", "runs", "seconds"), tuple(rows))
 
 
-def importance_grid(data: StudyData, shares: Importances) -> Grid:
+def importance_grid(data: StudyData, shares: Importances) -> TextTable:
     """Share of each parameter in the importance, by objective, in percent."""
     rows = [
         (name, *(number(100.0 * share) for share in of_objectives))
         for name, of_objectives in shares.shares.items()
     ]
     header = ("parameter", *(f"for {metric}, %" for metric in data.metrics))
-    return Grid("Importance of the parameters", header, tuple(rows))
+    return TextTable("Importance of the parameters", header, tuple(rows))
 
 
 def trials_csv(data: StudyData) -> str:
@@ -117,13 +117,15 @@ def trials_csv(data: StudyData) -> str:
     return csv_text(rows)
 
 
-def markdown_table(grid: Grid) -> str:
+def markdown_table(grid: TextTable) -> str:
     """A grid in Markdown; a bar in a reason or label must not begin a column."""
     rows = tuple(tuple(cell.replace("|", "\\|") for cell in row) for row in grid.rows)
-    return Grid(grid.title, grid.header, rows).to_markdown()
+    return TextTable(grid.title, grid.header, rows).to_markdown()
 
 
-def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_label: bool) -> Grid:
+def _grid(
+    data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_label: bool
+) -> TextTable:
     """Trials with what they are, val and test scores beside each other, and their runs."""
     names = [] if with_label else list(data.distributions)
     short = short_names(data.distributions)
@@ -144,7 +146,7 @@ def _grid(data: StudyData, title: str, trials: Sequence[FrozenTrial], *, with_la
         ]
         values = [number(results[name]) if name in results else ABSENT for name in scores]
         rows.append((str(trial.number), *what, *values, _seconds(trial), _runs(trial)))
-    return Grid(title, tuple(header), tuple(rows))
+    return TextTable(title, tuple(header), tuple(rows))
 
 
 def _scores(data: StudyData, trial: FrozenTrial) -> dict[str, float]:

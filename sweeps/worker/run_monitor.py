@@ -9,8 +9,8 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 
-from rgbt.tracking.folder import MetricLine, metric_line
-from rgbt.tracking.formats import read_result
+from rgbt.tracking.run_files import read_result
+from rgbt.tracking.run_folder import MetricLine, metric_line
 
 FULL = 1_000_000
 """Bytes; a disk with less is full."""

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from rgbt.checks import InputError, RunError
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.replaced import replace_finished
+from rgbt.tracking.replaced_runs import replace_finished
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Status, Tracking
 
 FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
@@ -123,7 +123,7 @@ class RunStore:
         except Exception as error:  # The border to a store that may fail in any way.
             self._is_unreachable = True
             lines = without_passwords(str(error)).splitlines() or [type(error).__name__]
-            tell(
+            info(
                 f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched in "
                 f"{self.runs_dir} alone. Send new runs later: `python -m rgbt.tracking.sync`."
             )

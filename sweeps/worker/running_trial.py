@@ -12,7 +12,7 @@ from statistics import fmean
 
 from rgbt.checks import RunError
 from rgbt.files.atomic import is_held
-from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.run_specs import PlannedRun

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
-from rgbt.tracking.folder import MetricLine
 from rgbt.tracking.percent import in_percent
+from rgbt.tracking.run_folder import MetricLine
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour
 from sweeps.settings import SweepSettings

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.run_folder import Description, RunFolder
 from tests.analysis.figures.drawn import counts
 
 SCORES = {

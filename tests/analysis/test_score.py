@@ -21,7 +21,7 @@ from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.run_folder import Description, RunFolder
 from tests.commands import SPLITS, Call
 from tests.conftest import pair
 

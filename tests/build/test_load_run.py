@@ -32,7 +32,7 @@ def session(**splits: tuple[str, ...]) -> SimpleNamespace:
 @pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     lines: list[str] = []
-    monkeypatch.setattr(stored, "tell", lines.append)
+    monkeypatch.setattr(stored, "info", lines.append)
     return lines
 
 

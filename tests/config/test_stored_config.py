@@ -54,7 +54,7 @@ OTHERS = [
         "rgbt.config.targets.get_object",
         "rgbt.config.targets.instantiate",
     ),
-    *("rgbt.files.atomic.write_atomic", "rgbt.tracking.folder.RunFolder", "rgbt"),
+    *("rgbt.files.atomic.write_atomic", "rgbt.tracking.run_folder.RunFolder", "rgbt"),
     *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
     *("rgbt.maskers.masker.Masker.", "rgbt.maskers.masker.Masker.__init__", "Rgbt.maskers.masker"),
     *("rgbt.maskers.masker.Masker ", "rgbt.maskers.masker.Maske\u0433", "rgbt.maskers.masker"),

@@ -381,7 +381,7 @@ def test_two_processes_do_not_write_at_once(
     out.mkdir()
     said: list[str] = []
     waits = threading.Event()
-    monkeypatch.setattr(pseudo, "tell", lambda sentence: (said.append(sentence), waits.set()))
+    monkeypatch.setattr(pseudo, "info", lambda sentence: (said.append(sentence), waits.set()))
     other = threading.Thread(target=written, args=(session, out))
     with holding(out / ".lock"):
         other.start()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rgbt.tracking.fit import blocks, is_text, shortened
+from rgbt.tracking.column_layout import blocks, is_text, shortened
 
 
 def test_labels_are_cut_in_the_middle_and_short_ones_left() -> None:

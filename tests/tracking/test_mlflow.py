@@ -20,12 +20,17 @@ from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
 from rgbt.tracking import mlflow_client, sync
-from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_fill import Sent, artifact_table, read_sent, write_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.mlflow_upload import (
+    UploadState,
+    artifact_table,
+    read_upload_state,
+    write_upload_state,
+)
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
 from rgbt.tracking.percent import shown
-from rgbt.tracking.replaced import replace_finished
+from rgbt.tracking.replaced_runs import replace_finished
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
@@ -110,7 +115,7 @@ def finished(runs_dir: Path) -> RunFolder:
 
 
 def run_id(folder: RunFolder) -> str:
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     assert sent is not None
     assert sent.run_id
     return sent.run_id
@@ -134,13 +139,13 @@ def test_sending_lines_again_after_a_crash_leaves_no_duplicate(runs_dir: Path) -
     folder.append(5, "train", {"loss": 3.0})
     conclude(folder)
     tracking(runs_dir).sync(folder, "FINISHED")
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     assert sent is not None
-    write_sent(folder, replace(sent, steps={}, profile=False))
+    write_upload_state(folder, replace(sent, steps={}, profile=False))
     tracking(runs_dir).sync(folder, "FINISHED")
     assert points(client(runs_dir), sent.run_id, "train/loss") == [(5, 3.0)]
     assert points(client(runs_dir), sent.run_id, "profile/iou_by_region") == [(1, 25.0), (2, 50.0)]
-    assert read_sent(folder) == sent
+    assert read_upload_state(folder) == sent
 
 
 def unnoted(runs_dir: Path, name: str) -> RunFolder:
@@ -221,7 +226,7 @@ def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> 
     tracker = tracking(runs_dir)
     begin(folder, tracker)
     tracker.finish("FAILED")
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     assert sent is not None
     store = client(runs_dir)
     assert store.get_run(sent.run_id).info.status == "FAILED"
@@ -294,7 +299,7 @@ def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
     uri = f"sqlite:///{runs_dir / 'mlflow.db'}"
     assert sync.entry.code([f"run={folder.path}", f"uri={uri}"]) == 0
     assert sync.entry.code([f"run={folder.path}"]) == 0, "the requested store is remembered"
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     assert sent is not None
     assert sent.uri == uri
     assert sent.run_id in capsys.readouterr().out
@@ -310,13 +315,13 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     tracker.update()
     tracker.finish("FAILED")
     assert tracker.links() == []
-    assert read_sent(folder) is None
+    assert read_upload_state(folder) is None
     shutil.rmtree(runs_dir / "dead", ignore_errors=True)  # has no reachable store if it ran alone
     assert sync.entry.code([f"runs_dir={runs_dir}"]) == 0
     output = capsys.readouterr().out
     assert f"{folder.path}  ->  MLflow run " in output
     assert "mlflow ui --workers 1 --backend-store-uri sqlite:///" in output
-    sent = read_sent(folder)
+    sent = read_upload_state(folder)
     assert sent is not None
     assert client(runs_dir).get_run(sent.run_id).info.status == "KILLED"
 
@@ -380,7 +385,7 @@ def test_links_open_the_pages(runs_dir: Path) -> None:
 def test_many_processes_may_start_on_a_fresh_store(tmp_path: Path) -> None:
     code = (
         "import sys\n"
-        "from rgbt.tracking.folder import RunFolder\n"
+        "from rgbt.tracking.run_folder import RunFolder\n"
         "from rgbt.tracking.mlflow_store import MlflowTracking\n"
         "runs, key = sys.argv[1:]\n"
         "t = MlflowTracking(None, artifact_uri=None, experiment='rgbt', runs_dir=runs)\n"
@@ -492,21 +497,23 @@ def test_a_store_is_the_same_however_much_of_its_address_was_hidden(tmp_path: Pa
     partly = "postgresql://u:123/abc@h/db?sslpassword=***"
     folder, place = RunFolder(tmp_path / "run"), "sftp://u:pw@h/files"
     store = MlflowTracking(uri, artifact_uri=place, experiment="e", runs_dir=str(tmp_path))
-    assert store._sent(folder) == Sent(hidden, "e", "sftp://u:***@h/files")
+    assert store._sent(folder) == UploadState(hidden, "e", "sftp://u:***@h/files")
     for stored in (hidden, uri, partly, "postgresql://u:***@h/db?sslpassword=x"):
-        write_sent(folder, Sent(stored, "e", None, "1", "the run"))
-        assert store._sent(folder) == Sent(hidden, "e", None, "1", "the run")
-    write_sent(folder, Sent("postgresql://u:***@other/db", "e", None, "1", "the run"))
+        write_upload_state(folder, UploadState(stored, "e", None, "1", "the run"))
+        assert store._sent(folder) == UploadState(hidden, "e", None, "1", "the run")
+    write_upload_state(
+        folder, UploadState("postgresql://u:***@other/db", "e", None, "1", "the run")
+    )
     assert store._sent(folder).run_id == ""
 
 
 @pytest.mark.parametrize("uri", ["postgresql://u:***@h/db", "https://***@h", "x://h?password=***"])
 def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> None:
     folder = RunFolder(tmp_path / "run")
-    write_sent(folder, Sent(uri, "e"))
+    write_upload_state(folder, UploadState(uri, "e"))
     with pytest.raises(InputError, match=r"give uri=\.\.\. with it"):
         sync.tracking_of(folder, sync.Options(run=folder.path))
-    write_sent(folder, Sent("http://h:5000", "e", "sftp://u:***@h/files"))
+    write_upload_state(folder, UploadState("http://h:5000", "e", "sftp://u:***@h/files"))
     with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
         sync.tracking_of(folder, sync.Options(run=folder.path))
     assert (

@@ -10,9 +10,9 @@ import pytest
 
 from rgbt.files.budgets import SEAL
 from rgbt.tracking import other_code as module
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code, warn_of_result, warn_of_steps
 from rgbt.tracking.provenance import package_digest
+from rgbt.tracking.run_folder import RunFolder
 
 NOW = {"code": "c" * 64, "git_commit": "d" * 40, "git_dirty": False, "diff": ""}
 OTHER = {"code": "a" * 64, "git_commit": "b" * 40, "git_dirty": True}

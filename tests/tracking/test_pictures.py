@@ -12,8 +12,8 @@ import pytest
 from rgbt.tracking.pictures import (
     HALF_SPAN,
     IGNORED_COLOUR,
-    Example,
     Legend,
+    PanelExample,
     RegionHeat,
     _broken,
     colour_limits,
@@ -94,7 +94,7 @@ def test_panel_is_drawn_with_every_class_colour(tmp_path: Path) -> None:
     label = np.zeros((30, 40), np.uint8)
     label[5:15, 5:15] = 1
     rgb = generator.integers(0, 255, (30, 40, 3)).astype(np.uint8)
-    example = Example("00001D", rgb, rgb[..., 0], label, label)
+    example = PanelExample("00001D", rgb, rgb[..., 0], label, label)
     sizes = []
     for count in (1, 3):
         path = tmp_path / f"panel_{count}.png"

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.tracking.folder import Description, RunFolder, find_run, runs_in
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.replaced import description_of, replace_finished, runs_dir_of, set_aside
+from rgbt.tracking.replaced_runs import replace_finished, runs_dir_of, set_aside, shown_description
+from rgbt.tracking.run_folder import Description, RunFolder, find_run, runs_in
 from rgbt.tracking.sync import Options, folders_of
 
 TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}
@@ -60,7 +60,7 @@ def test_a_replaced_run_is_no_run_of_the_folder_but_is_sent(tmp_path: Path) -> N
 
 def test_a_replaced_run_is_shown_outside_of_its_group(tmp_path: Path) -> None:
     replace_finished(finished(tmp_path), NoTracking())
-    shown = description_of(RunFolder(tmp_path / "replaced" / "abc-1"))
+    shown = shown_description(RunFolder(tmp_path / "replaced" / "abc-1"))
     assert shown is not None
     assert shown.name == "grbm seed=0 (replaced)"
     assert shown.tags == {
@@ -70,4 +70,4 @@ def test_a_replaced_run_is_shown_outside_of_its_group(tmp_path: Path) -> None:
         "rgbt.replaced": "true",
     }
     present = finished(tmp_path)
-    assert description_of(present) == present.description()
+    assert shown_description(present) == present.description()

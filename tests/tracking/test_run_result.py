@@ -10,7 +10,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.folder import Description, RunFolder
+from rgbt.tracking.run_folder import Description, RunFolder
 from rgbt.tracking.run_result import RunResult
 
 

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from rgbt.tracking import terminal
-from rgbt.tracking.mlflow_fill import artifact_table
+from rgbt.tracking.mlflow_upload import artifact_table
 from rgbt.tracking.tables import (
     ClassTable,
     ConsistencyTable,
@@ -139,7 +139,7 @@ def test_show_prints_to_stdout_and_never_cuts(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     long = Path("/a" * 150)
-    terminal.show(terminal.result_view(tables, long, []))
+    terminal.print_rich(terminal.result_view(tables, long, []))
     output = capsys.readouterr()
     assert f"run folder  {long}\n" in output.out
     assert "62.50" in output.out

@@ -8,18 +8,18 @@ import pytest
 from rich.console import Console
 
 from rgbt.tracking import terminal
-from rgbt.tracking.tables import Grid
-from rgbt.tracking.terminal import fitted, place_lines, rich_table, show
+from rgbt.tracking.tables import TextTable
+from rgbt.tracking.terminal import fitted, path_lines, print_rich, rich_table
 
 NUMBERS = ("48.75 ± 1.22", "-1.64", "-2.20 to -1.01", "454482993c6b")
-GRID = Grid(
+GRID = TextTable(
     "A title that is by far longer than the table of two columns below it",
     ("", "grbm sigma_div=1 of three seeds", "difference", "95 % over images", "run"),
     tuple((f"sigma_div={n} max_steps=240 · grbm", *NUMBERS) for n in (1, 2)),
 )
 
 
-def lines(grid: Grid, width: int) -> list[str]:
+def lines(grid: TextTable, width: int) -> list[str]:
     console = Console(width=width)
     with console.capture() as captured:
         console.print(rich_table(grid), soft_wrap=True)
@@ -56,23 +56,23 @@ def test_headers_that_differ_still_do() -> None:
     for width in (40, 60, 70):
         heads = [
             name
-            for part in fitted(Grid("", header, (("mIoU", "1.00", "2.00"),)), width)
+            for part in fitted(TextTable("", header, (("mIoU", "1.00", "2.00"),)), width)
             for name in part.header[1:]
         ]
         assert len(set(heads)) == 2
 
 
 def test_a_table_without_rows_is_shown() -> None:
-    assert lines(Grid("t", ("point", "mIoU"), ()), 80)[0] == "t"
+    assert lines(TextTable("t", ("point", "mIoU"), ()), 80)[0] == "t"
 
 
 def test_a_file_gets_whole_lines_and_a_terminal_whole_paths(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wide = Grid("t", ("", *(f"column {n}" for n in range(60))), (("label", *["1.00"] * 60),))
-    show(rich_table(wide))
+    wide = TextTable("t", ("", *(f"column {n}" for n in range(60))), (("label", *["1.00"] * 60),))
+    print_rich(rich_table(wide))
     assert "1.00 " * 2 in re.sub(" +", " ", capsys.readouterr().out)
     monkeypatch.setattr(terminal, "line_width", lambda: 40)
     place = "/a/very/long" * 20
-    show(place_lines([("run folder", place), ("MLflow", "x")]))
+    print_rich(path_lines([("run folder", place), ("MLflow", "x")]))
     assert place in capsys.readouterr().out

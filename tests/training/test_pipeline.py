@@ -22,7 +22,7 @@ from rgbt.spec import upstream
 from rgbt.spec.naming import TAGS, describe
 from rgbt.spec.run_spec import Dependency, RunSpec
 from rgbt.spec.specify import specify
-from rgbt.tracking.folder import RunFolder
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.training import pipeline
 from tests.commands import Call, Trained, short
 from tests.composed import composed
@@ -282,7 +282,7 @@ def another_process(folder: Path, *, finishes: bool, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(pipeline, "POLL_S", 0.01)
     messages: list[str] = []
     waits, holds = threading.Event(), threading.Event()
-    monkeypatch.setattr(pipeline, "tell", lambda text: (messages.append(text), waits.set()))
+    monkeypatch.setattr(pipeline, "info", lambda text: (messages.append(text), waits.set()))
 
     def hold() -> None:
         folder.mkdir(parents=True)

@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 
 from rgbt.engine.checkpoint import State
-from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_folder import Description, RunFolder
 from rgbt.training.train import Run, _show_again
 
 

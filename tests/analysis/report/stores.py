@@ -15,8 +15,8 @@ from analysis.report.store import RunFiles
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
 from rgbt.randomness import numpy_generator
-from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.run_folder import Description, RunFolder
 from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.rendering.file_formats import tidy_csv

@@ -14,8 +14,8 @@ import optuna
 import pytest
 
 from rgbt.spec.naming import TAGS
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.settings import Objective
 from sweeps.worker import driver as drivers

@@ -11,10 +11,10 @@ import pytest
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names, scores
-from rgbt.tracking.folder import RunFolder
-from rgbt.tracking.mlflow_fill import read_sent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
+from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.percent import in_percent
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.run_specs import open_run_store
@@ -206,7 +206,7 @@ class Machines:
         return run
 
     def tags(self, run: RunFolder) -> dict[str, str]:
-        sent = read_sent(run)
+        sent = read_upload_state(run)
         assert sent is not None
         client = self.runs("there").tracking.store().client  # type: ignore[attr-defined]
         return dict(client.get_run(sent.run_id).data.tags)

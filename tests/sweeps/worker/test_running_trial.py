@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point

@@ -14,8 +14,8 @@ import pytest
 from mlflow import MlflowClient
 
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from sweeps.attributes import DROPPED, KEY, OWNER, REASON, RUNS
 from sweeps.worker.run_store import RunStore

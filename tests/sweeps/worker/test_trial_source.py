@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import VARIED
-from rgbt.tracking.folder import MetricLine
+from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation

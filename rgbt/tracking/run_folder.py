@@ -35,7 +35,7 @@ from typing import Any, get_args
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
 from rgbt.files.budgets import TEXT, parse_json, read_bytes, read_json, sealed
-from rgbt.tracking.formats import (
+from rgbt.tracking.run_files import (
     Kind,
     LineForm,
     read_description,

@@ -19,7 +19,7 @@ ADVICE = "restore it from a copy, or remove the run's folder to train it again"
 
 
 class LineForm(TypedDict):
-    """A line of ``metrics.jsonl`` (`rgbt.tracking.folder.MetricLine`)."""
+    """A line of ``metrics.jsonl`` (`rgbt.tracking.run_folder.MetricLine`)."""
 
     step: int
     kind: Kind
@@ -28,7 +28,7 @@ class LineForm(TypedDict):
 
 
 class DescriptionForm(TypedDict):
-    """``run.json`` (`rgbt.tracking.folder.Description`)."""
+    """``run.json`` (`rgbt.tracking.run_folder.Description`)."""
 
     name: str
     tags: dict[str, str]
@@ -58,7 +58,7 @@ class ResultForm(TypedDict, total=False):
 
 
 class SentForm(TypedDict, total=False):
-    """``mlflow.json`` (`rgbt.tracking.mlflow_fill.Sent`)."""
+    """``mlflow.json`` (`rgbt.tracking.mlflow_upload.UploadState`)."""
 
     uri: Required[str]
     experiment: Required[str]

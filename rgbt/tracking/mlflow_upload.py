@@ -19,12 +19,12 @@ from typing import Any
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
-from rgbt.tracking.folder import MetricLine, RunFolder
-from rgbt.tracking.formats import SentForm
-from rgbt.tracking.mlflow_client import Store
+from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
 from rgbt.tracking.percent import shown
-from rgbt.tracking.replaced import description_of
+from rgbt.tracking.replaced_runs import shown_description
+from rgbt.tracking.run_files import SentForm
+from rgbt.tracking.run_folder import MetricLine, RunFolder
 from rgbt.tracking.tables import ResultTables, result_grids
 from rgbt.tracking.tracker import Status
 
@@ -49,7 +49,7 @@ TABLE_FILE = "tables/iou.json"
 
 
 @dataclass
-class Sent:
+class UploadState:
     """What a store already has of a run; lies in the folder as ``mlflow.json``.
 
     Attributes:
@@ -75,7 +75,7 @@ class Sent:
     later: list[str] = field(default_factory=list)
 
 
-def read_sent(folder: RunFolder) -> Sent | None:
+def read_upload_state(folder: RunFolder) -> UploadState | None:
     """What was sent from this folder, or None if nothing ever was.
 
     Raises:
@@ -83,16 +83,16 @@ def read_sent(folder: RunFolder) -> Sent | None:
     """
     path = folder.path / "mlflow.json"
     advice = "remove it: the MLflow run is then found by its key"
-    return Sent(**read_json(path, SentForm, advice)) if path.exists() else None
+    return UploadState(**read_json(path, SentForm, advice)) if path.exists() else None
 
 
-def write_sent(folder: RunFolder, sent: Sent) -> None:
+def write_upload_state(folder: RunFolder, sent: UploadState) -> None:
     """Remember what was sent."""
     text = json.dumps(sealed(asdict(sent)), indent=1)
     write_atomic(folder.path / "mlflow.json", text.encode())
 
 
-def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
+def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Status) -> None:
     """Bring the MLflow run of `folder` up to date; `sent` is changed and written.
 
     Args:
@@ -115,28 +115,32 @@ def fill(store: Store, folder: RunFolder, sent: Sent, status: Status) -> None:
     sent.later += later
     _send_table(store, sent, tables)
     _send_files(store, folder, sent)
-    description = description_of(folder)
+    description = shown_description(folder)
     if description is not None and short_name(description.name) != name:
         store.client.update_run(sent.run_id, name=short_name(description.name))
     if status == "RUNNING" and seen != status:
         store.client.update_run(sent.run_id, status=status)
     elif status != seen:
         store.client.set_terminated(sent.run_id, status=status, end_time=_end_time(folder))
-    write_sent(folder, sent)
+    write_upload_state(folder, sent)
 
 
-def _find_run(store: Store, folder: RunFolder, sent: Sent) -> tuple[set[str], str, str]:
+def _find_run(
+    store: MlflowStore, folder: RunFolder, sent: UploadState
+) -> tuple[set[str], str, str]:
     """Its parameters' names, status and name; the run is made if the store does not know it."""
     run = noted_run(store, sent.run_id)
     if run is None:
         run = unnoted_run(store, folder) or new_run(store, folder)
         sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
         sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
-        write_sent(folder, sent)
+        write_upload_state(folder, sent)
     return set(run.data.params), str(run.info.status), str(run.info.run_name)
 
 
-def _send(store: Store, sent: Sent, entities: tuple[list[Any], list[Any], list[Any]]) -> None:
+def _send(
+    store: MlflowStore, sent: UploadState, entities: tuple[list[Any], list[Any], list[Any]]
+) -> None:
     """One call with everything new; more only beyond MLflow's limits on one call."""
     metrics, params, tags = entities
     store.client.log_batch(
@@ -167,7 +171,7 @@ def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
                 yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
 
 
-def _later(folder: RunFolder, sent: Sent) -> dict[str, Any]:
+def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
     """Scores of pairs of frames in the result that no line holds and that were not sent yet.
 
     Those of the selection split, and those that `rgbt.consistency` added to a finished run.
@@ -208,7 +212,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
     """Parameters the run does not have yet; MLflow refuses to change one."""
     from mlflow.entities import Param
 
-    description = description_of(folder)
+    description = shown_description(folder)
     params = {} if description is None else description.params
     return [Param(k, v[:PARAM_LENGTH]) for k, v in params.items() if k not in known]
 
@@ -216,7 +220,7 @@ def _params(folder: RunFolder, known: set[str]) -> list[Any]:
 def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
     from mlflow.entities import RunTag
 
-    description = description_of(folder)
+    description = shown_description(folder)
     first = (folder.provenance() or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
@@ -269,7 +273,7 @@ def _two_decimals(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 2)
 
 
-def _send_table(store: Store, sent: Sent, tables: ResultTables | None) -> None:
+def _send_table(store: MlflowStore, sent: UploadState, tables: ResultTables | None) -> None:
     if tables is None:
         return
     text = json.dumps(artifact_table(tables))
@@ -279,7 +283,7 @@ def _send_table(store: Store, sent: Sent, tables: ResultTables | None) -> None:
         sent.files[TABLE_FILE] = digest
 
 
-def _send_files(store: Store, folder: RunFolder, sent: Sent) -> None:
+def _send_files(store: MlflowStore, folder: RunFolder, sent: UploadState) -> None:
     """Upload files that are new or changed, under their path in the folder."""
     for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
         place = path.relative_to(folder.path)

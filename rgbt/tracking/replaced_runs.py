@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rgbt.tracking.folder import Description, RunFolder
-from rgbt.tracking.terminal import tell
+from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Tracking
 
 REPLACED = "replaced"
@@ -46,7 +46,7 @@ def replace_finished(folder: RunFolder, tracking: Tracking) -> None:
         return
     tracking.start(kept, known.name, known.tags, known.params)
     tracking.finish("FINISHED")
-    tell(f"the finished run was moved to {kept.path}; run={kept.path} opens it.")
+    info(f"the finished run was moved to {kept.path}; run={kept.path} opens it.")
 
 
 def runs_dir_of(folder: RunFolder) -> Path:
@@ -54,13 +54,13 @@ def runs_dir_of(folder: RunFolder) -> Path:
     return folder.path.parents[1 if _is_replaced(folder) else 0]
 
 
-def key_of(folder: RunFolder) -> str:
+def shown_key(folder: RunFolder) -> str:
     """The key of a run as a tracker shows it: `<key>`, or `replaced/<key>-<n>`."""
     name = folder.path.name
     return f"{REPLACED}/{name}" if _is_replaced(folder) else name
 
 
-def description_of(folder: RunFolder) -> Description | None:
+def shown_description(folder: RunFolder) -> Description | None:
     """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
     known = folder.description()
     if known is None or not _is_replaced(folder):
@@ -69,7 +69,7 @@ def description_of(folder: RunFolder) -> Description | None:
         **known.tags,
         TAG: "true",
         GROUP: f"{known.tags.get(GROUP, known.name)} (replaced)",
-        "rgbt.key": key_of(folder),
+        "rgbt.key": shown_key(folder),
     }
     return replace(known, name=f"{known.name} (replaced)", tags=tags)
 
