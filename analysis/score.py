@@ -23,8 +23,7 @@ from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
-    from analysis.predictions.scoring import FolderScores
-    from analysis.predictions.scoring import ScoringOptions as Counting
+    from analysis.predictions.scoring import FolderScores, ScoringOptions
     from analysis.predictions.table import ScoreKey, ScoreTable
     from analysis.results import NamedCounts
     from analysis.uncertainty import Resampling
@@ -46,7 +45,7 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 
 
 @dataclass(frozen=True)
-class ScoringOptions:
+class Options:
     """What is scored, and how."""
 
     predictions: Annotated[
@@ -116,7 +115,7 @@ class ScoringOptions:
         return f"predictions={folder} split={self.split or 'test'}"
 
 
-def main(options: ScoringOptions, overrides: list[str]) -> int:
+def main(options: Options, overrides: list[str]) -> int:
     """Score predictions of any method by region, class, day and night, with intervals.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
@@ -230,7 +229,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
         print_rich(path_lines(places))
 
 
-def _scored(options: ScoringOptions, overrides: list[str]) -> FolderScores:
+def _scored(options: Options, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import score_folder
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
@@ -240,11 +239,10 @@ def _scored(options: ScoringOptions, overrides: list[str]) -> FolderScores:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _counting(options: ScoringOptions) -> Counting:
-    from analysis.predictions.scoring import PARTITIONS
-    from analysis.predictions.scoring import ScoringOptions as Counting
+def _counting(options: Options) -> ScoringOptions:
+    from analysis.predictions.scoring import PARTITIONS, ScoringOptions
 
-    return Counting(
+    return ScoringOptions(
         partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
         regions=options.regions,
         form=options.format,
@@ -256,11 +254,11 @@ def _counting(options: ScoringOptions) -> Counting:
     )
 
 
-def _stored(options: ScoringOptions, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import info
 
-    default = ScoringOptions()
+    default = Options()
     without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]
     without_effect += [word.partition("=")[0] for word in overrides]
     if without_effect:
@@ -285,7 +283,7 @@ def _distinct_label(named: NamedCounts) -> str:
     return str(named.path) if named.seed is None else f"{named.label} seed {named.seed}"
 
 
-def _resampling(options: ScoringOptions) -> Resampling | None:
+def _resampling(options: Options) -> Resampling | None:
     from analysis.uncertainty import Resampling
 
     if options.resamples == 0:
@@ -329,7 +327,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     return with_intervals(table, found, said)
 
 
-entry = PlainCommand(ScoringOptions, main, heeds=("dataset",))
+entry = PlainCommand(Options, main, heeds=("dataset",))
 
 if __name__ == "__main__":
     entry()

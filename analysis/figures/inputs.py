@@ -130,7 +130,7 @@ class FigureInput:
         """The images of ``names=``, or the first `number` of the split.
 
         Raises:
-            InputError: a name that the split lacks, or fewer images than asked for.
+            InputError: a name that the split lacks, or fewer images than requested.
         """
         split = self.get("split", "test")
         listed = self.dataset.names(split)
@@ -191,7 +191,7 @@ class FigureInput:
 
         Raises:
             InputError: neither or both were given, or a stored file of another split or partition
-                than was asked for.
+                than requested.
         """
         from analysis.statistics.data import SpatialStatistics
 

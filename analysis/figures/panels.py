@@ -180,7 +180,7 @@ def most_different(
         names by falling ``|last - first|``; equal ones in the order of the split.
 
     Raises:
-        InputError: fewer than two methods, or fewer images than asked for.
+        InputError: fewer than two methods, or fewer images than requested.
     """
     if len(mious) < 2:
         raise InputError("pick=largest_difference compares two methods; name two in methods=...")

@@ -87,15 +87,15 @@ def profile(label: str, seeds: Sequence[Counts], settings: Resampling, band: Ban
     if band == "widest":
         band = "both" if len(seeds) > 1 else "images"
     regions = seeds[0].counts.shape[1]
-    asked = [*(f"region/{region + 1}" for region in range(regions)), "mIoU"]
-    found = estimate(seeds, asked, settings)
-    intervals = [_interval(found[name], band) for name in asked[:-1]]
+    metrics = [*(f"region/{region + 1}" for region in range(regions)), "mIoU"]
+    found = estimate(seeds, metrics, settings)
+    intervals = [_interval(found[name], band) for name in metrics[:-1]]
     known = [interval for interval in intervals if interval is not None]
     low, high = np.array([(each.low, each.high) for each in known]).reshape(-1, 2).T
     return Profile(
         label=label,
         partition=seeds[0].partition,
-        means=np.array([found[name].value for name in asked[:-1]]),
+        means=np.array([found[name].value for name in metrics[:-1]]),
         miou=float(found["mIoU"].value),
         low=low if len(known) == regions else None,
         high=high if len(known) == regions else None,

@@ -21,7 +21,7 @@ from rgbt.config.stored_config import parse_trust
 from rgbt.config.words import readable_paths
 
 TOLD = 5
-"""Remarks told on stderr; the page has all."""
+"""Remarks that are printed to stderr; the page has all."""
 
 
 @dataclass(frozen=True)

@@ -43,11 +43,11 @@ class ReportRequest:
     trust: tuple[str, ...] = ()
 
 
-def collect(asked: ReportRequest, track: Track) -> ReportData:
+def collect(request: ReportRequest, track: Track) -> ReportData:
     """Read the store; what cannot be read becomes a remark.
 
     Args:
-        asked: which store, and how.
+        request: which store, and how.
         track: shows how far it is.
 
     Raises:
@@ -59,24 +59,24 @@ def collect(asked: ReportRequest, track: Track) -> ReportData:
     with tempfile.TemporaryDirectory(prefix="rgbt_report_") as copies:
         stored = [
             each
-            for tracking in track([asked.tracking], "store")
-            for each in read_store(tracking, asked.runs_dir, Path(copies))
+            for tracking in track([request.tracking], "store")
+            for each in read_store(tracking, request.runs_dir, Path(copies))
             if REPLACED_TAG not in each.tags
         ]
         runs = _open_all(stored, track, remarks)
         by_key = {run.entry.key: run for run in runs}
         records = {kind: [r for r in stored if r.kind == kind] for kind in ("table", "study")}
-        tables = table_entries(records["table"], by_key, asked.resamples, track, remarks)
+        tables = table_entries(records["table"], by_key, request.resamples, track, remarks)
         studies = study_entries(records["study"], remarks)
-        masks = mask_pictures(runs, track, remarks, asked.trust)
-        differences = difference_entries(runs, asked.resamples, track)
+        masks = mask_pictures(runs, track, remarks, request.trust)
+        differences = difference_entries(runs, request.resamples, track)
     if not runs:
         remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")
     return ReportData(
         title=TITLE,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
-        store=_address(asked.tracking),
-        command=asked.command,
+        store=_address(request.tracking),
+        command=request.command,
         runs=tuple(run.entry for run in runs),
         tables=tables,
         studies=studies,

@@ -32,7 +32,7 @@ class Side:
     values: Mapping[str, Any]
     text: str
 
-    def told(self) -> str:
+    def described(self) -> str:
         """Setting and sentence."""
         return self.text if self.setting is None else f"{self.setting}: {self.text}"
 
@@ -144,8 +144,8 @@ def _entry(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) ->
     runs = [run.entry.key for pair in pairs[:1] for run in (*pair.paper, *pair.released)]
     return DifferenceEntry(
         topic=choice.topic,
-        paper=choice.paper.told(),
-        released=choice.released.told(),
+        paper=choice.paper.described(),
+        released=choice.released.described(),
         source=choice.source,
         effect=_effect(choice, pairs, settings),
         runs=tuple(runs),
@@ -159,9 +159,9 @@ def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -
         return f"No two runs differ by this alone; these would: {choice.command()}"
     best, others = pairs[0], len(pairs) - 1
     # Both sides score alike: `metric.absent` is part of what must be equal.
-    asked = Resampling(resamples=settings.resamples, absent=best.paper[0].absent)
+    as_run = Resampling(resamples=settings.resamples, absent=best.paper[0].absent)
     try:
-        compared = compare(_counts(best.paper), _counts(best.released), METRICS, asked)
+        compared = compare(_counts(best.paper), _counts(best.released), METRICS, as_run)
     except InputError as error:
         return f"Runs of both sides cannot be compared: {error}"
     more = f" {others} more pair{'s' * (others > 1)} of runs differ by it." if others else ""

@@ -18,7 +18,7 @@ from analysis.report.tables_files import (
     reproduce_command,
 )
 from analysis.report.tables_intervals import Intervals, Track
-from analysis.report.tables_scored import RescoredTable, asked_of, changed, score_again
+from analysis.report.tables_scored import RescoredTable, changed, interval_key, score_again
 from rgbt.checks import InputError
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
@@ -88,9 +88,9 @@ def _ask(draft: RescoredTable, intervals: Intervals) -> None:
     table = draft.scored.table
     for row in table.rows:
         for column in table.columns:
-            asked = asked_of(draft, row, column)
-            if asked is not None:
-                intervals.ask(*asked)
+            key = interval_key(draft, row, column)
+            if key is not None:
+                intervals.request(*key)
 
 
 def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> TableEntry:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from analysis.report.data import CellEntry
 from analysis.report.tables_files import NO_CELL, RecordedCell
 from analysis.report.tables_intervals import Intervals
-from analysis.report.tables_scored import RescoredTable, asked_of, values_of
+from analysis.report.tables_scored import RescoredTable, interval_key, values_of
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
@@ -35,8 +35,8 @@ def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals
         values=values_of(draft, row, column, intervals.runs),
         rank=scored.ranks_ours.get(place, 0),
     )
-    asked = asked_of(draft, row, column)
-    found = None if asked is None else intervals.found.get(asked)
+    key = interval_key(draft, row, column)
+    found = None if key is None else intervals.found.get(key)
     if found is None:
         return entry
     if found.interval is None:

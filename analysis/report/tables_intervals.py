@@ -44,31 +44,31 @@ class CellInterval:
 
 @dataclass
 class Intervals:
-    """What is asked for, then what was found.
+    """What is requested, then what was found.
 
     Attributes:
         runs: by key.
-        asked: source -> metrics.
+        requested: source -> metrics.
         found: the intervals by source and metric, after `compute`.
     """
 
     runs: Mapping[str, ReportRun]
-    asked: dict[CountsSource, dict[str, None]] = field(default_factory=dict)
+    requested: dict[CountsSource, dict[str, None]] = field(default_factory=dict)
     found: dict[tuple[CountsSource, str], CellInterval] = field(default_factory=dict)
 
-    def ask(self, source: CountsSource, metric: str) -> None:
-        """Ask for the interval of a score."""
-        self.asked.setdefault(source, {})[metric] = None
+    def request(self, source: CountsSource, metric: str) -> None:
+        """Request the interval of a score."""
+        self.requested.setdefault(source, {})[metric] = None
 
     def compute(self, resamples: int, track: Track) -> None:
-        """Find every interval that was asked for.
+        """Find every interval that was requested.
 
         Args:
             resamples: of the images.
             track: shows how far it is.
         """
-        for source in track(list(self.asked), "intervals"):
-            metrics = tuple(self.asked[source])
+        for source in track(list(self.requested), "intervals"):
+            metrics = tuple(self.requested[source])
             settings = Resampling(resamples=resamples, absent=source.absent)
             try:
                 counts = [self._counts(source.keys, path) for path in source.paths]

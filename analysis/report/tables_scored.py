@@ -94,7 +94,7 @@ def _outcome(key: str, run: ReportRun | None) -> _Outcome:
     return _Outcome("finished", results=(run,))
 
 
-def asked_of(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:
+def interval_key(draft: RescoredTable, row: Row, column: Column) -> tuple[CountsSource, str] | None:
     """Source and metric of a cell's interval; None for cells without a value from counts."""
     table, place = draft.scored.table, (row.label, column.name)
     cell, line = draft.scored.cells.get(place), draft.recorded.lines.get(place, NO_CELL)

@@ -24,7 +24,7 @@ from analysis.uncertainty.intervals import (
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import Asked, parse
+from rgbt.metrics.named import ParsedMetric, parse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class Comparison:
     """Two methods compared.
 
     Attributes:
-        differences: in the order of the metrics asked for.
+        differences: in the order of the requested metrics.
         images: number of images.
         said: how they were drawn, e.g. "393 single images".
         reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
@@ -145,11 +145,11 @@ def compare(
 
 
 def _differences(
-    images: CommonImages, asked: Sequence[Asked], *, paired: bool
+    images: CommonImages, parsed: Sequence[ParsedMetric], *, paired: bool
 ) -> Iterator[Difference]:
-    a, b = images.drawn(asked)
-    swapped_a, swapped_b = images.swapped(asked)
-    every = zip(asked, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
+    a, b = images.drawn(parsed)
+    swapped_a, swapped_b = images.swapped(parsed)
+    every = zip(parsed, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
     for each, rows_a, rows_b, swapped in every:
         first, second = (estimate_of(images, each, *rows) for rows in (rows_a, rows_b))
         value = second.value - first.value

@@ -23,7 +23,7 @@ from analysis.uncertainty.intervals import (
 from analysis.uncertainty.settings import Resampling
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import Asked, parse
+from rgbt.metrics.named import ParsedMetric, parse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ def estimate(
         settings: of the resampling.
 
     Returns:
-        metric -> estimate, in the order asked for.
+        metric -> estimate, in the requested order.
 
     Raises:
         InputError: no such metric, class or region; seeds on different images; blocks that cannot
@@ -75,26 +75,26 @@ def estimate(
         images = prepare([seeds], group[0], settings)
         (drawn,) = images.drawn(group)
         found |= {
-            asked.metric: estimate_of(images, asked, *rows)
-            for asked, rows in zip(group, drawn.rows(), strict=True)
+            metric.metric: estimate_of(images, metric, *rows)
+            for metric, rows in zip(group, drawn.rows(), strict=True)
         }
     return {metric: found[metric] for metric in metrics}
 
 
-def by_part(metrics: Sequence[str]) -> list[list[Asked]]:
+def by_part(metrics: Sequence[str]) -> list[list[ParsedMetric]]:
     """The metrics taken apart, those over the same images together."""
-    every = sorted(map(parse, metrics), key=lambda asked: asked.part or "")
-    return [list(group) for _, group in groupby(every, key=lambda asked: asked.part)]
+    every = sorted(map(parse, metrics), key=lambda metric: metric.part or "")
+    return [list(group) for _, group in groupby(every, key=lambda metric: metric.part)]
 
 
 def estimate_of(
-    images: CommonImages, asked: Asked, points: Values, resampled: Values, without: Values
+    images: CommonImages, metric: ParsedMetric, points: Values, resampled: Values, without: Values
 ) -> Estimate:
-    """The estimate that one row of `Drawn` makes."""
+    """The estimate that one row of `ResampledScores` gives."""
     settings, value = images.settings, float(points.mean())
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
-    if asked.score == names.VAR and around is not None and settings.method == "auto":
+    if metric.score == names.VAR and around is not None and settings.method == "auto":
         bias = float(np.nanmean(resampled)) - value
         around = corrected(value, bias, image_spread(images, resampled), level)
     spread = over_seeds(points)

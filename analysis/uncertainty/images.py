@@ -15,7 +15,7 @@ from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, check_same_means, convention
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.named import Asked, images_of, parse, values
+from rgbt.metrics.named import ParsedMetric, images_of, parse, values
 from rgbt.metrics.pairs import protocol_of
 from rgbt.randomness import numpy_generator
 
@@ -67,31 +67,31 @@ class CommonImages:
     settings: Resampling
     absent: Absent
 
-    def drawn(self, asked: Sequence[Asked]) -> list[ResampledScores]:
+    def drawn(self, parsed: Sequence[ParsedMetric]) -> list[ResampledScores]:
         """The scores of every method, as they are and with images drawn anew or left out."""
         if self.blocks.count < FEWEST:
-            nothing = np.empty((len(asked), 0))
-            return [ResampledScores(points, nothing, nothing) for points in self.points(asked)]
-        parts = (self.points(asked), self.resampled(asked), self.without_each(asked))
+            nothing = np.empty((len(parsed), 0))
+            return [ResampledScores(points, nothing, nothing) for points in self.points(parsed)]
+        parts = (self.points(parsed), self.resampled(parsed), self.without_each(parsed))
         return [ResampledScores(*each) for each in zip(*parts, strict=True)]
 
-    def points(self, asked: Sequence[Asked]) -> list[Scores]:
+    def points(self, parsed: Sequence[ParsedMetric]) -> list[Scores]:
         """Per method (metrics, S): the score of every seed over all images."""
-        return [self._scores(asked, method.sum(1)) for method in self.methods]
+        return [self._scores(parsed, method.sum(1)) for method in self.methods]
 
-    def resampled(self, asked: Sequence[Asked]) -> list[Scores]:
+    def resampled(self, parsed: Sequence[ParsedMetric]) -> list[Scores]:
         """Per method (metrics, resamples): mean over seeds; both methods see the same draws."""
         count = self.blocks.count
         even = np.full(count, 1.0 / count)
-        found = [np.empty((len(asked), self.settings.resamples)) for _ in self.methods]
+        found = [np.empty((len(parsed), self.settings.resamples)) for _ in self.methods]
         rng = numpy_generator(self.settings.seed, "bootstrap")
         for chunk in _chunks(self.settings.resamples):
             weights = rng.multinomial(count, even, chunk.stop - chunk.start).astype(np.float64)
             for scores, method in zip(found, self.methods, strict=True):
-                scores[:, chunk] = self._scores(asked, weights @ method).mean(1)
+                scores[:, chunk] = self._scores(parsed, weights @ method).mean(1)
         return found
 
-    def swapped(self, asked: Sequence[Asked]) -> list[Scores]:
+    def swapped(self, parsed: Sequence[ParsedMetric]) -> list[Scores]:
         """Two methods (metrics, resamples) whose predictions were exchanged on half of the blocks.
 
         Seeds are exchanged in pairs; where the numbers of seeds differ, each is repeated as often
@@ -99,7 +99,7 @@ class CommonImages:
         """
         first, second = self.methods
         pairs = math.lcm(len(first), len(second))
-        found = [np.zeros((len(asked), self.settings.resamples)) for _ in self.methods]
+        found = [np.zeros((len(parsed), self.settings.resamples)) for _ in self.methods]
         # Pair by pair, with the same draws for each: all at once would not fit into memory.
         for a, b in (
             (first[pair % len(first)], second[pair % len(second)]) for pair in range(pairs)
@@ -109,32 +109,32 @@ class CommonImages:
             for chunk in _chunks(self.settings.resamples):
                 size = chunk.stop - chunk.start
                 swapped = rng.integers(0, 2, (size, self.blocks.count)).astype(np.float64) @ moved
-                found[0][:, chunk] += self._scores(asked, sums[0] + swapped) / pairs
-                found[1][:, chunk] += self._scores(asked, sums[1] - swapped) / pairs
+                found[0][:, chunk] += self._scores(parsed, sums[0] + swapped) / pairs
+                found[1][:, chunk] += self._scores(parsed, sums[1] - swapped) / pairs
         return found
 
-    def without_each(self, asked: Sequence[Asked]) -> list[Scores]:
+    def without_each(self, parsed: Sequence[ParsedMetric]) -> list[Scores]:
         """Per method (metrics, B): the mean over seeds without one block each (jackknife)."""
         return [
-            self._scores(asked, method.sum(1, keepdims=True) - method).mean(1)
+            self._scores(parsed, method.sum(1, keepdims=True) - method).mean(1)
             for method in self.methods
         ]
 
-    def _scores(self, asked: Sequence[Asked], summed: NDArray[np.float64]) -> Scores:
+    def _scores(self, parsed: Sequence[ParsedMetric], summed: NDArray[np.float64]) -> Scores:
         """(metrics, ...) percent of summed counts (..., R K K)."""
         by_region = summed.reshape(*summed.shape[:-1], *self.shape)
         given = (by_region, self.like, self.absent)
-        return np.stack([values(each, *given) for each in asked])
+        return np.stack([values(each, *given) for each in parsed])
 
 
 def prepare(
-    methods: Sequence[Sequence[Counts]], asked: Asked, settings: Resampling
+    methods: Sequence[Sequence[Counts]], metric: ParsedMetric, settings: Resampling
 ) -> CommonImages:
-    """Counts of the images that `asked` is over, summed inside blocks.
+    """Counts of the images that `metric` is over, summed inside blocks.
 
     Args:
         methods: per method the counts of its seeds; all of the same images, in any order.
-        asked: tells day, night or all images.
+        metric: over the images of the day, of the night, or all.
         settings: of the resampling.
 
     Raises:
@@ -142,7 +142,7 @@ def prepare(
             that part; blocks that cannot be made.
     """
     alike = _alike(methods)
-    parts = [[images_of(asked, counts) for counts in seeds] for seeds in alike]
+    parts = [[images_of(metric, counts) for counts in seeds] for seeds in alike]
     first = parts[0][0]
     regions, classes = first.counts.shape[1], len(first.classes)
     flat = [
@@ -161,14 +161,14 @@ def prepare(
     try:
         blocks = make_blocks(first.names, settings.blocks, _influence(single))
     except InputError as error:
-        raise InputError(f"{asked.part}: {error}" if asked.part else str(error)) from None
+        raise InputError(f"{metric.part}: {error}" if metric.part else str(error)) from None
     return replace(
         single, methods=tuple(_summed(each, blocks) for each in single.methods), blocks=blocks
     )
 
 
 WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
-"""Scores that tell how far neighbouring images are alike, whatever is asked for: the one that
+"""Scores that tell how far neighbouring images are alike, whatever is requested: the one that
 counts, and the one that shows likeness most clearly."""
 
 WATCHED_PAIRS = (parse(names.TC), parse(names.CA))

@@ -55,7 +55,7 @@ FORMS = (
 
 
 @dataclass(frozen=True)
-class Asked:
+class ParsedMetric:
     """A metric name, taken apart.
 
     Attributes:
@@ -73,7 +73,7 @@ class Asked:
     region: int | None = None
 
 
-def parse(metric: str) -> Asked:
+def parse(metric: str) -> ParsedMetric:
     """Take a metric name apart.
 
     Raises:
@@ -83,17 +83,17 @@ def parse(metric: str) -> Asked:
     part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
     match words:
         case [score] if score in MEANS or score in OF_PAIRS or score == names.VAR:
-            return Asked(metric, part, score)
+            return ParsedMetric(metric, part, score)
         case ["region", number] if _is_number(number):
-            return Asked(metric, part, names.MIOU, region=int(number))
+            return ParsedMetric(metric, part, names.MIOU, region=int(number))
         case ["class", name] if name:
-            return Asked(metric, part, "IoU", name)
+            return ParsedMetric(metric, part, "IoU", name)
         case ["class", name, "acc"] if name:
-            return Asked(metric, part, "acc", name)
+            return ParsedMetric(metric, part, "acc", name)
         case ["class", name, score] if name and score in OF_PAIRS:
-            return Asked(metric, part, score, name)
+            return ParsedMetric(metric, part, score, name)
         case ["class", name, "region", number] if name and _is_number(number):
-            return Asked(metric, part, "IoU", name, int(number))
+            return ParsedMetric(metric, part, "IoU", name, int(number))
     known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *FORMS])
     raise InputError(
         f"'{metric}' is not a metric; {known}; day/ or night/ may stand before each of them."
@@ -120,7 +120,9 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
     return float(values(asked, by_region, counts, absent))
 
 
-def values(asked: Asked, by_region: Matrices, like: Counts, absent: Absent) -> NDArray[np.float64]:
+def values(
+    asked: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
+) -> NDArray[np.float64]:
     """The score of many summed counts at once, e.g. one per resample.
 
     Args:
@@ -158,7 +160,7 @@ def values(asked: Asked, by_region: Matrices, like: Counts, absent: Absent) -> N
     return _of_class(asked, 100.0 * score(matrices, absent), like.classes)
 
 
-def check_kind(asked: Asked, partition: str) -> None:
+def check_kind(asked: ParsedMetric, partition: str) -> None:
     """Refuse a score of pairs of frames from counts of single ones, and the other way round.
 
     Args:
@@ -182,7 +184,7 @@ def check_kind(asked: Asked, partition: str) -> None:
         )
 
 
-def images_of(asked: Asked, counts: Counts) -> Counts:
+def images_of(asked: ParsedMetric, counts: Counts) -> Counts:
     """The images that a metric is over: all, those of the day or those of the night.
 
     Raises:
@@ -206,7 +208,7 @@ def _is_number(text: str) -> bool:
 
 
 def _of_class(
-    asked: Asked, by_class: NDArray[np.float64], classes: tuple[str, ...]
+    asked: ParsedMetric, by_class: NDArray[np.float64], classes: tuple[str, ...]
 ) -> NDArray[np.float64]:
     """(..., K) -> (...)."""
     if asked.class_name not in classes:

@@ -41,13 +41,13 @@ class NoTracking:
         folder.describe(described(run_name, tags, params))
 
     def update(self) -> None:
-        """Nothing to tell."""
+        """Nothing: the folder holds it already."""
 
     def finish(self, status: Status) -> None:
-        """Nothing to tell."""
+        """Nothing: the folder holds it already."""
 
     def links(self) -> list[Link]:
-        """No place but the folder."""
+        """None: there is the folder alone."""
         return []
 
 
@@ -58,7 +58,7 @@ class MlflowTracking:
         uri: the store: sqlite:///..., postgresql://..., http://...;
             None is ``sqlite:///<runs_dir>/mlflow.db``.
         artifact_uri: where a new experiment keeps its files; None is ``<runs_dir>/mlartifacts`` for
-            a database, and the server's own place for http.
+            a database, and the server's own storage for http.
         experiment: its name.
         runs_dir: the folder of all runs.
     """
@@ -133,9 +133,9 @@ class MlflowTracking:
 
     def _sent(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""
-        uri, place = without_passwords(self.uri), self.artifact_uri
+        uri, artifacts = without_passwords(self.uri), self.artifact_uri
         fresh = UploadState(
-            uri, self.experiment, None if place is None else without_passwords(place)
+            uri, self.experiment, None if artifacts is None else without_passwords(artifacts)
         )
         try:
             sent = read_upload_state(folder)

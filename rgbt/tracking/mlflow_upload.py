@@ -50,7 +50,7 @@ TABLE_FILE = "tables/iou.json"
 
 @dataclass
 class UploadState:
-    """What a store already has of a run; lies in the folder as ``mlflow.json``.
+    """What was uploaded of a run; kept in its folder as ``mlflow.json``.
 
     Attributes:
         uri: the store, passwords hidden.
@@ -286,12 +286,12 @@ def _send_table(store: MlflowStore, sent: UploadState, tables: ResultTables | No
 def _send_files(store: MlflowStore, folder: RunFolder, sent: UploadState) -> None:
     """Upload files that are new or changed, under their path in the folder."""
     for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
-        place = path.relative_to(folder.path)
+        inside = path.relative_to(folder.path)
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if sent.files.get(str(place)) != digest:
-            parent = None if place.parent == Path() else str(place.parent)
+        if sent.files.get(str(inside)) != digest:
+            parent = None if inside.parent == Path() else str(inside.parent)
             store.client.log_artifact(sent.run_id, str(path), parent)
-            sent.files[str(place)] = digest
+            sent.files[str(inside)] = digest
 
 
 def _end_time(folder: RunFolder) -> int:

@@ -107,7 +107,7 @@ class RunFolder:
         written.
 
         Raises:
-            InputError: another process does; the sentence says which one, on which machine.
+            InputError: another process does; the message names it and its machine.
         """
         with self._locked() as holder:
             if holder is not None:
@@ -140,13 +140,13 @@ class RunFolder:
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
-        earlier = self.provenance()
+        before = self.provenance()
         diff = entry.get("diff") or ""
-        name = f"diff_{len(earlier) + 1}.patch" if earlier else "diff.patch"
+        name = f"diff_{len(before) + 1}.patch" if before else "diff.patch"
         if diff:
             write_atomic(self.path / name, diff.encode())
         plain = {**entry, "diff": name if diff else None}
-        self._write_provenance([*earlier, plain])
+        self._write_provenance([*before, plain])
 
     def provenance(self) -> list[dict[str, Any]]:
         """Entries of all processes that worked on this run, first one first."""
@@ -244,11 +244,11 @@ class RunFolder:
         return list(found.values()), damaged
 
     def counts_path(self, split: str) -> Path:
-        """Where the counts of a split lie."""
+        """Path of the counts of a split."""
         return self.path / f"counts_{split}.npz"
 
     def figure_path(self, name: str) -> Path:
-        """Where the picture `name` lies; the folder exists afterwards."""
+        """Path of the picture `name`; its folder is made."""
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
         return folder / f"{name}.png"

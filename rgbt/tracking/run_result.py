@@ -157,7 +157,7 @@ class RunResult:
         return Counts.load(self.folder / path)
 
     def has_counts(self, path: str) -> bool:
-        """Whether counts of the test split are at `path`, of this training and no earlier one."""
+        """Whether `path` holds counts of the test split that this training made."""
         # Compared with the checkpoint: a run may write an evaluation before its result.
         file, best = self.folder / path, self.folder / CHECKPOINT
         if not file.exists() or (best.exists() and file.stat().st_mtime < best.stat().st_mtime):

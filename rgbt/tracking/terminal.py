@@ -1,4 +1,4 @@
-"""What a run says in the terminal: remarks on stderr; tables and where everything is on stdout."""
+"""What commands print: messages on stderr, tables and paths on stdout."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Column = tuple[str, ...]
 
 
 def info(sentence: str) -> None:
-    """A line on stderr that is no error."""
+    """Print a message to stderr."""
     sys.stderr.write(f"rgbt: {sentence}\n")
 
 
 def warn(sentence: str) -> None:
-    """A warning on stderr."""
+    """Print a warning to stderr."""
     info(f"warning: {sentence}")
 
 
@@ -139,7 +139,7 @@ def line_width() -> int:
 
 
 def final_lines(folder: Path, links: Sequence[tuple[str, str]]) -> Text:
-    """Where the run is, one "name  place" pair per line.
+    """Where the run is, one "name  path" pair per line.
 
     Args:
         folder: the run folder.
@@ -148,16 +148,16 @@ def final_lines(folder: Path, links: Sequence[tuple[str, str]]) -> Text:
     return path_lines([("run folder", str(folder)), *links])
 
 
-def path_lines(places: Sequence[tuple[str, str]]) -> Text:
-    """Where things are, one "name  place" pair per line."""
-    width = max(len(name) for name, _ in places)
-    return Text("\n".join(f"{name:<{width}}  {place}" for name, place in places), no_wrap=True)
+def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
+    """Paths, commands and addresses, one "name  path" pair per line."""
+    width = max(len(name) for name, _ in paths)
+    return Text("\n".join(f"{name:<{width}}  {path}" for name, path in paths), no_wrap=True)
 
 
 def result_view(
     tables: ResultTables, folder: Path, links: Sequence[tuple[str, str]]
 ) -> RenderableType:
-    """Tables and places of a finished run."""
+    """Tables and paths of a finished run."""
     return Group(*map(rich_table, result_grids(tables)), final_lines(folder, links))
 
 

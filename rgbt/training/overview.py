@@ -58,7 +58,7 @@ def network_line(session: Session) -> str:
 
 
 def _write(*lines: str) -> None:
-    # Not as a remark (`tell`): drivers of sweeps take the last remark for what went wrong.
+    # Not as a message (`info`): drivers of sweeps take the last remark for what went wrong.
     sys.stderr.write("".join(f"{line}\n" for line in lines))
 
 

@@ -17,7 +17,7 @@ from analysis.report.store import MlflowRun
 from analysis.report.tables_cells import cell_of
 from analysis.report.tables_files import RecordedCell, RecordedTable
 from analysis.report.tables_intervals import CountsSource, Intervals
-from analysis.report.tables_scored import RescoredTable, asked_of, score_again, values_of
+from analysis.report.tables_scored import RescoredTable, interval_key, score_again, values_of
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -53,7 +53,7 @@ def test_variances_of_parts_are_no_percent() -> None:
 def test_intervals_score_absent_classes_as_the_table_does(absent: Any) -> None:
     runs = {f"k{seed}": run_of({}, seed, without_a_class(seed)) for seed in range(2)}
     intervals, source = Intervals(runs), CountsSource(tuple(runs), (OWN_COUNTS,), absent)
-    intervals.ask(source, "mIoU")
+    intervals.request(source, "mIoU")
     intervals.compute(200, quiet)
     counts = [without_a_class(seed) for seed in range(2)]
     expected = estimate(counts, ["mIoU"], Resampling(resamples=200, absent=absent))["mIoU"]
@@ -118,7 +118,7 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
     sides = [value("mIoU", counts_of(0, right), "released") for right in (0.5, 0.7)]
     assert values_of(found, row, column, {"k0": run}) == pytest.approx((sum(sides) / 2,))
     assert found.scored.cells["A", "drop"].mean == pytest.approx(sum(sides) / 2)
-    assert asked_of(found, row, column) is None
+    assert interval_key(found, row, column) is None
     missing = draft(tmp_path, 1, {"k0": run_of({}, 0, counts_of(0))}, text)
     assert values_of(missing, row, column, {"k0": run_of({}, 0, counts_of(0))}) == (None,)
 
@@ -141,7 +141,7 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
     row, column = scored.table.rows[0], scored.table.columns[-1]
     cell = cell_of(found, row, column, Intervals({}))
     assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 1, ())
-    assert asked_of(found, row, column) is None
+    assert interval_key(found, row, column) is None
 
 
 def pairs_of(seed: int) -> Counts:
@@ -163,11 +163,11 @@ def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path
     expected = [value("class/car/TC", pairs_of(seed), "released") for seed in range(2)]
     assert values_of(found, row, column, runs) == ()  # recorded without the column
     assert found.scored.cells["A", "TC"].mean == pytest.approx(sum(expected) / 2)
-    asked = asked_of(found, row, column)
+    asked = interval_key(found, row, column)
     source = CountsSource(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), None)
     assert asked == (source, "class/car/TC")
     intervals = Intervals(runs)
-    intervals.ask(*asked)
+    intervals.request(*asked)
     intervals.compute(200, quiet)
     wanted = estimate(
         [pairs_of(seed) for seed in range(2)], ["class/car/TC"], Resampling(resamples=200)
@@ -179,8 +179,8 @@ def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> No
     runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
     table = draft(tmp_path, 2, runs).scored.table
     row, column = table.rows[0], table.columns[0]
-    assert asked_of(draft(tmp_path, 2, runs), row, column) is not None
-    assert asked_of(draft(tmp_path, 3, runs), row, column) is None
+    assert interval_key(draft(tmp_path, 2, runs), row, column) is not None
+    assert interval_key(draft(tmp_path, 3, runs), row, column) is None
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
