@@ -10,13 +10,13 @@ from typing import Any
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.checks import InputError
-from rgbt.config.compose import compose
-from rgbt.spec.run_spec import RunSpec
-from rgbt.config.stored_config import read_settings
-from rgbt.tracking.terminal import info
 from rgbt.checkpoints.load import load_weights
 from rgbt.checkpoints.report import Report
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.config.stored_config import read_settings
+from rgbt.spec.run_spec import RunSpec
+from rgbt.tracking.terminal import info
 
 
 def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:

@@ -18,8 +18,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.spec.load_spec import load_spec
 from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import specify
-from rgbt.tracking.run_folder import RunFolder, find_run
 from rgbt.tracking.run_files import read_marker
+from rgbt.tracking.run_folder import RunFolder, find_run
 from rgbt.tracking.terminal import warn
 
 CHECKPOINTS = ("best", "last")

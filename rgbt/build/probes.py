@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from rgbt.checks import InputError
 from rgbt.build.contracts import check_first_sample, check_regions, check_transform, is_own
+from rgbt.build.session import Session
+from rgbt.checks import InputError
 from rgbt.dataset import reader_of
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.build.session import Session
 from rgbt.types import Masker, Sample
 
 

@@ -6,42 +6,29 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Collection
-from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 import torch
 from lightning_fabric import Fabric
-from rich.progress import Progress, TaskID
 from torch import nn
 
-from rgbt.checks import InputError, check_choice
 from rgbt.build.contracts import check_dataset, is_own, watch_model
-from rgbt.dataset import LabelledDataset
-from rgbt.data.cache.dataset import cached_dataset, cached_layer
-from rgbt.data.domains import Domains, TestedHead
+from rgbt.build.initial_weights import start_from_weights
+from rgbt.checkpoints.report import Report
+from rgbt.checks import InputError
+from rgbt.data.cache.dataset import cached_dataset
+from rgbt.data.domains import Domains
 from rgbt.data.label_map import LabelMap
-from rgbt.data.loaders import LoaderSettings, eval_batches
+from rgbt.data.loaders import LoaderSettings
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
-from rgbt.engine.evaluate import HeadsOf, predictions
-from rgbt.engine.progress import progress
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
-from rgbt.metrics import scores
-from rgbt.metrics.absent import absent_notes
-from rgbt.metrics.confusion import RegionCounter
-from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.build.initial_weights import start_from_weights
 from rgbt.randomness import derive
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.pictures import PanelExample, Legend
-from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.transforms.view_sets import ViewSets
-from rgbt.types import VIEWS, View
-from rgbt.checkpoints.report import Report
 
 
 @dataclass(frozen=True)

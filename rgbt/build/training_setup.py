@@ -8,9 +8,11 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
+from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
+from rgbt.build.probes import check_cells, check_own_parts, example_hw, first_readable
+from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import available
-from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
@@ -21,10 +23,8 @@ from rgbt.engine.trainer import Scheme
 from rgbt.losses.adversarial import cross_entropy, judged, least_squares
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.losses.guidance import guidance
-from rgbt.build.probes import check_cells, check_own_parts, example_hw, first_readable
 from rgbt.randomness import derive
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec, labels_key
-from rgbt.build.session import Session, open_session
 from rgbt.tracking.terminal import info
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import VIEWS, Loadable, Masker, View
@@ -138,9 +138,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     ):
         session.dataset.names(split)
     datasets = {
-        name: session.dataset
-        if labels_key(name) in missing
-        else _labelled(session, name, domain)
+        name: session.dataset if labels_key(name) in missing else _labelled(session, name, domain)
         for name, domain in domains.named.items()
     }
     for name, domain in domains.named.items():
@@ -263,9 +261,7 @@ def _scheme(session: Session, **collaborators: Any) -> Scheme:
     spec = session.spec
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "scheme weights"))
-        scheme: Scheme = spec.scheme.build(
-            **collaborators, domains=session.domains, **FUNCTIONS
-        )
+        scheme: Scheme = spec.scheme.build(**collaborators, domains=session.domains, **FUNCTIONS)
     return scheme
 
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from rgbt.build import load_run
-from rgbt.checks import InputError
 from rgbt.build.session import names_key
+from rgbt.checks import InputError
 
 
 def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamespace:

@@ -12,18 +12,18 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from rgbt.training import pipeline as earlier
 from rgbt.build import training_setup as prepared_module
-from rgbt.checks import InputError
-from rgbt.config.compose import compose
-from rgbt.config.component import build
-from rgbt.spec.specify import specify
-from rgbt.data.pseudo_labels import FORMAT
+from rgbt.build.session import open_session
 from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
+from rgbt.checks import InputError
+from rgbt.config.component import build
+from rgbt.config.compose import compose
+from rgbt.data.pseudo_labels import FORMAT
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, Teacher, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.build.session import open_session
+from rgbt.spec.specify import specify
+from rgbt.training import pipeline as earlier
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
 from tests.composed import composed as composed_once
