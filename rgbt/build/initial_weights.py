@@ -10,13 +10,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from rgbt.checks import InputError
-from rgbt.config.compose import compose
-from rgbt.spec.run_key import weights_file
-from rgbt.config.stored_config import read_settings
-from rgbt.tracking.terminal import tell
 from rgbt.checkpoints.load import load_weights
 from rgbt.checkpoints.report import Report
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.config.stored_config import read_settings
+from rgbt.spec.run_key import weights_file
+from rgbt.tracking.terminal import tell
 
 
 def start(model: nn.Module, config: DictConfig) -> Report | None:

@@ -9,19 +9,19 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from rgbt.build.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import compose, flatten, register_resolvers
 from rgbt.config.schema import check
+from rgbt.config.stored_config import load_config
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
-from rgbt.spec.run_key import own_code, run_key, weights_file
+from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
-from rgbt.build.session import Session, names_key, open_session
-from rgbt.config.stored_config import load_config
+from rgbt.spec.run_key import own_code, run_key, weights_file
 from rgbt.tracking.folder import RunFolder, find_run
 from rgbt.tracking.formats import read_marker
 from rgbt.tracking.terminal import tell
-from rgbt.files.yaml_files import parse_yaml
 
 CHECKPOINTS = ("best", "last")
 GROUPS = ("dataset", "metric", "consistency")

@@ -18,11 +18,13 @@ from omegaconf import DictConfig
 from rich.progress import Progress, TaskID
 from torch import nn
 
+from rgbt.build.contracts import check_dataset, is_own, watch_model
+from rgbt.build.initial_weights import start
+from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError, check_choice
 from rgbt.config.schema import build
-from rgbt.build.contracts import check_dataset, is_own, watch_model
+from rgbt.data.cache.dataset import decoded_dataset
 from rgbt.data.dataset import LabelledDataset
-from rgbt.data.cache.dataset import Decoded, decoded_dataset
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
@@ -36,13 +38,12 @@ from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.build.initial_weights import start
 from rgbt.randomness import derive
+from rgbt.requirements import record_of
 from rgbt.tracking.pictures import Example, Legend
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.transforms.view_sets import ViewSets
-from rgbt.types import VIEWS, View
-from rgbt.checkpoints.report import Report
+from rgbt.types import View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: as many by day as by night where the split holds both."""
@@ -157,11 +158,9 @@ def decode_ahead(session: Session, *splits: str) -> None:
     Raises:
         InputError: the cache cannot be written.
     """
-    # A degradation may stand before it.
-    dataset = getattr(session.dataset, "source", None)
-    dataset = session.dataset if isinstance(session.dataset, Decoded) else dataset
-    if isinstance(dataset, Decoded):
-        names = tuple(name for split in splits for name in dataset.names(split))
+    fill_cache = record_of(session.dataset).fill_cache
+    if fill_cache is not None:
+        names = tuple(name for split in splits for name in session.dataset.names(split))
         with ExitStack() as shown:
             tasks: dict[str, TaskID] = {}
             display: list[Progress] = []
@@ -173,7 +172,7 @@ def decode_ahead(session: Session, *splits: str) -> None:
                     tasks[what] = display[0].add_task(what, total=total, note="images")
                 display[0].update(tasks[what], completed=done)
 
-            dataset.ensure(names, advance)
+            fill_cache(names, advance)
 
 
 def names_key(session: Session) -> str:
@@ -195,7 +194,7 @@ def view_of(session: Session, modality: str = "default") -> View:
     Raises:
         InputError: the network does not predict from it.
     """
-    known: tuple[View, ...] = getattr(session.model, "views", VIEWS)
+    known = record_of(session.model).views
     if modality == "default":
         return session.domains.source.view or known[0]
     check_choice("modality", modality, known)

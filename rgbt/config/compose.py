@@ -25,12 +25,12 @@ def conf_dir() -> Path:
 def compose(overrides: Sequence[str]) -> DictConfig:
     """The configuration that `rgbt.run` would get from these overrides, not checked."""
     register_resolvers()
-    with _own_hydra():
+    with own_hydra():
         return hydra.compose("config", list(overrides))
 
 
 @contextmanager
-def _own_hydra() -> Iterator[None]:
+def own_hydra() -> Iterator[None]:
     """Hydra with our configuration, also inside a command that Hydra runs."""
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()

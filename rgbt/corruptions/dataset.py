@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import Degradation, OfTime
 from rgbt.randomness import numpy_generator
+from rgbt.requirements import Record, record_of
 from rgbt.types import Sample
 
 
@@ -106,6 +107,11 @@ class Degraded:
         self.unscored = source.unscored
         self._names = source.names(split)
         self._shown = self._other_frames()
+
+    @property
+    def record(self) -> Record:
+        """That of the source."""
+        return record_of(self.source)
 
     @property
     def splits(self) -> Mapping[str, str]:

@@ -24,6 +24,7 @@ from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import Frame, find_frames, inside
 from rgbt.data.integrity import is_there
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import IGNORE, Sample
 
 CLASSES = (
@@ -135,6 +136,11 @@ class Freiburg:
                 check_choice(f"dataset.{key}", word, classes)
         _check_numbers(crop, thermal_range)
         self.images = FreiburgImages(crop, thermal_range)
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether there are frames of `split`; InputError where the split is unknown."""

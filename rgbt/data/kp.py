@@ -29,6 +29,7 @@ from rgbt.data.named_files import (
     with_label,
 )
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import IGNORE, Sample
 
 Lists = Literal["auto", "files", "sets"]
@@ -130,6 +131,11 @@ class KP:
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)
         self._names: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:

@@ -18,6 +18,7 @@ from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
 from rgbt.data.named_files import hash_of_files, with_label
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import Sample
 
 Layout = Literal["auto", "packed", "folders"]
@@ -106,6 +107,11 @@ class MFNet:
         check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether the list of `split` is there; InputError where the split is unknown."""

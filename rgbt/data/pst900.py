@@ -28,6 +28,7 @@ from rgbt.data.named_files import (
     with_label,
 )
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
@@ -130,6 +131,11 @@ class PST900:
                 )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:

@@ -14,7 +14,8 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.evaluation.corrupted import Chosen, Failure
 from rgbt.files import budgets
-from rgbt.types import VIEWS, View
+from rgbt.requirements import record_of
+from rgbt.types import View
 
 if TYPE_CHECKING:
     from torch import nn
@@ -69,7 +70,7 @@ def asked_of(session: Session, chosen: Sequence[Chosen]) -> tuple[Asked, ...]:
     from rgbt.build.session import view_of
 
     view = view_of(session)
-    known = getattr(session.model, "views", VIEWS)
+    known = record_of(session.model).views
     branches = {each: title for each, title in FEATURES.items() if view == "rgbt" and each in known}
     found = [Asked(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
     for branch, title in branches.items():

@@ -37,6 +37,7 @@ from rgbt.data.cache.store import (
 )
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.synth.cache import default_cache
+from rgbt.requirements import Record, record_of
 from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)
@@ -124,6 +125,11 @@ class Decoded:
         self.unscored = dataset.unscored
         self._placed: dict[str, Placed] = {}
         self._unreadable: dict[str, str] = {}
+
+    @property
+    def record(self) -> Record:
+        """That of the data set, with a cache."""
+        return replace(record_of(self.source), fill_cache=self.ensure)
 
     def ensure(self, names: tuple[str, ...], advance: Told = _silent) -> None:
         """Make `read` take `names` from the cache; decodes what is missing, changed or damaged.
