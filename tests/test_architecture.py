@@ -15,12 +15,13 @@ ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
 FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
 BASE = {"types", "checks", "ranges", "randomness", "files"}
-SHARED = BASE | {"geometry"}
+SHARED = BASE | {"geometry", "requirements"}
 COMPONENTS = {"data", "corruptions", "transforms", "maskers", "models", "losses", "metrics"}
 READING = SHARED | {"config", "spec", "tracking", "metrics", "data"}
 BUILDING = READING | COMPONENTS | {"schemes", "engine", "checkpoints", "runtime", "build"}
 MAY_IMPORT = {
     **dict.fromkeys(("types", "checks", "ranges", "randomness"), set()),
+    "requirements": BASE,
     "files": BASE,
     "runtime": BASE,
     "geometry": BASE,

@@ -23,6 +23,7 @@ from rgbt.evaluation.corrupted import Failure, choose
 from rgbt.evaluation.robustness import Asked, Measured, asked_of, measure, weights_digest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.requirements import Record
 from rgbt.robustness import chosen_of, robustness_grid
 from tests.commands import Call, Trained, assert_one_sentence, short
 from tests.corruptions.recorded import Recorded
@@ -35,7 +36,7 @@ NOISE = ("degradations=noise_rgb", "degradation.severities=[16,64]")
 class Network(nn.Module):
     def __init__(self, views: tuple[str, ...] = ("rgbt", "rgb", "thermal")) -> None:
         super().__init__()
-        self.views = views
+        self.record = Record(views=views)
         self.weight = nn.Parameter(torch.arange(4.0))
 
 

@@ -62,13 +62,14 @@ def _sentence(
     options = _options(failures, records, components, config)
     # Where no single file helps with everything, those that help with this.
     options = options or _options(failures[:1], both, components, config)
-    options += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
+    advice = [f"choose {', or '.join(options)}"] if options else []
+    advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
     provided = records[wanted.node].get(wanted.key)
     return (
         f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, "
         f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
-        f"{', or '.join(options) or f'change {node} or {wanted.node}'}."
+        f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
     )
 
 
@@ -92,7 +93,7 @@ def _options(
         found = (name for name, node in files if helps(group, node))
         names = list(islice(found, MOST_CHOICES + 1))
         listed = ", ".join(names[:MOST_CHOICES]) + (", ..." if names[MOST_CHOICES:] else "")
-        options += [f"choose {group}={listed}"] if names else []
+        options += [f"{group}={listed}"] if names else []
     return options
 
 

@@ -118,9 +118,9 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     domains = session.domains
     masker: Masker = build(config.masker)
     loss = build(config.loss)
-    loss = CheckedLoss(loss) if is_own(loss) else loss
+    checked = CheckedLoss(loss) if is_own(loss) else loss
     model = session.fabric.setup_module(session.model)
-    scheme = _scheme(session, model=model, loss=loss, masker=masker)
+    scheme = _scheme(session, model=model, loss=checked, masker=masker)
     check_requirements(
         {
             **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},

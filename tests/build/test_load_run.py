@@ -10,9 +10,9 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.build import load_run as stored
+from rgbt.build.session import names_key
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from rgbt.build.session import names_key
 from tests.composed import composed
 
 

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rgbt.build.session import decode_ahead, heads_of, result_tables, view_of
 from rgbt.checks import InputError
 from rgbt.data.cache.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
-from rgbt.build.session import decode_ahead, heads_of, result_tables, view_of
 
 
 def test_tables_pool_the_image_and_keep_regions_apart() -> None:
