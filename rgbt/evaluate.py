@@ -53,7 +53,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.corrupted import own_words
     from rgbt.tracking.terminal import result_view, show
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     if Path(arguments["out"] or "x").is_dir():
         raise InputError(f"out={arguments['out']} is a folder; name the file of the counts, x.npz.")
@@ -65,7 +65,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     runs_dir = Path(arguments["runs_dir"])
     run, checkpoint = arguments["run"], arguments["checkpoint"]
     stored = open_trained(run, runs_dir, overrides, checkpoint, trust=trust)
-    announce_stored(stored)
+    announce_network(stored)
     session = stored.session
     view = view_of(session, arguments["modality"])
     head = _head(arguments["head"])

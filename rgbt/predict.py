@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rgbt.build.load_run import Stored
+    from rgbt.build.load_run import TrainedNetwork
     from rgbt.build.session import Session
     from rgbt.data.domains import TestedHead
     from rgbt.data.label_map import LabelMap
@@ -66,7 +66,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     from rgbt.build.load_run import open_trained
     from rgbt.config.stored_config import parse_trust
     from rgbt.evaluation.pseudo_labels import label_map_of
-    from rgbt.training.overview import announce_stored
+    from rgbt.training.overview import announce_network
 
     check_choice("pseudo_labels", arguments["pseudo_labels"], ("true", "false"))
     as_labels = arguments["pseudo_labels"] == "true"
@@ -80,7 +80,7 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     run, checkpoint = arguments["run"], arguments["checkpoint"]
     trust = parse_trust(arguments["trust"])
     stored = open_trained(run, runs_dir, overrides, checkpoint, label_map, trust)
-    announce_stored(stored)
+    announce_network(stored)
     if as_labels:
         _pseudo_labels(arguments, stored, label_map)
     else:
@@ -88,7 +88,9 @@ def main(arguments: dict[str, str], overrides: list[str]) -> int:
     return 0
 
 
-def _pseudo_labels(arguments: dict[str, str], stored: Stored, label_map: LabelMap | None) -> None:
+def _pseudo_labels(
+    arguments: dict[str, str], stored: TrainedNetwork, label_map: LabelMap | None
+) -> None:
     from rgbt.build.session import view_of
     from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
     from rgbt.tracking.terminal import place_lines, rich_table, show

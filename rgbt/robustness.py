@@ -14,7 +14,7 @@ from rgbt.checks import InputError, split_list
 from rgbt.config.command import plain_command
 
 if TYPE_CHECKING:
-    from rgbt.build.load_run import Stored
+    from rgbt.build.load_run import TrainedNetwork
     from rgbt.evaluation.corrupted import Chosen
     from rgbt.evaluation.robustness import Measured
     from rgbt.tracking.tables import Grid
@@ -130,7 +130,7 @@ def _check_comparable(
         raise InputError(f"out= is the folder of one run, but run= names {len(runs)}; leave it.")
 
 
-def _place(stored: Stored, arguments: dict[str, str]) -> str:
+def _place(stored: TrainedNetwork, arguments: dict[str, str]) -> str:
     """Folder of a split's counts: plain where the run is measured as its own evaluation is."""
     from rgbt.evaluation.robustness import read_json
 
@@ -144,10 +144,10 @@ def _place(stored: Stored, arguments: dict[str, str]) -> str:
     return "_".join([arguments["split"], *regions, *last, *others])
 
 
-def _title(stored: Stored, split: str) -> str:
+def _title(stored: TrainedNetwork, split: str) -> str:
     session = stored.session
     is_run = stored.step > 0  # a file of weights tells neither step nor seed
-    seed = f" seed={session.config.seed}" if is_run else ""
+    seed = f" seed={session.spec.seed}" if is_run else ""
     return f"Robustness of {stored.label}{seed} ({session.dataset.name}, {split}): mIoU in percent"
 
 

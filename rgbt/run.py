@@ -1,7 +1,6 @@
 """Train one configuration: ``python -m rgbt.run +experiment=grbm``.
 
-The same command on the same configuration continues its run folder; a finished run shows its
-tables and stops.
+The same command on the same configuration resumes its run folder; a finished run shows its tables.
 """
 
 from __future__ import annotations
@@ -16,27 +15,17 @@ if TYPE_CHECKING:
 
 @command(sweeper="study")
 def main(config: DictConfig) -> int:
-    """Train, evaluate a checkpoint on the test split, show the tables; earlier runs come first."""
-    # torch loads here, after --help
-    from rgbt.build.training_setup import rehearse
+    """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
+    # torch is imported here, after --help
+    from rgbt.spec.naming import tags_from_environment
+    from rgbt.spec.specify import specify
     from rgbt.tracking.terminal import tell
-    from rgbt.training.pipeline import (
-        earlier_runs,
-        finish_earlier,
-        reads_pretrained,
-        warn_of_other_code,
-    )
-    from rgbt.training.train import is_finished, train
+    from rgbt.training.pipeline import run_pipeline
 
-    if config.pretrained is not None and not reads_pretrained(config):
-        tell(f"pretrained={config.pretrained} is not read: {config.name} starts otherwise.")
-    # A key may hash a large file of weights: it is asked for only where it decides something.
-    needed = list(earlier_runs(config))
-    if needed and config.fresh:
-        warn_of_other_code(needed)
-    if needed and (config.fresh or not is_finished(config)):
-        finish_earlier(config, train, rehearse, task_overrides())
-    train(config, task_overrides())
+    run = specify(config, task_overrides())
+    if run.pretrained is not None and not run.uses_pretrained:
+        tell(f"pretrained={run.pretrained} is ignored: {run.name} does not start from it.")
+    run_pipeline(run, tags_from_environment())
     return 0
 
 

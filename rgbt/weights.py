@@ -20,8 +20,8 @@ from rgbt.checkpoints.layout import Facts
 from rgbt.checkpoints.read import Contents
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.command import plain_command
+from rgbt.config.component import build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.config.schema import build
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
 
 INSPECT = {"file": None, "trust": ""}

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.command import composing, readable_paths
-from rgbt.config.schema import NODES, TOP_LEVEL, check_node
+from rgbt.config.component import Component
+from rgbt.config.keys import top_level
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
 WEIGHTS = "weights."
 """weights.mask2former_swin_b=FILE: for the rows that name this network."""
 
-KEYS = (*NODES, *TOP_LEVEL, "debug")
+KEYS = (*top_level()[0], *top_level()[1], "debug")
 
 WORDS = ("storage", "retry", "executor")
 """Settings that are text."""
@@ -183,7 +184,7 @@ def runs_of(place: Place) -> Runs:
 
     with composing(place.base):
         config = compose([*place.base, f"fresh={str(place.fresh).lower()}"])
-        check_node(config.tracking, "tracking")
+        Component.from_node(config.tracking)
     return open_runs(config)
 
 

@@ -100,7 +100,7 @@ def _probe(wanted: Search) -> Plan:
             data set.
     """
     planner = Planner()
-    planner.config((*wanted.fixed, *_end_of(wanted.parameters, "high")))
+    planner.spec((*wanted.fixed, *_end_of(wanted.parameters, "high")))
     lowest = (*wanted.fixed, *_end_of(wanted.parameters, "low"))
     return planner.plan(Point(label="probe", overrides=lowest))
 
@@ -122,9 +122,9 @@ def _check_consistency(probe: Plan, settings: Settings) -> None:
         InputError: the split is not among those of ``conf/consistency``.
     """
     for objective in filter(lambda each: each.is_consistency, settings.objectives):
-        node = Planner().config(probe.runs[0].overrides).consistency
+        views = Planner().spec(probe.runs[0].overrides).consistency.values
         split = objective.metric.partition("/")[0]
-        if not node.sets or split not in node.splits:
+        if not views["sets"] or split not in views["splits"]:
             splits = ",".join(dict.fromkeys((split, "test")))
             raise InputError(
                 f"objective '{objective.metric}': the runs do not measure it; add "

@@ -9,7 +9,7 @@ from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.metrics import names as scores
 from rgbt.ranges import Names, Positive, Text
 

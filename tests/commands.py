@@ -32,7 +32,7 @@ Trained = Callable[..., Path]
 def without_pictures() -> Iterator[None]:
     """Pictures of runs are empty files: drawing takes as long as the steps of these tests."""
     from rgbt.tracking import pair_pictures
-    from rgbt.training.train import train as training
+    from rgbt.training import train as training
 
     def draw(*things: Any) -> None:
         things[-1].parent.mkdir(parents=True, exist_ok=True)

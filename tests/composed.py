@@ -10,7 +10,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
+from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.specify import specify
 from sweeps.table.table import Row, Table
 
 
@@ -35,14 +36,12 @@ def _of_files(words: tuple[str, ...]) -> DictConfig:
 
 
 @cache
-def checked(words: tuple[str, ...]) -> DictConfig:
-    """Composed and checked, to be read alone."""
-    config = composed(words)
-    check(config)
-    return config
+def specified(words: tuple[str, ...]) -> RunSpec:
+    """The specification of the run that `words` request."""
+    return specify(composed(words), words)
 
 
-def row_config(table: Table, row: Row, scale: str = "demo") -> DictConfig:
-    """The checked configuration of a row, to be read alone."""
+def row_spec(table: Table, row: Row, scale: str = "demo") -> RunSpec:
+    """The specification of the run of a row."""
     rooted = ("dataset.root=/data",) if scale == "paper" else ()
-    return checked((*table.overrides(row, scale), f"scale={scale}", *rooted))
+    return specified((*table.overrides(row, scale), f"scale={scale}", *rooted))

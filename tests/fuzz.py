@@ -15,13 +15,14 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from rgbt.build.training_setup import prepare
+from rgbt.build.training_setup import set_up_training
 from rgbt.checks import InputError
+from rgbt.config.component import Component
 from rgbt.config.compose import compose
-from rgbt.config.schema import NODES, build, check, check_node
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
-from rgbt.spec.run_key import run_key
+from rgbt.spec.run_spec import NODES
+from rgbt.spec.specify import specify
 
 NO_NUMBER = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 10**12)
 NO_TEXT = ("", "x" * 100_000, "a\x00b", "two\nlines")
@@ -157,9 +158,9 @@ def checked(config: DictConfig, case: Case) -> None:
     """The check of the node alone that a case changes."""
     head = case.key.split(".")[0]
     if head in NODES:
-        check_node(config[head], head)
+        Component.from_node(config[head], head)
     else:
-        check(config)
+        specify(config)
 
 
 def used(folder: Path) -> Callable[[DictConfig, Case], None]:
@@ -167,10 +168,10 @@ def used(folder: Path) -> Callable[[DictConfig, Case], None]:
 
     def use(config: DictConfig, case: Case) -> None:
         del case
-        check(config)
-        run_key(config)
-        build(config.tracking)
-        prepared = prepare(config)
+        spec = specify(config)
+        assert spec.key
+        spec.tracking.build()
+        prepared = set_up_training(spec)
         session = prepared.session
         settings = replace(session.trainer, max_steps=1)
         Trainer(

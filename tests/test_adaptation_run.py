@@ -18,12 +18,12 @@ import pytest
 import torch
 
 from rgbt.checkpoints.stored import save
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.schemes.adversarial import Adversarial
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from tests.commands import Call, assert_one_sentence
 from tests.conftest import write_png
 from tests.test_run import ADAPTATION, EXPERIMENTS
@@ -65,7 +65,7 @@ class Runs:
 
     def folder(self, experiment: str, *overrides: str) -> Path:
         """Of a run, whether it is there or not."""
-        return self.runs / run_key(compose(self.words(experiment, *overrides)))
+        return self.runs / specify(compose(self.words(experiment, *overrides))).key
 
     def told(self, experiment: str, *overrides: str) -> tuple[int, str, str]:
         from rgbt.run import main

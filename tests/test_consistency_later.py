@@ -15,6 +15,7 @@ from rgbt.files.budgets import read_json
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import describe
+from rgbt.spec.specify import specify
 from sweeps.worker.found import Found
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, only_run, train
 from tests.conftest import pair, write_png
@@ -310,7 +311,7 @@ def test_sets_without_a_split_are_refused(call: Call, data: Path, tmp_path: Path
 def test_what_is_measured_is_no_part_of_a_name() -> None:
     def named(*words: str) -> tuple[str, str]:
         overrides = ["+experiment=temporal_con", *words]
-        found = describe(compose(overrides), overrides)
+        found = describe(specify(compose(overrides), overrides))
         return found.name, found.tags["rgbt.group"]
 
     plain = named()

@@ -13,8 +13,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.randomness import numpy_generator
+from rgbt.spec.specify import specify
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data
 
@@ -180,4 +180,4 @@ def test_a_wrong_part_is_one_sentence_of_the_command(
 def test_a_misspelt_key_of_ones_own_is_named(lab: Path) -> None:
     config = compose([*words_of(lab), "masker.cell=4", "+masker.cel=4"])
     with pytest.raises(InputError, match=r"'masker.cel' is not a setting of my_lab.Halves; did"):
-        check(config)
+        specify(config)

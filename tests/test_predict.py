@@ -12,8 +12,8 @@ import torch
 
 from rgbt import predict
 from rgbt.config.command import plain_command
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.data.pseudo_labels import PseudoLabels
 from tests.commands import SPLITS, Call, Trained, assert_one_sentence, short
 

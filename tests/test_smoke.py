@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run
 from tests.conftest import write_data
 from tests.data.folder_files import PATTERNS, write_folder
@@ -72,15 +71,8 @@ def test_the_plus_is_asked_for(call: Call, tmp_path: Path) -> None:
 def test_the_smoke_test_fits_every_data_set(dataset: str) -> None:
     root = [] if dataset.startswith("synth") else ["dataset.root=/data"]
     config = compose(["+experiment=grbm", f"dataset={dataset}", *root, "+debug=smoke"])
-    check(config)
+    specify(config)
     assert config.trainer.max_steps == 2
     sizes = {key: config.dataset[key] for key in config.dataset if key.startswith("num_tr")}
     assert all(size == 6 for size in sizes.values())
     assert bool(sizes) == dataset.startswith("synth")
-
-
-def test_keys_of_smoke_runs_are_what_they_were() -> None:
-    """Also of those that smoke_freiburg made."""
-    known = {"grbm": "2af865ec1d57", "crm_pst900": "39681806fb79", "heatnet": "4ce4547558c9"}
-    found = {name: run_key(compose([f"+experiment={name}", "+debug=smoke"])) for name in known}
-    assert found == known

@@ -13,7 +13,7 @@ import torch
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from rgbt.transforms.virtual_view import VirtualView
 from tests.commands import SPLITS, Call, assert_one_sentence, only_run, short, train
 from tests.conftest import write_data
@@ -186,12 +186,13 @@ def test_rows_of_the_tables_are_overrides(
 @pytest.mark.slow
 def test_what_is_measured_is_no_part_of_the_key_but_how_it_is_trained_is() -> None:
     def key(*overrides: str) -> str:
-        return run_key(compose(["+experiment=temporal_con", *overrides]))
+        return specify(compose(["+experiment=temporal_con", *overrides])).key
 
     same = ["consistency=none", "view@consistency.view=paper"]
     assert {key(each) for each in same} == {key()}
-    assert run_key(compose(["+experiment=cmx", "consistency=views"])) == run_key(
-        compose(["+experiment=cmx"])
+    assert (
+        specify(compose(["+experiment=cmx", "consistency=views"])).key
+        == specify(compose(["+experiment=cmx"])).key
     )
     other = ["scheme.view.camera.fx=500", "scheme.detach=true", "scheme.view.yaw=[-9,10]"]
     assert len({key(each) for each in other} | {key()}) == 4

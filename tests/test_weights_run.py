@@ -13,7 +13,7 @@ import torch
 from rgbt import evaluate, predict
 from rgbt.config.command import plain_command
 from rgbt.metrics.counts import Counts
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from rgbt.weights import main as weights_main
 from tests.commands import Call, Trained, assert_one_sentence, only_run, short, train
 from tests.models.golden import SHARED, compose
@@ -160,10 +160,10 @@ def test_the_key_follows_what_is_in_the_file(tmp_path: Path) -> None:
     first.write_bytes(b"weights")
     shutil.copy(first, copy)
     other.write_bytes(b"other weights")
-    keys = [run_key(compose(f"model.weights={path}")) for path in (first, copy, other)]
+    keys = [specify(compose(f"model.weights={path}")).key for path in (first, copy, other)]
     assert keys[0] == keys[1] != keys[2]
-    assert run_key(compose()) not in keys
-    assert run_key(compose(f"model.weights={first}", "model.fresh=[head]")) not in keys
+    assert specify(compose()).key not in keys
+    assert specify(compose(f"model.weights={first}", "model.fresh=[head]")).key not in keys
 
 
 @pytest.mark.slow

@@ -142,9 +142,8 @@ class Given:
         return made
 
     def _built(self, node: str) -> Any:
-        from rgbt.config.schema import build, check_node
+        from rgbt.config.component import build
 
-        check_node(self.config[node], node)
         return build(self.config[node])
 
     def names(self, number: int) -> tuple[str, ...]:

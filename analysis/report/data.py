@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from rgbt.spec.run_key import NOT_IN_KEY
+from rgbt.spec.run_spec import NOT_IN_KEY
 from rgbt.tracking.tables import without_nan
 
 Uncertainty = Literal["images", "seeds", "images and seeds", "none"]

@@ -161,10 +161,9 @@ def _sample(node: Mapping[str, Any]) -> tuple[Any, str]:
 def _built(name: str, values: Mapping[str, Any]) -> Any:
     from omegaconf import OmegaConf
 
-    from rgbt.config.schema import build, check_node
+    from rgbt.config.component import build
 
     node = OmegaConf.create({name: dict(values)})[name]
-    check_node(node, name)
     return build(node)
 
 

@@ -192,7 +192,7 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
     record = record_of(module)
     if record.auxiliary and "aux_logits" not in found.aux:
         raise InputError(
-            f"{returned} aux without aux_logits, though its record has auxiliary=True."
+            f"{returned} aux without `aux_logits`, but its record says auxiliary=True."
         )
     if found.logits is None and module.training and record.outputs == "masks":
         return  # its loss reads `aux`

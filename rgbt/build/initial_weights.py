@@ -7,27 +7,27 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.checkpoints.load import load_weights
-from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
+from rgbt.spec.run_spec import RunSpec
 from rgbt.config.stored_config import read_settings
-from rgbt.spec.run_key import weights_file
 from rgbt.tracking.terminal import tell
+from rgbt.checkpoints.load import load_weights
+from rgbt.checkpoints.report import Report
 
 
-def start(model: nn.Module, config: DictConfig) -> Report | None:
-    """Set what `model.weights` names and say so in a line on stderr; None where it names nothing.
+def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
+    """Load what `model.weights` names and report it in a line on stderr; None for no weights.
 
-    A second line follows where the network is fed or evaluated in another way than the file's.
+    A second line warns where the inputs or settings of the network are not those of the weights.
 
     Raises:
         InputError: the file does not fit, or `model.fresh` without a file.
     """
-    source, fresh = weights_file(config), tuple(config.model.get("fresh", ()))
+    source, fresh = spec.weights_path, spec.fresh_parts
     if source is None:
         if fresh:
             raise InputError(
@@ -37,8 +37,8 @@ def start(model: nn.Module, config: DictConfig) -> Report | None:
         return None
     report = load_weights(model, source, fresh)
     tell(report.sentence())
-    others = differences(config.model, report.facts.convention)
-    if not others and _fed_otherwise(config.model, report, source):
+    others = differences(spec.model.plain, report.facts.convention)
+    if not others and _has_other_inputs(spec.model.plain, report, source):
         others = ["the inputs noted beside it"]
     if others:
         tell(
@@ -48,7 +48,7 @@ def start(model: nn.Module, config: DictConfig) -> Report | None:
     return report
 
 
-def differences(node: DictConfig, convention: Iterable[str]) -> list[str]:
+def differences(node: Mapping[str, Any], convention: Iterable[str]) -> list[str]:
     """Which of these overrides of a network would change it.
 
     Args:
@@ -58,10 +58,10 @@ def differences(node: DictConfig, convention: Iterable[str]) -> list[str]:
     return [override for override in convention if not _holds(node, override)]
 
 
-def _holds(node: DictConfig, override: str) -> bool:
+def _holds(node: Mapping[str, Any], override: str) -> bool:
     key, _, text = override.partition("=")
     if key == "model/inputs":
-        return bool(_plain(node.inputs) == _plain(compose([override]).model.inputs))
+        return bool(_plain(node["inputs"]) == _plain(compose([override]).model.inputs))
     try:
         value = json.loads(text)
     except json.JSONDecodeError:
@@ -70,13 +70,13 @@ def _holds(node: DictConfig, override: str) -> bool:
     return bool(found == value)
 
 
-def _fed_otherwise(node: DictConfig, report: Report, source: Path) -> bool:
-    """Whether a file of ours says of itself, or its run beside it, that it was fed otherwise."""
+def _has_other_inputs(node: Mapping[str, Any], report: Report, source: Path) -> bool:
+    """Whether a file of this project, or the run beside it, notes other inputs."""
     said: Any = report.facts.inputs
     beside = source.parent / "config.yaml"
     if said is None and report.facts.layout == "own" and beside.is_file():
         said = read_settings(beside).get("model", {}).get("inputs")
-    return said is not None and "inputs" in node and _plain(said) != _plain(node.inputs)
+    return said is not None and "inputs" in node and _plain(said) != _plain(node["inputs"])
 
 
 def _plain(inputs: Any) -> Any:

@@ -29,7 +29,7 @@ def first_readable(session: Session, split: str) -> Sample:
 def example_hw(session: Session) -> tuple[int, int]:
     """Size of the first training example."""
     sample = first_readable(session, session.domains.source.split)
-    example = session.transform.train(sample, numpy_generator(session.config.seed, "probe"))
+    example = session.transform.train(sample, numpy_generator(session.spec.seed, "probe"))
     height, width = example.thermal.shape
     return height, width
 
@@ -48,7 +48,7 @@ def check_own_parts(session: Session) -> None:
             check_first_sample(dataset, split)
     if is_own(transform):
         sample = first_readable(session, splits[0])
-        check_transform(transform, sample, numpy_generator(session.config.seed, "probe"))
+        check_transform(transform, sample, numpy_generator(session.spec.seed, "probe"))
     if is_own(session.regions):
         check_regions(session.regions, first_readable(session, "test").thermal.shape)
 
@@ -63,7 +63,7 @@ def check_cells(session: Session, masker: Masker) -> None:
     if crop_hw is None and is_own(masker):
         crop_hw = example_hw(session)
     if crop_hw is not None and record_of(masker).hides_cells:
-        check_masker(masker, crop_hw, torch_generator(session.config.seed, "probe"))
+        check_masker(masker, crop_hw, torch_generator(session.spec.seed, "probe"))
 
 
 def check_cameras(session: Session, scheme: object) -> None:

@@ -12,7 +12,8 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.config.choices import choices
-from rgbt.config.schema import build, constructor
+from rgbt.config.component import Component
+from rgbt.config.targets import constructor
 from rgbt.requirements import Record, Requirement, record_of
 
 MOST_CHOICES = 6
@@ -26,13 +27,13 @@ class Failure(NamedTuple):
     requirement: Requirement
 
 
-def check_requirements(components: Mapping[str, Any], config: DictConfig) -> None:
+def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
     """Refuse components of which one lacks what another one requires.
 
     Args:
         components: by their keys in the configuration ("model", "loss"), in the order in which
             their requirements are looked at.
-        config: composed; where other choices are looked for.
+        plain: the whole configuration as resolved values, for the files that could be chosen.
 
     Raises:
         InputError: the first requirement that is not met, with the files of ``conf/`` that help.
@@ -40,7 +41,7 @@ def check_requirements(components: Mapping[str, Any], config: DictConfig) -> Non
     records = {node: record_of(component) for node, component in components.items()}
     failures = list(_failures(records))
     if failures:
-        raise InputError(_sentence(failures, records, components, config))
+        raise InputError(_sentence(failures, records, components, plain))
 
 
 def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
@@ -55,13 +56,13 @@ def _sentence(
     failures: list[Failure],
     records: Mapping[str, Record],
     components: Mapping[str, Any],
-    config: DictConfig,
+    plain: Mapping[str, Any],
 ) -> str:
     node, wanted = failures[0]
     both = {key: records[key] for key in (node, wanted.node)}
-    options = _options(failures, records, components, config)
+    options = _options(failures, records, components, plain)
     # Where no single file helps with everything, those that help with this.
-    options = options or _options(failures[:1], both, components, config)
+    options = options or _options(failures[:1], both, components, plain)
     advice = [f"choose {', or '.join(options)}"] if options else []
     advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
@@ -77,7 +78,7 @@ def _options(
     failures: list[Failure],
     records: Mapping[str, Record],
     components: Mapping[str, Any],
-    config: DictConfig,
+    plain: Mapping[str, Any],
 ) -> list[str]:
     """Files of either group with which the first failure is gone and no other one is new."""
     remaining = set(failures[1:])
@@ -89,7 +90,7 @@ def _options(
     options = []
     for group in (failures[0].requirement.node, failures[0].node):
         # A data set is no choice: to build one may write its images.
-        files = choices(config, group) if group in config and group != "dataset" else ()
+        files = choices(plain, group) if group in plain and group != "dataset" else ()
         found = (name for name, node in files if helps(group, node))
         names = list(islice(found, MOST_CHOICES + 1))
         listed = ", ".join(names[:MOST_CHOICES]) + (", ..." if names[MOST_CHOICES:] else "")
@@ -105,7 +106,7 @@ def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any])
         if isinstance(declared, Record):
             return declared
         with torch.device("meta"):  # no memory, no random numbers
-            return record_of(build(node, **components))
+            return record_of(Component.from_node(node).build(**components))
     except Exception:  # noqa: BLE001 - a file may miss values, or be a user's: it is no choice
         return None
 

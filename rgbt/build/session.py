@@ -14,17 +14,13 @@ from typing import Any, cast
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from omegaconf import DictConfig
 from rich.progress import Progress, TaskID
 from torch import nn
 
-from rgbt.build.contracts import check_dataset, is_own, watch_model
-from rgbt.build.initial_weights import start
-from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError, check_choice
-from rgbt.config.schema import build
-from rgbt.data.cache.dataset import decoded_dataset
+from rgbt.build.contracts import check_dataset, is_own, watch_model
 from rgbt.data.dataset import LabelledDataset
+from rgbt.data.cache.dataset import decoded_dataset
 from rgbt.data.domains import Domains, TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import LoaderSettings, eval_batches
@@ -38,12 +34,15 @@ from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.build.initial_weights import start_from_weights
 from rgbt.randomness import derive
 from rgbt.requirements import record_of
+from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.pictures import Example, Legend
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import View
+from rgbt.checkpoints.report import Report
 
 NUM_PANELS = 6
 """Images of the qualitative panel: as many by day as by night where the split holds both."""
@@ -54,7 +53,7 @@ class Session:
     """What every command needs, built once.
 
     Attributes:
-        config: the composed configuration, checked.
+        spec: the run that they belong to.
         dataset: where samples come from.
         domains: which of them are trained on, and which head predicts an image.
         transform: makes examples of them.
@@ -67,7 +66,7 @@ class Session:
         weights: what it took from a file, None where it is random.
     """
 
-    config: DictConfig
+    spec: RunSpec
     dataset: LabelledDataset
     domains: Domains
     transform: Any
@@ -80,61 +79,60 @@ class Session:
     weights: Report | None
 
 
-def open_session(config: DictConfig, label_map: LabelMap | None = None) -> Session:
+def open_session(
+    spec: RunSpec, label_map: LabelMap | None = None, *, load_weights: bool = True
+) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
     Weights are drawn from (seed, "weights") without touching the global generator; those that
     `model.weights` names replace them.
 
     Args:
-        config: composed and checked.
+        spec: the run.
         label_map: from the classes of the network to those of the data set, where they differ.
+        load_weights: False: `model.weights` is left out, because an upstream run is not finished.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the file of weights.
     """
     keep_memory()
-    trainer: TrainerSettings = build(config.trainer)
-    fix_threads(trainer.threads)
-    fabric = _fabric(trainer)
+    fix_threads(spec.trainer.threads)
+    fabric = _fabric(spec.trainer)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(config.seed, "weights"))
-        model: nn.Module = build(config.model)
-    loading: LoaderSettings = build(config.data)
-    files: LabelledDataset = build(config.dataset)
+        torch.manual_seed(derive(spec.seed, "weights"))
+        model: nn.Module = spec.model.build()
+    files: LabelledDataset = spec.dataset.build()
     if is_own(files):
         check_dataset(files)
-    dataset = decoded_dataset(files, loading.cache, num_threads=len(os.sched_getaffinity(0)))
-    _check_classes(config, dataset, label_map)
+    dataset = decoded_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
+    num_classes = spec.model.values.get("num_classes", dataset.num_classes)
+    _check_classes(num_classes, dataset, label_map)
     if is_own(model):
-        watch_model(model, config.model.get("num_classes", dataset.num_classes))
-    weights = start(model, config)
+        watch_model(model, num_classes)
+    weights = start_from_weights(model, spec) if load_weights else None
     return Session(
-        config=config,
+        spec=spec,
         dataset=dataset,
-        domains=build(config.domains),
-        transform=build(config.transform),
-        loading=loading,
-        regions=build(config.metric),
-        consistency=build(config.consistency),
-        trainer=trainer,
+        domains=spec.domains,
+        transform=spec.transform.build(),
+        loading=spec.data,
+        regions=spec.metric.build(),
+        consistency=spec.consistency.build(),
+        trainer=spec.trainer,
         fabric=fabric,
         model=model.to(fabric.device),
         weights=weights,
     )
 
 
-def _check_classes(
-    config: DictConfig, dataset: LabelledDataset, label_map: LabelMap | None
-) -> None:
-    num_classes = config.model.get("num_classes", dataset.num_classes)
+def _check_classes(num_classes: int, dataset: LabelledDataset, label_map: LabelMap | None) -> None:
     if label_map is not None:
         label_map.check(num_classes, tuple(dataset.classes), dataset.name)
     elif num_classes != dataset.num_classes:
         raise InputError(
             f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
-            "classes; leave it to the data set, or let rgbt.predict map the classes of a network "
-            "that was trained on others with label_map=..."
+            "classes; omit it, so that the data set decides, or let rgbt.predict map the classes "
+            "of a network that was trained on others with label_map=..."
         )
 
 

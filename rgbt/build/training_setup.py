@@ -6,16 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig
 from torch import nn
 
-from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
-from rgbt.build.probes import check_cameras, check_cells, check_own_parts, first_readable
-from rgbt.build.requirements import check_requirements
-from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
+from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
@@ -23,15 +18,18 @@ from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
+from rgbt.build.probes import check_cameras, check_cells, check_own_parts, first_readable
+from rgbt.build.requirements import check_requirements
 from rgbt.randomness import derive
 from rgbt.requirements import record_of
+from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key
+from rgbt.build.session import Session, open_session
 from rgbt.tracking.terminal import tell
-from rgbt.training.pipeline import earlier_runs, labels_folder
 from rgbt.types import Loadable, Masker
 
 
 @dataclass(frozen=True)
-class Prepared:
+class TrainingSetup:
     """The objects of a training, before anything is written.
 
     Attributes:
@@ -69,7 +67,7 @@ class Prepared:
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
-        session, seed = self.session, self.session.config.seed
+        session, seed = self.session, self.session.spec.seed
         loading = replace(session.loading, augment=_where_to_augment(session))
         # Each domain is shuffled and augmented by draws of its own.
         seeds = {"source": seed, "target": derive(seed, "target domain")}
@@ -85,59 +83,56 @@ class Prepared:
         return PairedBatches(*found, first=steps.start, per_step=session.trainer.accumulate)
 
 
-def rehearse(config: DictConfig) -> None:
-    """Find what is wrong with a run before the earlier ones are trained that it stands on.
+def validate(spec: RunSpec) -> None:
+    """Build everything once, so that errors are reported before the upstream runs are trained.
 
     Raises:
-        InputError: as `prepare`, but for the weights and labels that are not there yet.
+        InputError: as `set_up_training`; what unfinished upstream runs will write is left out.
     """
-    copy = config.copy()
-    for earlier in earlier_runs(config):
-        if earlier.key == "model.weights":
-            copy.model.weights, copy.model.fresh = None, []
-            copy.scale.pretrained = False
-        else:
+    for name in spec.domains.named:
+        teacher = spec.dependency(labels_key(name))
+        if teacher is not None:
             with torch.device("meta"):
-                teacher = build(earlier.config.model)
-            domains = {"domains": build(config.domains), f"network of {earlier.key}": teacher}
-            check_requirements(domains, config)
-    prepare(copy, rehearsal=True)
+                network = teacher.run.model.build()
+            check_requirements(
+                {"domains": spec.domains, f"network of {teacher.key}": network}, spec.plain
+            )
+    set_up_training(spec, upstream_finished=False)
 
 
-def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
-    """Build everything and look at all lists that the run will read, so that errors come first.
+def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> TrainingSetup:
+    """Build everything and read all lists of images of the run, so that errors come first.
 
     Args:
-        config: composed and checked.
-        rehearsal: pseudo-labels of earlier runs are not there yet and are not looked at.
+        spec: the run.
+        upstream_finished: False: weights and pseudo-labels of upstream runs do not exist yet and
+            are left out.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the data.
     """
-    session = open_session(config)
+    missing = () if upstream_finished else [each.key for each in spec.dependencies]
+    session = open_session(spec, load_weights=WEIGHTS not in missing)
     domains = session.domains
-    masker: Masker = build(config.masker)
-    loss = build(config.loss)
+    masker: Masker = spec.masker.build()
+    loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
     model = session.fabric.setup_module(session.model)
     scheme = _scheme(session, model=model, loss=checked, masker=masker)
-    check_requirements(
-        {
-            **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
-            **{"masker": masker, "transform": session.transform, "data": session.loading},
-            "dataset": session.dataset,
-        },
-        config,
-    )
+    components = {
+        **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
+        **{"masker": masker, "transform": session.transform, "data": session.loading},
+        "dataset": session.dataset,
+    }
+    check_requirements(components, spec.plain)
     for split in (
         *(domain.split for domain in domains.named.values()),
         *(session.trainer.selection_split, "test"),
     ):
         session.dataset.names(split)
-    awaited = [earlier.key for earlier in earlier_runs(config)] if rehearsal else []
     datasets = {
         name: session.dataset
-        if f"domains.{name}.labels" in awaited
+        if labels_key(name) in missing
         else _labelled(session, name, domain)
         for name, domain in domains.named.items()
     }
@@ -147,24 +142,26 @@ def prepare(config: DictConfig, *, rehearsal: bool = False) -> Prepared:
     check_own_parts(session)
     check_cells(session, masker)
     check_cameras(session, scheme)
-    if not rehearsal:
+    if upstream_finished:
         _tell_what_is_not_as_published(session)
     others, optimizers = _set_up(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
-    return Prepared(session, datasets, model, others, optimizers, scheme, build(config.schedule))
+    return TrainingSetup(
+        session, datasets, model, others, optimizers, scheme, spec.schedule.build()
+    )
 
 
 def _tell_what_is_not_as_published(session: Session) -> None:
     """Remarks on what is no mistake, and yet not what a paper's numbers were made with."""
-    config, data = session.config, session.dataset
-    expected = config.scale.pretrained and record_of(session.model).pretrained_parts
+    spec, data = session.spec, session.dataset
+    expected: object = spec.scale.pretrained and record_of(session.model).pretrained_parts
     if expected and session.weights is None:
         tell(
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
             "file with pretrained=..., or expect less than published."
         )
-    meant = config.recipe.dataset
-    if config.scale.name == "paper" and meant != data.name:
+    meant = spec.recipe.dataset
+    if spec.scale.name == "paper" and meant != data.name:
         known = (conf_dir() / "recipe" / f"{data.name}.yaml").is_file()
         tell(
             f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
@@ -193,8 +190,7 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
 
 def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
     """The data set with the labels that a domain is trained with."""
-    config = session.config
-    folder = labels_folder(config, name)
+    folder = session.spec.labels_folder(name)
     if folder is not None:
         found = PseudoLabelled(session.dataset, folder, with_confidence=domain.confidence)
         listed = session.dataset.names(domain.split)
@@ -242,10 +238,10 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
 
 def _scheme(session: Session, **collaborators: Any) -> Scheme:
     """The scheme; weights of networks of its own are drawn from (seed, "scheme weights")."""
-    config = session.config
+    spec = session.spec
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(config.seed, "scheme weights"))
-        scheme: Scheme = build(config.scheme, **collaborators, domains=session.domains)
+        torch.manual_seed(derive(spec.seed, "scheme weights"))
+        scheme: Scheme = spec.scheme.build(**collaborators, domains=session.domains)
     return scheme
 
 
@@ -253,7 +249,7 @@ def _set_up(
     session: Session, scheme: Any
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
-    builder, fabric = build(session.config.optimizer), session.fabric
+    builder, fabric = session.spec.optimizer.build(), session.fabric
     record = record_of(scheme)
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}

@@ -23,9 +23,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
+from rgbt.config.component import build
 from rgbt.config.compose import compose, conf_dir, register_resolvers
 from rgbt.config.hydra_messages import check_words, hydra_sentence
-from rgbt.config.schema import build, check, check_node
+from rgbt.config.keys import check_keys
 from rgbt.runtime.resources import reporting_exhaustion
 from rgbt.runtime.signals import Stopped, answered
 
@@ -96,7 +97,7 @@ def task_overrides() -> list[str]:
 
 
 def _checked(main: Main, config: DictConfig) -> int | None:
-    check(config)
+    check_keys(config)
     return main(config)
 
 
@@ -170,7 +171,6 @@ def built(node: str, overrides: Sequence[str]) -> Any:
     """
     with composing(overrides):
         config = compose(overrides)
-        check_node(config[node], node)
         return build(config[node])
 
 

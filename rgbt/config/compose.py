@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -72,12 +72,11 @@ def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:
     return few if _root_.scale.get("few_scenes", False) else usually
 
 
-def flatten(config: DictConfig) -> dict[str, Any]:
-    """Resolved leaves of a configuration by dotted key, lists as they are."""
-    plain = OmegaConf.to_container(config, resolve=True)
+def flatten(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Leaves of plain values by dotted key, lists as they are."""
 
     def leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-        if not isinstance(value, dict):
+        if not isinstance(value, Mapping):
             yield path, value
             return
         for key, child in value.items():

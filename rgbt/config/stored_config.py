@@ -5,7 +5,7 @@ stored configuration may name what the files of ``conf/`` name inside `rgbt`, an
 module that the user names with ``trust=``. Everything else is refused before it is imported.
 Classes and functions of `rgbt` that no file of ``conf/`` names are refused as well: some of them
 write files. What a user types or composes now is the user's own and follows Hydra's rules
-(`rgbt.config.build`).
+(`rgbt.config.component`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, split_list
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import NODES, constructor
+from rgbt.config.keys import top_level
+from rgbt.config.targets import constructor
 from rgbt.files.yaml_files import read_yaml
 
 OWN = "rgbt."
@@ -71,7 +72,7 @@ def settings_of(plain: Any, source: str) -> dict[str, Any]:
                 f"{source}: '{_shown(key)}' is {_shown(value)}; a stored configuration holds "
                 "values and no interpolations. Replace it by its value."
             )
-    for key in NODES:
+    for key in top_level()[0]:
         if key in plain and not isinstance(plain[key], dict):
             raise InputError(f"{source}: '{key}' must be a mapping with `_target_`.")
     return plain

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from rgbt.config.command import command
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.report.dataset import check_dataset, layout_of, num_listed
 from rgbt.data.report.values import Report, SplitReport

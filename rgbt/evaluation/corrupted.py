@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.build.contracts import check_degradation, check_sample, is_own
 from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build, check_node
 from rgbt.config.stored_config import load_config
 from rgbt.corruptions.corruption import Degradation, OfTime
 from rgbt.corruptions.dataset import Degraded, settings_of
@@ -145,7 +145,6 @@ def choose(name: str, words: Sequence[str] = (), trust: Collection[str] = ()) ->
     for key, value in pairs:
         if key != SEED:
             OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
-    check_node(node, NODE)
     kind = build(node)
     if is_own(kind) and not isinstance(kind, OfTime):
         check_degradation(kind)

@@ -19,14 +19,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from rgbt.build.session import Session, decode_ahead, heads_of
 from rgbt.checks import InputError, RunError, check_range
 from rgbt.config.command import composing
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check_node
 from rgbt.data.batches import Dataset
 from rgbt.data.domains import TestedHead
 from rgbt.data.label_map import LabelMap
@@ -44,6 +43,7 @@ from rgbt.engine.confidence import probabilities
 from rgbt.engine.progress import progress
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
+from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.tables import Grid, percent
 from rgbt.tracking.terminal import tell
 from rgbt.types import IGNORE, Sample, View
@@ -98,7 +98,6 @@ def label_map_of(name: str) -> LabelMap | None:
         return None
     with composing([]):
         node = compose([f"+label_map={name}"]).label_map
-    check_node(node, "label_map")
     made: LabelMap = build(node)
     return made
 
@@ -141,7 +140,7 @@ def write_pseudo_labels(  # noqa: PLR0913 - who predicts what, from what, where 
     """
     check_range("threshold", threshold, 0, 1)
     if label_map is not None:
-        num_classes = session.config.model.get("num_classes", label_map.num_source)
+        num_classes = session.spec.model.values.get("num_classes", label_map.num_source)
         label_map.check(num_classes, tuple(session.dataset.classes), session.dataset.name)
     asked = _Asked(split, view, threshold, label_map, head)
     settings = _settings(session, teacher, asked)
@@ -203,7 +202,7 @@ def _settings(session: Session, teacher: Teacher, asked: _Asked) -> dict[str, An
         "format": FORMAT,
         "teacher": teacher.name,
         "weights": teacher.weights,
-        "network": _network(session.config),
+        "network": _network(session.spec),
         "view": asked.view,
         "head": asked.head or session.domains.tested_head,
         "label_map": None if asked.label_map is None else asdict(asked.label_map),
@@ -217,12 +216,9 @@ def _settings(session: Session, teacher: Teacher, asked: _Asked) -> dict[str, An
     return plain
 
 
-def _network(config: DictConfig) -> str:
-    """SHA-256 of how the network is built, fed and asked, whatever its weights.
-
-    How the data set is read belongs to it (the range of thermal counts), where it lies does not.
-    """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
+def _network(spec: RunSpec) -> str:
+    """SHA-256 over the settings of a prediction, without the weights and without paths."""
+    plain = spec.plain
     model = {key: value for key, value in plain["model"].items() if key not in ("weights", "fresh")}
     places = ("root", "cache_dir", "palette", "layout")
     read = {key: value for key, value in plain["dataset"].items() if key not in places}

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
-
 from rgbt.checks import InputError
 from rgbt.evaluation.corrupted import Chosen, Failure
 from rgbt.files import budgets
@@ -180,7 +178,7 @@ def _shared_identity(session: Session, split: str) -> dict[str, Any]:
         "split": split,
         "partition": session.regions.name,
         "weights": weights_digest(session.model),
-        "transform": OmegaConf.to_container(session.config.transform, resolve=True),
+        "transform": session.spec.transform.plain,
         "precision": session.trainer.precision,
     }
 

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError
 from rgbt.config.command import command
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator

@@ -11,10 +11,9 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 
-from omegaconf import DictConfig
-
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten, with_pixels
+from rgbt.spec.run_spec import NODES, RunSpec
 from rgbt.tracking.folder import Description
 
 TAGS = "RGBT_TAGS"
@@ -33,11 +32,12 @@ SILENT = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name"
 BESIDE = ("tracking.", "consistency")
 """What is measured beside is no part of the run, and neither are its trackers."""
 
-SIZES = ("scale", "recipe", "tracking", "consistency")
-"""Nodes whose keys never make a short key ambiguous: the settings of the run repeat them."""
+OUTSIDE_KEY = tuple(name for name, node in NODES.items() if not node.in_key)
+"""Nodes whose keys never make a short key ambiguous: sizes, which the settings of the run repeat,
+and what is no part of the run."""
 
 
-def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
+def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Description:
     """How the run is shown: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
 
     Only what differs from the experiment is named. Of a point of a sweep, what is common to all
@@ -45,26 +45,23 @@ def describe(config: DictConfig, overrides: Sequence[str]) -> Description:
     their last part where only one key of the configuration ends with it.
 
     Args:
-        config: composed and checked.
-        overrides: as typed.
+        spec: the run.
+        extra_tags: of the command that asks for it (`tags_from_environment`).
     """
-    flat = flatten(config)
     params = {
         key: str(value)
-        for key, value in flat.items()
+        for key, value in flatten(spec.plain).items()
         # Paths and passwords of the tracker are no property of the run.
         if not key.endswith("_target_") and not key.startswith("tracking.") and key != "fresh"
     }
-    asked = _asked_tags()
-    words = _words(overrides, params)
+    words = _words(spec.overrides, params)
     tags = {
-        "rgbt.experiment": config.name,
-        GROUP: " ".join([config.name, *map(_word, words.values())]),
-        "rgbt.seed": str(config.seed),
-        **asked,
+        "rgbt.experiment": spec.name,
+        GROUP: " ".join([spec.name, *map(_word, words.values())]),
+        "rgbt.seed": str(spec.seed),
+        **(extra_tags or {}),
     }
-    name = _name(config, words, asked.get(VARIED, "").split())
-    return Description(name, tags, params)
+    return Description(_name(spec, words, tags.get(VARIED, "").split()), tags, params)
 
 
 def group_of(tags: Mapping[str, str], params: Mapping[str, str]) -> str:
@@ -115,7 +112,7 @@ def _word(pair: tuple[str, str]) -> str:
 
 def _ending(end: str, params: Mapping[str, str]) -> set[str]:
     """Keys of settings and of nodes that end with `end`, but for those that only give sizes."""
-    parts = [key.split(".") for key in params if not key.startswith(SIZES)]
+    parts = [key.split(".") for key in params if not key.startswith(OUTSIDE_KEY)]
     paths = (".".join(each[: each.index(end) + 1]) for each in parts if end in each)
     return set(paths)
 
@@ -128,15 +125,15 @@ def _resolved(value: str, key: str, params: Mapping[str, str]) -> str:
     return params.get(key, value) if "${" in value else value
 
 
-def _name(config: DictConfig, words: Mapping[str, tuple[str, str]], varied: Sequence[str]) -> str:
+def _name(spec: RunSpec, words: Mapping[str, tuple[str, str]], varied: Sequence[str]) -> str:
     """What varies, a dot, and what does not; outside of a sweep everything may vary."""
     shown = {key: _word((label, _short(value))) for key, (label, value) in words.items()}
     first = [word for key, word in shown.items() if key in varied or not varied]
     rest = [word for word in shown.values() if word not in first]
-    seed = f"seed={config.seed}"
+    seed = f"seed={spec.seed}"
     if "experiment" in varied:
-        return " · ".join(filter(None, (" ".join([config.name, *first, seed]), " ".join(rest))))
-    return f"{' '.join([*first, seed])} · {' '.join([config.name, *rest])}"
+        return " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
+    return f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
 
 
 def _short(value: str) -> str:
@@ -150,7 +147,8 @@ def _short(value: str) -> str:
     return f"{value[:half]}…{digest}…{value[-half:]}"
 
 
-def _asked_tags() -> dict[str, str]:
+def tags_from_environment() -> dict[str, str]:
+    """The MLflow tags that a sweep gives to the run that it requests (`TAGS`)."""
     text = os.environ.get(TAGS, "{}")
     try:
         tags = json.loads(text)

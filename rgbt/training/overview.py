@@ -8,24 +8,24 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from rgbt.build.load_run import Stored
+from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
-from rgbt.build.training_setup import Prepared
+from rgbt.build.training_setup import TrainingSetup
 from rgbt.tracking.terminal import place_lines
 
 MILLION = 1e6
 
 
-def announce_training(prepared: Prepared, name: str, folder: Path) -> None:
+def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     """Say what is trained on what: device, network, images, steps and the run folder."""
-    session, trainer = prepared.session, prepared.session.trainer
-    critics = "".join(f", {key} {_millions(net)}" for key, net in prepared.others.items())
+    session, trainer = setup.session, setup.session.trainer
+    critics = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
     batch = session.loading.batch_size * trainer.accumulate
-    epochs = trainer.max_steps * trainer.accumulate / prepared.steps_per_epoch()
+    epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
     lines = [
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{critics}"),
-        ("images", f"{session.dataset.name}: {_images(prepared)}"),
+        ("images", f"{session.dataset.name}: {_images(setup)}"),
         (
             "steps",
             f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), "
@@ -36,10 +36,10 @@ def announce_training(prepared: Prepared, name: str, folder: Path) -> None:
     _write(name, *(f"  {line}" for line in place_lines(lines).plain.splitlines()))
 
 
-def announce_stored(stored: Stored) -> None:
+def announce_network(network: TrainedNetwork) -> None:
     """Say what predicts, in one line: device, network and checkpoint."""
-    session = stored.session
-    checkpoint = f"checkpoint of step {stored.step}" if stored.step else stored.label
+    session = network.session
+    checkpoint = f"checkpoint of step {network.step}" if network.step else network.label
     _write(f"{device_line(session)}; {network_line(session)}; {checkpoint}")
 
 
@@ -66,7 +66,7 @@ def _millions(network: nn.Module) -> str:
     return f"{sum(each.numel() for each in network.parameters()) / MILLION:.2f} M"
 
 
-def _images(prepared: Prepared) -> str:
+def _images(setup: TrainingSetup) -> str:
     """Numbers of images by split: those of the training, of the selection and of the test."""
-    counts = ((len(prepared.session.dataset.names(each)), each) for each in prepared.read_splits())
+    counts = ((len(setup.session.dataset.names(each)), each) for each in setup.read_splits())
     return ", ".join(f"{count} {split}" for count, split in counts)

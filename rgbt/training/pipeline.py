@@ -1,233 +1,156 @@
-"""What a run needs of earlier runs: trained here, before it, where it is missing.
+"""A run and the runs upstream of it, in topological order.
 
-A configuration names them by their experiment: ``model.weights=experiment:NAME/last.pt`` starts
-from the end of that run (the stage before, or another task), ``domains.target.labels=
-experiment:NAME/best.pt`` learns from what its network predicts. Seed, scale and data set are those
-of the run that asks (`rgbt.spec.run_key.SHARED`), so that a run of seed 2 stands on runs of seed 2.
+Finished runs are used as they are, a run that another process trains is waited for, and an
+interrupted one is resumed.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
+from rgbt.build.load_run import open_run
+from rgbt.build.session import view_of
+from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
-from rgbt.config.stored_config import targets
-from rgbt.data.domains import GIVEN, NONE
+from rgbt.config.component import target_names
 from rgbt.data.pseudo_labels import MANIFEST
+from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
 from rgbt.files.atomic import is_held
-from rgbt.spec.naming import TAGS
-from rgbt.spec.run_key import DOMAINS, SHARED, earlier_config, earlier_run, run_key
+from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.terminal import tell
+from rgbt.training.train import train
 
-LOOK_S = 1.0
+POLL_S = 1.0
 """Between two looks at a run that another process trains."""
 
-Train = Callable[[DictConfig, Sequence[str]], None]
-"""Brings a run to its end (see `rgbt.training.train`)."""
 
-Rehearse = Callable[[DictConfig], None]
-"""Refuses what would go wrong after the earlier runs (see `rgbt.build.training_setup.rehearse`)."""
+def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
+    """Train a run after the runs upstream of it.
 
-
-@dataclass(frozen=True)
-class Earlier:
-    """A run that another one needs.
-
-    Attributes:
-        key: dotted key of the configuration that names it.
-        experiment: its experiment.
-        checkpoint: "best.pt" or "last.pt".
-        config: its configuration.
-    """
-
-    key: str
-    experiment: str
-    checkpoint: str
-    config: DictConfig
-
-    @cached_property
-    def folder(self) -> Path:
-        """Its run folder."""
-        return Path(self.config.runs_dir) / run_key(self.config)
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether it has its result."""
-        return (self.folder / "result.json").exists()
-
-
-def earlier_runs(config: DictConfig) -> Iterator[Earlier]:
-    """The runs that a configuration names, in the order in which it does."""
-    for key in ("model.weights", *(f"domains.{name}.labels" for name in DOMAINS)):
-        found = _named_by(key, config)
-        if found is not None:
-            yield found
-
-
-def _named_by(key: str, config: DictConfig) -> Earlier | None:
-    reference = earlier_run(key, OmegaConf.select(config, key))
-    if reference is None:
-        return None
-    return Earlier(key, *reference, earlier_config(config, key, reference[0]))
-
-
-def finish_earlier(
-    config: DictConfig, train: Train, rehearse: Rehearse, words: Sequence[str]
-) -> None:
-    """Train what `config` needs and is not finished, and what that needs, and predict its labels.
-
-    A run that another process trains is waited for.
+    The whole pipeline is validated before the first run starts.
 
     Args:
-        config: composed and checked.
-        train: see `Train`.
-        rehearse: see `Rehearse`; called before anything is trained.
-        words: overrides of `config` as they were typed, for the names of the earlier runs.
+        run: the requested run.
+        extra_tags: MLflow tags of the requested run; its upstream runs do not get them.
 
     Raises:
-        InputError: see `rehearse` and `train`; where an earlier run is wrong, it is named.
+        InputError: see `validate` and `train`; the message names the upstream run that is wrong.
     """
-    labels = [labels_folder(config, name) for name in DOMAINS if config.domains[name] is not None]
-    are_there = all(each is None or (each / MANIFEST).is_file() for each in labels)
-    needed = list(earlier_runs(config))
-    if not (are_there and all(earlier.is_finished for earlier in needed)):
-        rehearse(config)
-    for earlier in needed:
-        typed = [f"+experiment={earlier.experiment}", *_shared(words, earlier.key)]
-        if not earlier.is_finished:
-            with _naming(earlier, config):
-                finish_earlier(earlier.config, train, rehearse, typed)
-                tell(
-                    f"{config.name} needs a run of {earlier.experiment} ({earlier.key}), which "
-                    f"comes first: {earlier.folder}"
-                )
-                _finish(earlier, train, typed)
-        if earlier.key != "model.weights":
-            _write_labels(earlier, config, earlier.key.split(".")[1])
+    if run.fresh:
+        _warn_of_other_code(run)
+    if run.is_finished and not run.fresh:
+        train(run, extra_tags)  # shows the result
+        return
+    specs = topological_order(run)
+    if not _is_upstream_finished(run):
+        for spec in specs:
+            with _naming(spec, run):
+                validate(spec)
+    for spec in specs:
+        with _naming(spec, run):
+            _write_labels(spec)
+            if spec is run:
+                train(run, extra_tags)
+            else:
+                _train_upstream(spec, run)
 
 
-def warn_of_other_code(needed: Sequence[Earlier]) -> None:
-    """Say which finished runs that a run needs were made by other code: fresh=true keeps them."""
-    for earlier in needed:
-        made_by = other_code(RunFolder(earlier.folder)) if earlier.is_finished else None
+def topological_order(run: RunSpec) -> list[RunSpec]:
+    """The unfinished runs upstream of a run, each after those that it depends on, then the run."""
+    order: dict[str, RunSpec] = {}
+    for spec in run.upstream:
+        if not spec.is_finished:
+            order |= {each.key: each for each in topological_order(spec)}
+    return [*order.values(), run]
+
+
+def _is_upstream_finished(spec: RunSpec) -> bool:
+    folders = [spec.labels_folder(name) for name in spec.domains.named]
+    has_labels = all(each is None or (each / MANIFEST).is_file() for each in folders)
+    return has_labels and all(each.is_finished for each in spec.upstream)
+
+
+def _warn_of_other_code(run: RunSpec) -> None:
+    """Name the finished upstream runs that other code made: fresh=true does not repeat them."""
+    for dependency in run.dependencies:
+        spec = dependency.run
+        made_by = other_code(RunFolder(spec.folder)) if spec.is_finished else None
         if made_by is not None:
             tell(
-                f"warning: the upstream run {earlier.folder} ({earlier.key}) was made by other "
+                f"warning: the upstream run {spec.folder} ({dependency.key}) was made by other "
                 f"code ({made_by}) and is used as it is; to train it again, run "
-                f"+experiment={earlier.experiment} with fresh=true."
+                f"+experiment={spec.name} with fresh=true."
             )
 
 
-def reads_pretrained(config: DictConfig) -> bool:
-    """Whether `config`, or a run that it stands on, starts from the file `pretrained`."""
-    return config.model.get("weights") == config.pretrained or any(
-        reads_pretrained(earlier.config) for earlier in earlier_runs(config)
-    )
-
-
-def labels_folder(config: DictConfig, name: str) -> Path | None:
-    """The folder of pseudo-labels of a domain; None where it takes no pseudo-labels."""
-    node = config.domains[name]
-    earlier = _named_by(f"domains.{name}.labels", config)
-    if earlier is not None:
-        words = [node.split, node.teacher_view or "default"]
-        words += [earlier.checkpoint.removesuffix(".pt")]
-        words += [f"{node.threshold:g}"] if node.threshold else []
-        return earlier.folder / "pseudo_labels" / "_".join(words)
-    return None if node.labels in (GIVEN, NONE) else Path(node.labels).expanduser()
-
-
-def _shared(words: Sequence[str], key: str) -> list[str]:
-    """Those of the typed overrides that hold for an earlier run as well."""
-    groups = ("scale", "dataset", "metric", *(("model",) if key == "model.weights" else ()))
-    own = ("model.weights", "model.fresh")
-    places = [(word, word.partition("=")[0].lstrip("+").rpartition("@")[2]) for word in words]
-    return [
-        word
-        for word, place in places
-        if place not in own
-        and (
-            place in SHARED
-            or place.replace("/", ".").split(".")[0] in groups
-            or place.startswith("data.")
-        )
-        and place not in ("seed", "runs_dir")
-    ]
-
-
 @contextmanager
-def _naming(earlier: Earlier, config: DictConfig) -> Iterator[None]:
-    """Say which run is wrong, where it is not the one that was asked for."""
+def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
+    """Name the upstream run in an error of it."""
     try:
         yield
     except InputError as error:
-        raise InputError(
-            f"{earlier.experiment}, which {config.name} needs ({earlier.key}): {error}"
-        ) from error
+        if spec is run:
+            raise
+        raise InputError(f"{spec.name}, which is upstream of {run.name}: {error}") from error
 
 
-def _finish(earlier: Earlier, train: Train, words: Sequence[str]) -> None:
-    told = False
-    while not earlier.is_finished:
-        if is_held(earlier.folder / "lock"):
-            if not told:
-                tell(f"{earlier.folder} is being trained by another process; waiting for it.")
-            told = True
-            time.sleep(LOOK_S)
+def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
+    tell(f"{run.name} depends on {spec.name}, which is trained first: {spec.folder}")
+    is_waiting = False
+    while not spec.is_finished:
+        if is_held(spec.folder / "lock"):
+            if not is_waiting:
+                tell(f"{spec.folder} is being trained by another process; waiting for it.")
+            is_waiting = True
+            time.sleep(POLL_S)
             continue
         try:
-            with _without_tags():
-                train(earlier.config, words)
+            train(spec)
         except InputError:
-            # Another process may have begun it between the look and the start, and even ended it.
-            if not (earlier.is_finished or is_held(earlier.folder / "lock")):
+            # Another process may have started it since the look, and even finished it.
+            if not (spec.is_finished or is_held(spec.folder / "lock")):
                 raise
 
 
-@contextmanager
-def _without_tags() -> Iterator[None]:
-    """Tags of a table's row or a trial are those of the run that was asked for."""
-    tags = os.environ.pop(TAGS, None)
-    try:
-        yield
-    finally:
-        if tags is not None:
-            os.environ[TAGS] = tags
+def _write_labels(spec: RunSpec) -> None:
+    """Predict the pseudo-labels of a run with the networks of its upstream runs."""
+    for dependency in spec.dependencies:
+        if dependency.key != WEIGHTS:
+            _predict_labels(spec, dependency)
 
 
-def _write_labels(earlier: Earlier, config: DictConfig, name: str) -> None:
-    from rgbt.build.load_run import open_run
-    from rgbt.build.session import view_of
-    from rgbt.evaluation.pseudo_labels import teacher_of, write_pseudo_labels
-
-    folder, node = labels_folder(config, name), config.domains[name]
-    assert folder is not None, "the domain takes labels of an earlier run"
+def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
+    name = teacher.key.split(".")[1]
+    folder, domain = spec.labels_folder(name), spec.domains.named[name]
+    assert folder is not None, "the domain takes labels of an upstream run"
     if (folder / MANIFEST).exists():
         return
-    # The earlier run may have been made on another machine, and where the data lie elsewhere.
-    here = [
+    # The upstream run may be a copy from another machine, where the data have another path.
+    config = OmegaConf.create(dict(spec.plain))
+    keys = [
         *(f"data.{each}" for each in config.data if each != "_target_"),
         *("trainer.accelerator", "trainer.threads"),
         *(f"dataset.{each}" for each in ("root", "cache_dir") if each in config.dataset),
     ]
-    place = [f"{each}={json.dumps(OmegaConf.select(config, each))}" for each in here]
-    checkpoint = earlier.checkpoint.removesuffix(".pt")
-    # The user's own: the same configuration as this command composed.
-    own = [target for _, target in targets(OmegaConf.to_container(earlier.config))]
-    session = open_run(earlier.folder, place, checkpoint, trust=own).session
-    view = view_of(session, node.teacher_view or "default")
-    teacher = teacher_of(earlier.folder.name, session.model)
+    overrides = [f"{key}={json.dumps(OmegaConf.select(config, key))}" for key in keys]
+    checkpoint = teacher.checkpoint.removesuffix(".pt")
+    # Its configuration was composed by this command, so that its targets are the user's own.
+    trust = list(target_names(teacher.run.plain))
+    session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
     write_pseudo_labels(
-        session, teacher, node.split, view, folder, node.threshold, label_map=None, head=None
+        session,
+        teacher_of(teacher.run.folder.name, session.model),
+        domain.split,
+        view_of(session, domain.teacher_view or "default"),
+        folder,
+        domain.threshold,
+        label_map=None,
+        head=None,
     )

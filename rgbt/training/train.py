@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import nn
 
 from rgbt.build.session import (
@@ -22,9 +22,8 @@ from rgbt.build.session import (
     result_tables,
     view_of,
 )
-from rgbt.build.training_setup import Prepared, prepare
+from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
-from rgbt.config.schema import build
 from rgbt.data.domains import Domains
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
@@ -37,7 +36,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
 from rgbt.runtime.signals import deferred
 from rgbt.spec.naming import describe, group_of
-from rgbt.spec.run_key import own_code, run_key
+from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import Tracking
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
@@ -54,47 +53,39 @@ MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which a sentence says so."""
 
 
-def is_finished(config: DictConfig) -> bool:
-    """Whether the run of a configuration has its result."""
-    return (Path(config.runs_dir) / run_key(config) / "result.json").exists()
-
-
-def train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Run `config` to its end, continuing where an earlier process stopped.
+def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+    """Train a run to its end, resuming where another process stopped, and show its result.
 
     Args:
-        config: composed and checked.
-        overrides: as typed, for the run's name.
+        spec: the run; its upstream runs are finished.
+        extra_tags: MLflow tags of the run (see `rgbt.spec.naming.describe`).
 
     Raises:
         InputError: the configuration, the data or the run folder do not fit.
-        RunError: the run cannot go on.
+        RunError: the training failed.
     """
-    if config.out is not None:
-        raise InputError(f"out={config.out}: a run is written to runs_dir=...; omit out=...")
-    fresh, config = config.fresh, config.copy()
-    config.fresh = False  # a request to this command, no property of the run
-    path = Path(config.runs_dir) / run_key(config)
-    asked = describe(config, overrides)
-    tracking: Tracking = build(config.tracking)
-    if is_finished(config) and not fresh:
-        folder = RunFolder(path)
+    if spec.out is not None:
+        raise InputError(f"out={spec.out}: a run is written to runs_dir=...; omit out=...")
+    description = describe(spec, extra_tags)
+    tracking: Tracking = spec.tracking.build()
+    if spec.is_finished and not spec.fresh:
+        folder = RunFolder(spec.folder)
         folder.clean()
-        _show_again(folder, tracking, asked)
+        _show_again(folder, tracking, description)
         warn_of_result(folder)
-        _tell_other_files(folder, config)
-        _tell_unmeasured(folder, build(config.consistency))
+        _warn_of_other_files(folder, spec)
+        _warn_of_missing_consistency(folder, spec.consistency.build())
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
-        prepared = prepare(config)
-        announce_training(prepared, asked.name, path)
-        decode_ahead(prepared.session, *prepared.read_splits())
-        if is_finished(config):
-            replace_finished(RunFolder(path), tracking)
-        folder = RunFolder(path)
+        setup = set_up_training(spec)
+        announce_training(setup, description.name, spec.folder)
+        decode_ahead(setup.session, *setup.read_splits())
+        if spec.is_finished:
+            replace_finished(RunFolder(spec.folder), tracking)
+        folder = RunFolder(spec.folder)
         with folder.lock():
-            Run(prepared, folder, tracking, asked).complete()
-    _show_result(folder, tracking, build(config.domains))
+            Run(setup, folder, tracking, description).complete()
+    _show_result(folder, tracking, spec.domains)
 
 
 def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
@@ -105,26 +96,26 @@ def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> Non
     show(result_view(ResultTables.from_json(tables), folder.path, links))
 
 
-def _show_again(folder: RunFolder, tracking: Tracking, asked: Description) -> None:
+def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
     known = folder.description()
     assert known is not None, "a finished run has its description"
-    tell(f"{asked.name} is finished; showing its result. Another seed is another run: seed=1.")
-    # A point of a grid that is the default elsewhere: the name that says more is the one to read.
-    lengths = [len(group_of(each.tags, each.params)) for each in (asked, known)]
-    shown = asked if lengths[0] > lengths[1] else known
+    tell(f"{requested.name} is finished; showing its result. Another seed is another run: seed=1.")
+    # A point of a grid may be the default of an experiment: the longer name says what it varies.
+    lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
+    shown = requested if lengths[0] > lengths[1] else known
     tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
     tracking.finish("FINISHED")
 
 
-def _tell_other_files(folder: RunFolder, config: DictConfig) -> None:
-    """A finished run of the same key may have been made on another copy: say so."""
-    if "root" not in config.dataset:
-        return  # made by its settings alone, which are in the key; it need not be made for this
+def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
+    """Warn where a finished run of the same key was made on another copy of the data set."""
+    if "root" not in spec.dataset.plain:
+        return  # drawn from its settings alone, which are in the key
     result = folder.result()
     try:
-        now = build(config.dataset).fingerprint()
+        now = spec.dataset.build().fingerprint()
     except InputError:
-        return  # a result can be shown where its data are not at hand
+        return  # a result can be shown without its data
     if result is not None and result["dataset"] != now:
         tell(
             f"it was made on other files of the data set ({result['dataset'][:8]}, now "
@@ -132,10 +123,10 @@ def _tell_other_files(folder: RunFolder, config: DictConfig) -> None:
         )
 
 
-def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
-    """A finished run measures nothing more: say how its consistency can still be had."""
-    places = [folder.path / file_name("aligned", split, asked.mark) for split in asked.splits]
-    if asked.sets and not all(place.is_file() for place in places):
+def _warn_of_missing_consistency(folder: RunFolder, views: ViewSets) -> None:
+    """A finished run is not evaluated again: say which command measures its consistency."""
+    paths = [folder.path / file_name("aligned", split, views.mark) for split in views.splits]
+    if views.sets and not all(path.is_file() for path in paths):
         tell(
             "its consistency on these views and splits has not been measured; to add it: "
             f"python -m rgbt.consistency run={folder.path} split=..."
@@ -146,7 +137,7 @@ def _tell_unmeasured(folder: RunFolder, asked: ViewSets) -> None:
 class Run:
     """A run that is not finished: trains, evaluates and fills its folder."""
 
-    prepared: Prepared
+    setup: TrainingSetup
     folder: RunFolder
     tracking: Tracking
     description: Description
@@ -154,7 +145,7 @@ class Run:
     def complete(self) -> None:
         """Train to the last step, evaluate the best checkpoint, write the result."""
         started = time.time()
-        session = self.prepared.session
+        session = self.setup.session
         self._claim(session)
         shown = self.description
         tags = {**shown.tags, "rgbt.key": self.folder.path.name}
@@ -210,7 +201,7 @@ class Run:
 
     def _validated(self) -> dict[str, float]:
         """Scores of the best checkpoint from its counts, where their line was damaged."""
-        session = self.prepared.session
+        session = self.setup.session
         path = self.folder.counts_path(session.trainer.selection_split)
         return scores.summary(Counts.load(path), session.regions.absent)
 
@@ -228,12 +219,12 @@ class Run:
         if before["files"] != found["files"]:
             tell(f"files of {dataset.root} have changed since this run was started.")
         self.folder.mark(**found)
-        config = without_passwords(OmegaConf.to_yaml(session.config, resolve=True))
-        self.folder.write_config(config)
-        self.folder.add_provenance({**provenance(), "own_code": own_code(session.config)})
+        config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
+        self.folder.write_config(without_passwords(config))
+        self.folder.add_provenance({**provenance(), "own_code": session.spec.own_code()})
 
     def _train(self, session: Session) -> State:
-        state = State(seed=session.config.seed)
+        state = State(seed=session.spec.seed)
         trainer = self._trainer(session, state)
         if trainer.resume(state):
             if trainer.checkpoints.warning:
@@ -244,7 +235,7 @@ class Run:
         self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
-        batches = self.prepared.batches(steps)
+        batches = self.setup.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
         self._tell_waiting(session)
         return state
@@ -256,7 +247,7 @@ class Run:
         if before.reached > step:
             tell(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
         logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
-        every = max([self.prepared.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
+        every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
             tell(
                 f"warning: {self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
@@ -289,14 +280,14 @@ class Run:
 
     def _trainer(self, session: Session, state: State) -> Trainer:
         split = session.trainer.selection_split
-        per_epoch = self.prepared.steps_per_epoch()
+        per_epoch = self.setup.steps_per_epoch()
 
         def validate(step: int) -> float:
-            found = evaluate(session, self.prepared.model, split)
+            found = evaluate(session, self.setup.model, split)
             place = trainer.checkpoints.begin_evaluation(step)
             found.counts.save(place / self.folder.counts_path(split).name)
             values = scores.summary(found.counts, session.regions.absent)
-            values |= self._of_target(session, self.prepared.model, split, place)
+            values |= self._of_target(session, self.setup.model, split, place)
             self.folder.append(step, "val", values)
             state.skip(found.skipped)
             return values[names.MIOU]
@@ -304,11 +295,11 @@ class Run:
         trainer = Trainer(
             fabric=session.fabric,
             settings=session.trainer,
-            scheme=self.prepared.scheme,
-            model=self.prepared.model,
-            others=self.prepared.others,
-            optimizers=self.prepared.optimizers,
-            schedule=self.prepared.schedule,
+            scheme=self.setup.scheme,
+            model=self.setup.model,
+            others=self.setup.others,
+            optimizers=self.setup.optimizers,
+            schedule=self.setup.schedule,
             steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
             folder=self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),

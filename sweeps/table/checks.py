@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, check_choice
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
 from rgbt.metrics.named import OF_PAIRS
 
 if TYPE_CHECKING:

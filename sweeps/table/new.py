@@ -15,8 +15,8 @@ from typing import Any
 from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import PIXELS, compose
-from rgbt.config.schema import check
 from rgbt.files.atomic import write_atomic
+from rgbt.spec.specify import specify
 from sweeps.table.table import OWN as FOLDER
 from sweeps.table.table import PUBLISHED, load_table
 
@@ -117,7 +117,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         chosen = [f"{f.key}={value}" for f, value in zip(factors, point, strict=True)]
         every = [f"+experiment={experiment}", *chosen]
         with composing(every):
-            check(compose(every))
+            specify(compose(every))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, _text(name, experiment, factors, points).encode())
     return path

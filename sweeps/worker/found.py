@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.folder import RunFolder
 from rgbt.tracking.formats import ADVICE, read_provenance, read_result

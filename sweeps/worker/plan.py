@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from omegaconf import DictConfig
-
 from rgbt.checks import InputError
 from rgbt.config.command import composing
+from rgbt.config.component import Component
 from rgbt.config.compose import compose, with_pixels
-from rgbt.config.schema import build, check
-from rgbt.spec.run_key import run_key
+from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.specify import specify
 from sweeps.points import Evaluation, Point
 
 
@@ -89,44 +88,35 @@ class Planner:
         factor = runs[0].pixel_factor
         return Plan(replace(point, label=with_pixels(point.label, factor)), key, runs, factor)
 
-    def config(self, overrides: Sequence[str]) -> DictConfig:
-        """The checked configuration of one run.
+    def spec(self, overrides: Sequence[str]) -> RunSpec:
+        """The specification of one run.
 
         Raises:
             InputError: see `plan`; what Hydra refuses is told in the words of the command line.
         """
         with composing(overrides):
-            config = compose(overrides)
-            check(config)
-        return config
+            return specify(compose(overrides), overrides)
 
     def _run(self, overrides: tuple[str, ...]) -> PlannedRun:
         every = (*self.base, *overrides)
-        config = self.config(every)
-        key = run_key(config)
+        spec = self.spec(every)
         return PlannedRun(
-            key=key,
-            dataset=self._fingerprint(config),
+            key=spec.key,
+            dataset=self._fingerprint(spec.dataset),
             overrides=every,
-            steps=int(config.trainer.max_steps),
-            pixel_factor=float(config.scale.pixel_factor),
+            steps=spec.trainer.max_steps,
+            pixel_factor=spec.scale.pixel_factor,
         )
 
-    def _fingerprint(self, config: DictConfig) -> str:
-        text = json.dumps(_plain(config.dataset), sort_keys=True)
+    def _fingerprint(self, component: Component) -> str:
+        text = json.dumps(component.plain, sort_keys=True)
         if text not in self._fingerprints:
-            dataset: Any = build(config.dataset)
+            dataset: Any = component.build()
             if not any(dataset.has(split) for split in dataset.splits):
-                places = ", ".join(dict.fromkeys(dataset.splits.values()))
+                paths = ", ".join(dict.fromkeys(dataset.splits.values()))
                 raise InputError(
-                    f"{dataset.root} holds none of the lists or files {places} of the data set; "
+                    f"{dataset.root} holds none of the lists or files {paths} of the data set; "
                     "name its folder with dataset.root=..."
                 )
             self._fingerprints[text] = dataset.fingerprint()
         return self._fingerprints[text]
-
-
-def _plain(node: DictConfig) -> object:
-    from omegaconf import OmegaConf
-
-    return OmegaConf.to_container(node, resolve=True)

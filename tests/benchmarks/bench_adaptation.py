@@ -37,10 +37,10 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
     """Seconds per step, wall and CPU, and peak memory in MiB of one case, in this process."""
     import torch
 
-    from rgbt.build.training_setup import prepare
+    from rgbt.build.training_setup import set_up_training
     from rgbt.config.compose import compose
-    from rgbt.config.schema import check
     from rgbt.engine.trainer import Trainer
+    from rgbt.spec.specify import specify
 
     experiment, changes = CASES[case]
     config = compose(
@@ -50,8 +50,7 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
             *("data.num_workers=0", f"trainer.accelerator={device}", f"trainer.threads={threads}"),
         ]
     )
-    check(config)
-    made = prepare(config)
+    made = set_up_training(specify(config))
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(
             fabric=made.session.fabric,

@@ -24,8 +24,8 @@ import hydra
 import torch
 from torch import Tensor
 
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir, register_resolvers
-from rgbt.config.schema import build
 from rgbt.engine.allocator import keep_memory
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.losses.distillation import sdc, sdn

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.data.cache.dataset import Decoded
 from rgbt.data.dataset import LabelledDataset
 from rgbt.data.loaders import LoaderSettings, train_batches

@@ -12,15 +12,16 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from rgbt.training import pipeline as earlier
 from rgbt.build import training_setup as prepared_module
-from rgbt.build.session import decode_ahead, open_session
-from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check
+from rgbt.config.component import build
+from rgbt.spec.specify import specify
 from rgbt.data.pseudo_labels import FORMAT
+from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
 from rgbt.evaluation.pseudo_labels import BEGUN, Teacher, write_pseudo_labels
-from rgbt.training.train import pipeline as earlier
+from rgbt.build.session import decode_ahead, open_session
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
 from tests.composed import composed as composed_once
@@ -48,7 +49,7 @@ def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
 def composed(words: Callable[..., list[str]]) -> Composed:
     def make(name: str, *more: str) -> DictConfig:
         config = compose(words(name, *more))
-        check(config)
+        specify(config)
         return config
 
     return make

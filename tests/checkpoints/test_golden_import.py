@@ -14,7 +14,7 @@ import torch
 from rgbt.checkpoints.load import load_weights
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.recognise import recognise
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from tests.models import golden
 
 FAST = ("mfnet", "cmx_mit_b0", "temporal_cmx_b2")

@@ -14,10 +14,12 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import Component
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import TOP_LEVEL, check_node, setting_types
+from rgbt.config.targets import setting_types
 from rgbt.config.values import check_value, expected
 from rgbt.ranges import Pixels, Share
+from rgbt.spec.run_spec import VALUES
 from sweeps.settings import Settings
 
 TARGETS = sorted(
@@ -151,11 +153,11 @@ def test_every_number_and_text_has_a_range(target: str) -> None:
 
 
 def test_top_level_keys_have_a_range() -> None:
-    assert all(bounded(leaf) for each in TOP_LEVEL.values() for leaf in leaves(each))
-    assert check_value("seed", 0, TOP_LEVEL["seed"]) == 0
+    assert all(bounded(leaf) for each in VALUES.values() for leaf in leaves(each))
+    assert check_value("seed", 0, VALUES["seed"]) == 0
     for wrong in (-1, 2**32, True, 0.5, None):
         with pytest.raises(InputError, match="'seed' must be a whole number at least 0 and below"):
-            check_value("seed", wrong, TOP_LEVEL["seed"])
+            check_value("seed", wrong, VALUES["seed"])
 
 
 # ---- sentences ------------------------------------------------------------------------------
@@ -216,7 +218,7 @@ def test_what_is_expected_in_words(annotation: Any, words: str) -> None:
         (True, float, "'a.b' must be a number, got true."),
         (
             "\x00",
-            TOP_LEVEL["name"],
+            VALUES["name"],
             "'a.b' must be a text of 1 to 4096 (printable",
         ),
     ],
@@ -242,7 +244,7 @@ def test_nan_and_infinity_are_refused_without_a_declared_range() -> None:
     for wrong in (".nan", ".inf", "-.inf"):
         node = OmegaConf.create(f"own: {{_target_: {__name__}.Own, rate: {wrong}}}").own
         with pytest.raises(InputError, match="'own.rate' must be a number, got"):
-            check_node(node, "own")
+            Component.from_node(node, "own")
 
 
 def test_settings_of_a_sweep_are_those_of_its_file() -> None:

@@ -10,9 +10,10 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import Component, build
 from rgbt.config.compose import conf_dir, flatten
-from rgbt.config.schema import NODES, build, check, check_node
-from rgbt.spec.run_key import run_key
+from rgbt.spec.run_spec import NODES
+from rgbt.spec.specify import specify
 from tests.models.golden import alone, compose
 
 
@@ -37,7 +38,7 @@ def options(group: str) -> list[str]:
 def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
     rooted = ["dataset.root=unused"] if scale == "paper" else []
     config = compose(f"+experiment={experiment}", f"scale={scale}", *rooted)
-    check(config)
+    specify(config)
     assert config.name == experiment
     assert config.scale.pixel_factor == {"demo": 0.5, "paper": 1.0}[scale]
     assert config.model.num_classes == config.dataset.num_classes
@@ -58,7 +59,7 @@ def test_every_option_of_every_group_passes_the_check(
     group: str, option: str, default: DictConfig
 ) -> None:
     if group == "scale":  # sets nodes of all groups
-        check(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
+        specify(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
         return
     made = option.startswith("synth") or option.endswith("_demo")
     needed = {} if group != "dataset" or made else {"root": "unused"}
@@ -68,7 +69,7 @@ def test_every_option_of_every_group_passes_the_check(
     usual = default[group]
     try:
         default[group] = chosen[group]
-        check_node(default[group], group)
+        Component.from_node(default[group], group)
     finally:
         default[group] = usual
 
@@ -150,10 +151,10 @@ def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
         ),
     ]
     base = ["+experiment=grbm", "dataset=mfnet", "dataset.root=/elsewhere"]
-    key = run_key(compose(*base))
-    assert run_key(compose(*base, *same)) == key
+    key = specify(compose(*base)).key
+    assert specify(compose(*base, *same)).key == key
     # The file says 4.0; a user types 4.
-    assert run_key(compose(*base, "masker.sigma_div=4")) == key
+    assert specify(compose(*base, "masker.sigma_div=4")).key == key
     for change in (
         "seed=1",
         "masker.sigma_div=2",
@@ -161,7 +162,7 @@ def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
         "trainer.max_steps=7",
         "trainer.threads=1",
     ):
-        assert run_key(compose(*base, change)) != key, change
+        assert specify(compose(*base, change)).key != key, change
 
 
 def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
@@ -189,7 +190,7 @@ def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
 def test_wrong_values_are_named_with_their_key(change: dict, sentence: str) -> None:
     good = {"_target_": f"{__name__}.Knob", "size": [1, 2], "kind": "a"}
     with pytest.raises(InputError, match=sentence):
-        check_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
+        Component.from_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
 
 
 def test_a_missing_value_is_named_when_the_object_is_built() -> None:
@@ -204,7 +205,7 @@ def test_flatten_gives_dotted_keys() -> None:
 
 
 def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
-    assert conf_dir() == Path(__file__).resolve().parents[1] / "conf"
+    assert conf_dir() == Path(__file__).resolve().parents[2] / "conf"
 
 
 def test_paths_are_read_as_they_are_typed() -> None:

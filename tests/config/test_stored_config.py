@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.command import plain_command
+from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.config.schema import NODES, build, check_node
 from rgbt.config.stored_config import (
     check_targets,
     load_config,
@@ -23,6 +23,7 @@ from rgbt.config.stored_config import (
     shipped_targets,
     targets,
 )
+from rgbt.spec.run_spec import NODES
 from tests.commands import Call, assert_one_sentence
 
 LAB = "import os\nfrom pathlib import Path\nPath(__file__).with_suffix('.imported').touch()\n" + (
@@ -51,8 +52,8 @@ OTHERS = [
     *("os.system", "posix.system", "builtins.eval", "subprocess.Popen", "hydra.utils.get_object"),
     *(
         "rgbt.files.atomic.os.system",
-        "rgbt.config.schema.get_object",
-        "rgbt.config.schema.instantiate",
+        "rgbt.config.targets.get_object",
+        "rgbt.config.targets.instantiate",
     ),
     *("rgbt.files.atomic.write_atomic", "rgbt.tracking.folder.RunFolder", "rgbt"),
     *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
@@ -155,7 +156,7 @@ def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None
 @pytest.mark.parametrize("target", ["os.system", "posix.system", "builtins.eval", "yaml.load"])
 def test_composed_configurations_follow_hydras_policy(target: str, tmp_path: Path) -> None:
     loud = OmegaConf.create({"x": {"_target_": target, "command": f"touch {tmp_path / 'marker'}"}})
-    for use in (build, lambda each: check_node(each, "x")):
+    for use in (build, lambda each: Component.from_node(each, "x")):
         with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as said:
             use(loud.x)
         assert_printable(str(said.value))

@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build, check_node
+from rgbt.config.component import Component, build
 from rgbt.data.folder.dataset import Folder
 from rgbt.data.folder.values import grey, label_codes, painted
 from rgbt.data.freiburg_images import _grey_levels
@@ -436,5 +436,5 @@ def test_the_configuration_names_every_key(sound: Path) -> None:
     own = {"root": str(sound), "num_classes": 3, "classes": list(CLASSES), **PATTERNS}
     own |= {"thermal_range": list(RANGE), "ids": {0: "background", 1: "person", 2: "car"}}
     config = OmegaConf.create({"dataset": OmegaConf.merge(node, own)})
-    check_node(config.dataset, "dataset")
+    Component.from_node(config.dataset, "dataset")
     assert build(config.dataset).read("test_1").thermal.shape == HW

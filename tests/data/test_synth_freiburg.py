@@ -10,8 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import Component, build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build, check_node
 from rgbt.data.freiburg import CLASSES, Freiburg
 from rgbt.data.synth import freiburg
 from rgbt.data.synth.factors import SceneFactors
@@ -252,7 +252,7 @@ def test_the_yaml_names_every_setting_with_its_default() -> None:
 def test_it_is_chosen_on_the_command_line(tmp_path: Path) -> None:
     words = [f"dataset.{key}={value}" for key, value in SMALL.items()]
     config = compose(["dataset=synth_freiburg", f"dataset.cache_dir={tmp_path}", *words])
-    check_node(config.dataset, "dataset")
+    Component.from_node(config.dataset, "dataset")
     assert build(config.dataset).name == "synth_freiburg"
 
 

@@ -10,8 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.config.schema import build, check_node
 from rgbt.data.kp import CLASSES, KP, set_of
 from rgbt.data.synth import kp, people
 from rgbt.data.synth.classes import ids_in
@@ -218,8 +218,8 @@ def test_it_is_made_from_a_configuration(tmp_path: Path) -> None:
     node = OmegaConf.load(conf_dir() / "dataset/synth_kp.yaml")
     changes = {**SMALL, "num_train": 1, "num_test": 1, "cache_dir": str(tmp_path)}
     config = OmegaConf.create({"dataset": OmegaConf.merge(node, changes)})
-    check_node(config.dataset, "dataset")
+    Component.from_node(config.dataset, "dataset")
     assert build(config.dataset).name == "synth_kp"
     config.dataset.hight = 3
     with pytest.raises(InputError, match="did you mean 'height'"):
-        check_node(config.dataset, "dataset")
+        Component.from_node(config.dataset, "dataset")

@@ -10,8 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import Component, build
 from rgbt.config.compose import compose, conf_dir
-from rgbt.config.schema import build, check_node
 from rgbt.data.pst900 import CLASSES, PST900, bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors
@@ -152,5 +152,5 @@ def test_it_is_made_from_a_configuration(tmp_path: Path) -> None:
     node = OmegaConf.load(conf_dir() / "dataset/synth_pst900.yaml")
     changes = {**SMALL, "num_train": 1, "num_test": 1, "cache_dir": str(tmp_path)}
     config = OmegaConf.create({"dataset": OmegaConf.merge(node, changes)})
-    check_node(config.dataset, "dataset")
+    Component.from_node(config.dataset, "dataset")
     assert build(config.dataset).name == "synth_pst900"

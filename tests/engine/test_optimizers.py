@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
 from rgbt.models.critic import Critic
 from rgbt.requirements import Record

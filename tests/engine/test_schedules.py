@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.engine.schedules import LatePoly, Poly, Steps, ThesisPoly
 from tests.models.golden import compose
 

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.data.cache.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
@@ -28,6 +27,7 @@ from rgbt.engine.confidence import probabilities
 from rgbt.evaluation import pseudo_labels as pseudo
 from rgbt.evaluation.pseudo_labels import Teacher, summary, teacher_of, write_pseudo_labels
 from rgbt.files.atomic import holding
+from rgbt.spec.specify import specify
 from rgbt.types import Output, View
 from tests.conftest import write_png
 
@@ -101,8 +101,7 @@ def session_of(root: Path, *overrides: str) -> Session:
             *overrides,
         ]
     )
-    check(config)
-    return replace(open_session(config), model=Fixed())
+    return replace(open_session(specify(config)), model=Fixed())
 
 
 @pytest.fixture

@@ -20,12 +20,12 @@ from torch.nn import functional as F
 from rgbt.build.session import Session, evaluate, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
 from rgbt.data.next_frames import NextFrames
 from rgbt.evaluation import temporal_consistency as two_frames
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, ca, tc
+from rgbt.spec.specify import specify
 from rgbt.transforms.view_sets import read_angles
 from rgbt.types import Output
 from tests.commands import SPLITS, words_of
@@ -67,9 +67,7 @@ class Oracle(nn.Module):
 
 
 def opened(*overrides: str) -> Session:
-    config = compose(overrides)
-    check(config)
-    return open_session(config)
+    return open_session(specify(compose(overrides)))
 
 
 def on_mfnet(data: Path, *overrides: str) -> Session:

@@ -14,7 +14,7 @@ from rgbt.config.compose import conf_dir
 from rgbt.files import yaml_files
 from rgbt.files.yaml_files import parse_yaml, read_yaml
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LAUGHS = "a0: &a0 [x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 20)
 )

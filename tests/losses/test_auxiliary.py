@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.losses.auxiliary import WithAuxiliary
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.requirements import Requirement

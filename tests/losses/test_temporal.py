@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build, check_node
+from rgbt.config.component import Component, build
 from rgbt.losses import temporal as module
 from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.cross_entropy import CrossEntropy
@@ -185,7 +185,7 @@ def test_raises(frames: Any) -> None:
 
 def built(*overrides: str) -> TemporalLoss:
     node = compose(*overrides).loss
-    check_node(node, "loss")
+    Component.from_node(node, "loss")
     loss = build(node)
     assert isinstance(loss, TemporalLoss)
     return loss
@@ -220,7 +220,7 @@ def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> N
 def test_unknown_words_name_their_key(wrong: str) -> None:
     key, _ = wrong.split("=")
     with pytest.raises(InputError, match=f"^'{key}'"):
-        check_node(compose("loss=temporal_paper", f"++{wrong}").loss, "loss")
+        Component.from_node(compose("loss=temporal_paper", f"++{wrong}").loss, "loss")
 
 
 class Recorded:

@@ -11,8 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir, register_resolvers
-from rgbt.config.schema import build
 from rgbt.maskers.masker import Masker
 from rgbt.maskers.pairing import complementary, random_complementary
 from rgbt.randomness import torch_generator

@@ -12,8 +12,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import ring_map, ring_rectangle, strip_map
 

@@ -22,8 +22,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from rgbt.config import schema as config
-from rgbt.config.schema import build
+from rgbt.config import compose as config
+from rgbt.config.component import build
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
 FOLDER = SHARED / "golden"

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.fusion import CrossAttention, Rectification
 from rgbt.models.cmx.mit import Attention, Block, MixFfn, drop_rates

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.models.cmx.fusion import Fusion, Rectification
 from rgbt.models.cmx.model import CMX
 from tests.models import golden

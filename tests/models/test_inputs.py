@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.models.inputs import Inputs, expand_cells, only_view
 from rgbt.types import MaskPair
 from tests.models.golden import compose

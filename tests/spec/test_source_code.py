@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from rgbt.spec import source_code
-from rgbt.spec.run_key import run_key
 from rgbt.spec.source_code import counted_modules, user_code
+from rgbt.spec.specify import specify
 from tests.composed import composed
 
 Write = Callable[..., None]
@@ -108,19 +108,19 @@ def test_user_code_of_released_targets_and_the_standard_library_is_empty() -> No
 
 def test_run_key_counts_the_code_of_own_targets_alone(write: Write) -> None:
     config = composed(["+experiment=baseline"])
-    released = run_key(config)
+    released = specify(config).key
     masker = {
         "my_masker.py": "class Mine:\n    def __init__(self, *, cell: int = 4):\n        pass\n"
     }
     write(masker)
     own = config.copy()
     own.masker = {"_target_": "my_masker.Mine"}
-    first = run_key(own)
+    first = specify(own).key
     write({"my_masker.py": masker["my_masker.py"].replace("pass", "self.cell = cell")})
-    second = run_key(own)
+    second = specify(own).key
     write(masker, "elsewhere")
     assert len({released, first, second}) == 3
-    assert (run_key(own), run_key(config)) == (first, released)
+    assert (specify(own).key, specify(config).key) == (first, released)
     # Trackers are no part of a run, whoever wrote them.
     config.tracking = {"_target_": "my_masker.Mine"}
-    assert run_key(config) == released
+    assert specify(config).key == released

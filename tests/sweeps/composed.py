@@ -10,7 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config.compose import compose
-from rgbt.config.schema import check
+from rgbt.spec.specify import specify
 from sweeps.table.table import Row, Table
 
 
@@ -28,7 +28,7 @@ def checked(overrides: Sequence[str]) -> DictConfig:
     parser = OverridesParser.create()
     for override in parser.parse_overrides(list(values)):
         OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
-    check(config)
+    specify(config)
     return config
 
 

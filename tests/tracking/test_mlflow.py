@@ -17,7 +17,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build, check_node
+from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.folder import RunFolder
@@ -467,7 +467,7 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
 def test_configuration_builds(name: str, kind: type) -> None:
     loaded = OmegaConf.load(CONF / f"{name}.yaml")
     config = OmegaConf.create({"runs_dir": "runs", "tracking": loaded})
-    check_node(config.tracking, "tracking")
+    Component.from_node(config.tracking, "tracking")
     tracker = build(config.tracking)
     assert isinstance(tracker, kind)
     if isinstance(tracker, MlflowTracking):

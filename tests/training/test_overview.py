@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from rgbt.build.load_run import Stored
-from rgbt.build.training_setup import Prepared, prepare
-from rgbt.training.overview import announce_stored, announce_training, network_line
-from tests.composed import checked
+from rgbt.build.load_run import TrainedNetwork
+from rgbt.build.training_setup import TrainingSetup, set_up_training
+from rgbt.training.overview import announce_network, announce_training, network_line
+from tests.composed import specified
 
 WORDS = (
     *("+experiment=mfnet", "dataset.num_train=3", "dataset.num_val=2", "dataset.num_test=4"),
@@ -21,22 +21,22 @@ WORDS = (
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+def setup(tmp_path_factory: pytest.TempPathFactory) -> TrainingSetup:
     place = tmp_path_factory.mktemp("overview")
-    return prepare(checked((*WORDS, f"dataset.cache_dir={place}", f"runs_dir={place}")))
+    return set_up_training(specified((*WORDS, f"dataset.cache_dir={place}", f"runs_dir={place}")))
 
 
 def test_a_training_says_what_it_works_with_and_nothing_that_reads_like_a_remark(
-    prepared: Prepared, capsys: pytest.CaptureFixture[str]
+    setup: TrainingSetup, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    announce_training(prepared, "seed=0 · mfnet", Path("/runs/abc"))
+    announce_training(setup, "seed=0 · mfnet", Path("/runs/abc"))
     out, err = capsys.readouterr()
     name, *lines = err.splitlines()
     shown = {line.split()[0]: " ".join(line.split()[1:]) for line in lines}
     assert (out, name) == ("", "seed=0 · mfnet")
     threads = torch.get_num_threads()
     assert shown["device"] == f"cpu, {threads} thread{'s' * (threads > 1)}, 32-true"
-    millions = sum(each.numel() for each in prepared.session.model.parameters()) / 1e6
+    millions = sum(each.numel() for each in setup.session.model.parameters()) / 1e6
     assert shown["network"] == f"MFNet, {millions:.2f} M parameters"
     assert shown["images"] == "synth: 3 train, 2 val, 4 test"
     # one batch of two of the three images is an epoch
@@ -47,9 +47,9 @@ def test_a_training_says_what_it_works_with_and_nothing_that_reads_like_a_remark
 
 @pytest.mark.parametrize(("step", "ending"), [(240, "checkpoint of step 240"), (0, "final.pth")])
 def test_an_evaluation_says_in_one_line_what_predicts(
-    prepared: Prepared, capsys: pytest.CaptureFixture[str], step: int, ending: str
+    setup: TrainingSetup, capsys: pytest.CaptureFixture[str], step: int, ending: str
 ) -> None:
-    announce_stored(Stored(prepared.session, step, Path("x"), "final.pth"))
+    announce_network(TrainedNetwork(setup.session, step, Path("x"), "final.pth"))
     (line,) = capsys.readouterr().err.splitlines()
     assert re.fullmatch(r"cpu, \d+ threads?, 32-true; .*; " + ending, line)
-    assert network_line(prepared.session) in line
+    assert network_line(setup.session) in line

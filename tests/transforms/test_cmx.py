@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.transforms.cmx import CmxTransform, draw_span, padded
 from rgbt.transforms.example import Example, viewed
 from rgbt.transforms.joint import whole_view

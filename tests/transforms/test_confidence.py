@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.transforms.cmx import padded
 from rgbt.transforms.example import viewed
 from rgbt.transforms.joint import View

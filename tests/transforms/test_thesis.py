@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
+from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.config.schema import build
 from rgbt.transforms.joint import View
 from rgbt.transforms.thesis import ThesisTransform, area, mixed
 from rgbt.types import IGNORE, Sample

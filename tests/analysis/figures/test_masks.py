@@ -18,8 +18,8 @@ from analysis.figures.masks import (
     whole_cells,
 )
 from rgbt.checks import InputError
+from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.config.schema import build
 from rgbt.types import MaskPair, Sample
 from tests.analysis.figures.drawn import texts
 

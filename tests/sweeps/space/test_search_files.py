@@ -9,7 +9,7 @@ import pytest
 from omegaconf import DictConfig
 
 from rgbt.config.compose import conf_dir, flatten, register_resolvers
-from rgbt.config.schema import check
+from rgbt.spec.specify import specify
 from sweeps.settings import read_settings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, plain_space
@@ -58,7 +58,7 @@ def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
     for place in (0, -1):
         chosen = {one.key: ends(one)[place] for one in parameters}
         config = compose(f"+search={name}", *as_overrides(chosen))
-        check(config)
+        specify(config)
         values = flatten(config)
         for key, value in chosen.items():
             assert str(value).startswith("${px:") or values[key] == value

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.config.schema import build
+from rgbt.config.component import build
 from rgbt.metrics.named import parse
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from sweeps.table.table import Column, Row, Table, load_table, table_names
 from tests.sweeps.composed import row_config
 
@@ -287,7 +287,7 @@ def test_rows_that_are_printed_twice_are_one_run(cells: list[tuple[str, str]], s
     keys, printed = set(), set()
     for name, label in cells:
         (row,) = [row for row in TABLES[name].rows if row.label == label]
-        keys.add(run_key(row_config(TABLES[name], row, scale)))
+        keys.add(specify(row_config(TABLES[name], row, scale)).key)
         miou = row.values.get("mIoU", row.values.get("rgbt_mIoU"))
         assert miou is not None
         printed.add(round(miou, 1))
@@ -303,7 +303,7 @@ def test_rows_that_are_printed_twice_are_one_run(cells: list[tuple[str, str]], s
 )
 def test_rows_of_an_ablation_are_different_runs(name: str) -> None:
     table = TABLES[name]
-    keys = {run_key(row_config(table, row, "demo")) for row in table.rows}
+    keys = {specify(row_config(table, row, "demo")).key for row in table.rows}
     assert len(keys) == len(table.rows)
 
 

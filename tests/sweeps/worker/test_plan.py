@@ -10,7 +10,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.spec.run_key import run_key
+from rgbt.spec.specify import specify
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.points import Evaluation, Point
 from sweeps.worker.found import Runs
@@ -37,7 +37,7 @@ def test_a_run_is_planned_under_the_key_that_the_command_gives_it(
 ) -> None:
     plan = planner.plan(Point("p", ("seed=3",)))
     (run,) = plan.runs
-    assert run.key == plan.key == run_key(compose([*base, "seed=3"]))
+    assert run.key == plan.key == specify(compose([*base, "seed=3"])).key
     assert run.overrides == (*base, "seed=3")
     assert run.steps == 6
     assert plan.point.label == "p"

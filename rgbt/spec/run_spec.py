@@ -1,0 +1,296 @@
+"""One run, described completely: made once from the composed configuration.
+
+Whoever needs a setting gets it, or its object, from here; the configuration itself is passed on to
+nobody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from rgbt.checks import InputError
+from rgbt.config.component import Component, target_names
+from rgbt.data.domains import GIVEN, NONE, Domains
+from rgbt.data.loaders import LoaderSettings
+from rgbt.engine.settings import Recipe, Scale, TrainerSettings
+from rgbt.ranges import Seed, Text
+from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
+from rgbt.spec.source_code import user_code
+
+WEIGHTS = "model.weights"
+"""The setting that names the weights that a network starts from."""
+
+CheckpointFile = Literal["best.pt", "last.pt"]
+
+
+@dataclass(frozen=True)
+class Node:
+    """What the run key and the upstream runs take of a node of the configuration.
+
+    Attributes:
+        in_key: whether it is part of the run key.
+        outside_key: settings of it that are not: paths, hardware, labels, and what other settings
+            take up.
+        added: settings that are newer than the first runs -> what these runs did: left out of the
+            key where they say that, so that a run keeps its key.
+        added_as: the same for the whole node; None: the node is as old as the first runs.
+        shared: whether upstream runs take it over from the run that needs them; or which of its
+            settings.
+    """
+
+    in_key: bool = True
+    outside_key: tuple[str, ...] = ()
+    added: Mapping[str, Any] = field(default_factory=dict)
+    added_as: Mapping[str, Any] | None = None
+    shared: bool | tuple[str, ...] = False
+
+    def key_settings(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What of the node's canonical `values` the run key is made of, below its `name`."""
+        if not self.in_key or values == self.added_as:
+            return {}
+        old = {key: value for key, value in self.added.items() if values.get(key) == value}
+        return {name: {key: values[key] for key in values if key not in (*self.outside_key, *old)}}
+
+
+def labels_key(domain: str) -> str:
+    """The setting that names the labels of a domain."""
+    return f"domains.{domain}.labels"
+
+
+def _node(**policy: Any) -> Any:
+    return field(metadata={"node": Node(**policy)})
+
+
+def _value(annotation: Any, *, shared: bool = False, is_label: bool = False) -> Any:
+    return field(metadata={"value": annotation, "shared": shared, "is_label": is_label})
+
+
+@dataclass(frozen=True)
+class Dependency:
+    """An upstream run, and what is taken from it.
+
+    Attributes:
+        key: the setting that names it: "model.weights" or "domains.target.labels".
+        run: the upstream run.
+        checkpoint: the file that is taken: "best.pt" or "last.pt".
+    """
+
+    key: str
+    run: RunSpec
+    checkpoint: CheckpointFile
+
+    @property
+    def path(self) -> Path:
+        """The checkpoint file."""
+        return self.run.folder / self.checkpoint
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunSpec:
+    """The typed, frozen description of one run.
+
+    Attributes:
+        name: of its experiment.
+        seed: of every generator.
+        runs_dir: the folder of run folders.
+        fresh: whether a finished run is trained again.
+        pretrained: file of ImageNet weights that the network, or that of its first upstream run,
+            starts from.
+        out: where a command that draws or predicts writes.
+        overrides: as typed on the command line, for the name of the run.
+        plain: the whole configuration as resolved YAML values, for ``config.yaml``.
+        components: every node, checked.
+        dependencies: the upstream runs, in the order in which they are needed.
+    """
+
+    name: str = _value(Text, is_label=True)
+    seed: int = _value(Seed, shared=True)
+    runs_dir: str = _value(Text, shared=True, is_label=True)
+    fresh: bool = _value(bool)
+    pretrained: str | None = _value(Text | None, shared=True)
+    out: str | None = _value(Text | None, is_label=True)
+
+    scale: Scale = _node(in_key=False)
+    recipe: Recipe = _node(in_key=False)
+    dataset: Component = _node(
+        outside_key=("root", "cache_dir", "palette", "layout", "absent"), shared=True
+    )
+    domains: Domains = _node(
+        added_as={
+            "_target_": "rgbt.data.domains.Domains",
+            "source": {
+                "_target_": "rgbt.data.domains.Domain",
+                **{"split": "train", "view": None, "head": None, "labels": "given"},
+                **{"teacher_view": None, "threshold": 0.0, "confidence": False},
+            },
+            **{"target": None, "target_is": None, "tested_head": "own"},
+        }
+    )
+    data: LoaderSettings = _node(
+        outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
+        shared=True,
+    )
+    transform: Component = _node()
+    masker: Component = _node()
+    model: Component = _node()
+    loss: Component = _node()
+    scheme: Component = _node()
+    optimizer: Component = _node()
+    schedule: Component = _node()
+    trainer: TrainerSettings = _node(
+        outside_key=("accelerator", "log_every", "checkpoint_every"),
+        added={"tested": "best", "threads": 2},
+        shared=(
+            *("max_steps", "eval_every", "checkpoint_every", "log_every"),
+            *("precision", "accelerator", "threads"),
+        ),
+    )
+    metric: Component = _node(shared=True)
+    consistency: Component = _node(in_key=False)
+    tracking: Component = _node(in_key=False, shared=True)
+
+    overrides: tuple[str, ...] = ()
+    plain: Mapping[str, Any] = field(repr=False)
+    components: Mapping[str, Component] = field(repr=False)
+    dependencies: tuple[Dependency, ...] = ()
+
+    @cached_property
+    def key(self) -> str:
+        """12 hexadecimal digits that identify the run: a hash of what decides its result.
+
+        Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method
+        with the same seed is the same run on every machine. A file of weights, or a folder of
+        pseudo-labels, counts by its content and not by its path; an upstream run by its key, and it
+        need not exist yet.
+
+        Raises:
+            InputError: the file of weights or the folder of pseudo-labels does not exist.
+        """
+        settings: dict[str, Any] = {"seed": self.seed}
+        if self.weights is not None:
+            settings["weights"] = [self._content(WEIGHTS, self.weights), *self.fresh_parts]
+        for name, node in NODES.items():
+            values = self.components[name].canonical()
+            if name == "domains":
+                for domain, each in self.domains.named.items():
+                    values[domain]["labels"] = self._content(labels_key(domain), each.labels)
+            settings |= node.key_settings(name, values)
+        return settings_digest(settings)
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return Path(self.runs_dir) / self.key
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has its result."""
+        return (self.folder / "result.json").exists()
+
+    @property
+    def upstream(self) -> tuple[RunSpec, ...]:
+        """The runs that this one depends on."""
+        return tuple(each.run for each in self.dependencies)
+
+    def dependency(self, key: str) -> Dependency | None:
+        """The upstream run that the setting `key` names; None where it names none."""
+        return next((each for each in self.dependencies if each.key == key), None)
+
+    @property
+    def weights(self) -> str | None:
+        """`model.weights`: a file, a run folder, or "experiment:NAME/best.pt"."""
+        return cast("str | None", self.model.plain.get("weights"))
+
+    @property
+    def fresh_parts(self) -> tuple[str, ...]:
+        """`model.fresh`: beginnings of parameter names that keep their random start."""
+        return tuple(self.model.plain.get("fresh") or ())
+
+    @property
+    def weights_path(self) -> Path | None:
+        """The file that `model.weights` names; of a run folder its best checkpoint.
+
+        Raises:
+            InputError: there is no such file, or the upstream run is not finished.
+        """
+        if self.weights is None:
+            return None
+        dependency = self.dependency(WEIGHTS)
+        named = self.weights if dependency is None else str(dependency.path)
+        path = Path(named).expanduser()
+        path = path / "best.pt" if path.is_dir() else path
+        if not path.is_file():
+            raise InputError(
+                f"model.weights={named}: there is no file {path}; give a file of weights, or the "
+                "folder of a run."
+            )
+        return path
+
+    def labels_folder(self, domain: str) -> Path | None:
+        """The folder of pseudo-labels of "source" or "target"; None where it takes none."""
+        settings = self.domains.named[domain]
+        dependency = self.dependency(labels_key(domain))
+        if dependency is not None:
+            words = [settings.split, settings.teacher_view or "default"]
+            words += [dependency.checkpoint.removesuffix(".pt")]
+            words += [f"{settings.threshold:g}"] if settings.threshold else []
+            return dependency.run.folder / "pseudo_labels" / "_".join(words)
+        is_folder = settings.labels not in (GIVEN, NONE)
+        return Path(settings.labels).expanduser() if is_folder else None
+
+    @property
+    def uses_pretrained(self) -> bool:
+        """Whether this run, or one upstream of it, starts from the file `pretrained`."""
+        return self.weights == self.pretrained or any(
+            each.run.uses_pretrained for each in self.dependencies
+        )
+
+    def own_code(self) -> dict[str, str]:
+        """Digest or version of the user's own code in the run, by module (see `user_code`)."""
+        return dict(user_code(target_names(self.plain)))
+
+    def _content(self, key: str, value: str) -> str:
+        """What stands for a file, a folder or an upstream run in the key."""
+        dependency = self.dependency(key)
+        if dependency is not None:
+            return f"{dependency.run.key}/{dependency.checkpoint}"
+        if key == WEIGHTS:
+            path = self.weights_path
+            assert path is not None, "model.weights has a value"
+            return file_digest(path)
+        return value if value in (GIVEN, NONE) else str(manifest_of(key, value)["digest"])
+
+
+NODES: dict[str, Node] = {
+    each.name: each.metadata["node"] for each in fields(RunSpec) if "node" in each.metadata
+}
+"""Every node of the configuration with its policy."""
+
+VALUES: dict[str, Any] = {
+    each.name: each.metadata["value"] for each in fields(RunSpec) if "value" in each.metadata
+}
+"""Every plain value at the top of the configuration with its type."""
+
+NOT_IN_KEY = (
+    *(each.name for each in fields(RunSpec) if each.metadata.get("is_label")),
+    *(key for key, node in NODES.items() if not node.in_key),
+    *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
+)
+"""Dotted keys in which two configurations of one run may differ."""
+
+SHARED = (
+    *(each.name for each in fields(RunSpec) if each.metadata.get("shared")),
+    *(key for key, node in NODES.items() if node.shared is True),
+    *(
+        f"{key}.{each}"
+        for key, node in NODES.items()
+        if not isinstance(node.shared, bool)
+        for each in node.shared
+    ),
+)
+"""Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
+the scale. A duration is that of the scale unless it was typed."""

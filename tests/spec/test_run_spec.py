@@ -1,0 +1,296 @@
+"""Run specifications: upstream runs, their configurations, and what the run key is made of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.config.compose import conf_dir
+from rgbt.spec import upstream
+from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.specify import specify
+from tests.composed import composed
+
+DEPENDENT = (
+    *("sh_adversarial", "sh_adversarial_seg", "sh_max_squares"),
+    *("multi_head_thermal", "multi_head_night", "multi_head_night_stage1"),
+    *("multi_head_modified_night_init", "multi_head_modified_night_init_stage1"),
+    *("heatnet", "heatnet_rgb_only"),
+)
+"""Experiments with upstream runs, each in another way."""
+
+
+@pytest.fixture(autouse=True)
+def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of the time of these tests is composing the same again and again."""
+    monkeypatch.setattr(upstream, "compose", composed)
+
+
+def spec_of(experiment: str, *overrides: str) -> RunSpec:
+    words = [f"+experiment={experiment}", *overrides]
+    return specify(composed(words), words)
+
+
+def key_of(experiment: str, *overrides: str) -> str:
+    return spec_of(experiment, *overrides).key
+
+
+TYPED = {
+    "as it is": [],
+    "seed": ["seed=3"],
+    "sizes": ["scale.batch_size=2", "scale.lr=0.5", "scale.crop_hw=[64,64]", "scale.num_workers=1"],
+    "durations": ["trainer.max_steps=3", "trainer.eval_every=2"],
+    "data": ["dataset.num_test=4", "data.on_error=skip"],
+    "regions": ["metric=ring9", "metric.absent=exclude"],
+    "precision": ["trainer.precision=bf16-mixed", "trainer.threads=1"],
+    "paper": ["scale=paper", "dataset.root=/data/freiburg"],
+}
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        pytest.param(words, marks=() if name in ("seed", "data", "durations") else pytest.mark.slow)
+        for name, words in TYPED.items()
+    ],
+    ids=TYPED,
+)
+def test_upstream_run_has_the_key_of_its_experiment(typed: list[str]) -> None:
+    for experiment in ("multi_head_modified_night_init_stage1", "heatnet_rgb_only"):
+        for run in spec_of(experiment, *typed).upstream:
+            assert run.key == key_of(run.name, *typed), run.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", ["demo", "paper"])
+@pytest.mark.parametrize("experiment", DEPENDENT)
+def test_every_upstream_run_has_the_key_of_its_experiment(experiment: str, scale: str) -> None:
+    typed = [f"scale={scale}", *(["dataset.root=x"] if scale == "paper" else [])]
+    runs = spec_of(experiment, *typed).upstream
+    assert runs
+    for run in runs:
+        assert run.key == key_of(run.name, *typed)
+
+
+def test_upstream_runs_other_seed_are_other_runs() -> None:
+    def keys(*overrides: str) -> list[str]:
+        run = spec_of("multi_head_night_stage1", *overrides)
+        return [run.key, *(each.key for each in run.upstream)]
+
+    first, second = keys("seed=0"), keys("seed=1")
+    assert all(a != b for a, b in zip(first, second, strict=True))
+    assert keys("seed=0") == first
+
+
+def test_key_counts_what_is_taken_from_upstream_runs() -> None:
+    base = key_of("sh_adversarial")
+    best = key_of("sh_adversarial", "model.weights=experiment:sh_source/best.pt")
+    other = key_of("sh_adversarial", "model.weights=experiment:sh_both/last.pt")
+    none = key_of("sh_adversarial", "model.weights=null")
+    assert len({base, best, other, none}) == 4
+    night = key_of("multi_head_night_stage1")
+    changes = ("labels=experiment:thermal_teacher/last.pt", "threshold=0.5", "teacher_view=null")
+    keys = [key_of("multi_head_night_stage1", f"domains.target.{each}") for each in changes]
+    assert len({night, *keys}) == 4
+
+
+@pytest.mark.parametrize("typed", ["runs_dir=/elsewhere", "tracking=none", "fresh=true"])
+def test_key_leaves_out_folder_and_tracking(typed: str) -> None:
+    assert key_of("multi_head_night", typed) == key_of("multi_head_night")
+
+
+def write_manifest(folder: Path, digest: str) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "pseudo_labels.json").write_text(json.dumps({"digest": digest}))
+    return folder
+
+
+def test_key_counts_pseudo_labels_by_content(tmp_path: Path) -> None:
+    def key(folder: Path) -> str:
+        return key_of("sh_both", f"domains.target.labels={folder}")
+
+    one = write_manifest(tmp_path / "one", "abc")
+    moved = write_manifest(tmp_path / "elsewhere", "abc")
+    other = write_manifest(tmp_path / "other", "abd")
+    assert key(one) == key(moved)
+    assert len({key(one), key(other), key_of("sh_both")}) == 3
+    run = spec_of("sh_both", f"domains.target.labels={one}")
+    assert run.labels_folder("target") == one
+    assert run.labels_folder("source") is None
+
+
+BAD_MANIFESTS = {"damaged": "{", "a list": "[1]", "a number": "3", "of something else": "{}"}
+
+
+@pytest.mark.parametrize("text", BAD_MANIFESTS.values(), ids=BAD_MANIFESTS)
+def test_key_damaged_pseudo_labels_are_refused(tmp_path: Path, text: str) -> None:
+    folder = write_manifest(tmp_path / "x", "abc")
+    (folder / "pseudo_labels.json").write_text(text)
+    with pytest.raises(InputError, match=r"pseudo_labels.json .*predict"):
+        key_of("sh_both", f"domains.target.labels={folder}")
+
+
+REFUSED = {
+    "no folder": ("domains.target.labels=/no/such", "there is no /no/such/pseudo_labels.json"),
+    "no checkpoint": ("model.weights=experiment:sh_source", "expected experiment:NAME/best.pt"),
+    "other checkpoint": (
+        "model.weights=experiment:sh_source/first.pt",
+        "expected experiment:NAME/best.pt or experiment:NAME/last.pt",
+    ),
+    "unknown": (
+        "model.weights=experiment:sh_sourc/last.pt",
+        "there is no experiment 'sh_sourc'.*did you mean 'sh_source'",
+    ),
+    "unknown teacher": (
+        "domains.target.labels=experiment:teacher/best.pt",
+        "domains.target.labels=experiment:teacher/best.pt: there is no experiment",
+    ),
+    "no name": ("domains.source.labels=experiment:/best.pt", "there is no experiment ''"),
+    "itself": (
+        "model.weights=experiment:sh_both/last.pt",
+        "circle of upstream runs: sh_both -> sh",
+    ),
+    "its own teacher": ("domains.target.labels=experiment:sh_both/last.pt", "sh_both -> sh_both"),
+}
+
+
+@pytest.mark.parametrize(("override", "sentence"), REFUSED.values(), ids=REFUSED)
+def test_reference_wrong_is_refused(override: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        key_of("sh_both", override)
+
+
+def test_circle_of_two_experiments_is_refused() -> None:
+    words = ["+experiment=sh_adversarial", "model.weights=experiment:heatnet_rgb_only/last.pt"]
+    words += ["domains.target.labels=experiment:sh_adversarial/best.pt"]
+    with pytest.raises(
+        InputError, match="circle of upstream runs: sh_adversarial -> sh_adversarial"
+    ):
+        specify(composed(words), words)
+
+
+def test_weights_upstream_run_gets_the_network() -> None:
+    run = spec_of(
+        "sh_adversarial", "model=rtfnet_tiny", "model.weights=experiment:sh_source/last.pt"
+    )
+    (source,) = run.upstream
+    assert source.model.target == run.model.target
+    assert source.weights is None
+    assert source.key == key_of("sh_source", "model=rtfnet_tiny")
+
+
+def test_teacher_keeps_its_own_network() -> None:
+    (teacher,) = spec_of("multi_head_night_stage1", "model.base_width=7").upstream
+    assert teacher.key == key_of("thermal_teacher")
+
+
+def test_shipped_experiments_have_no_circle() -> None:
+    needs = {}
+    for path in (conf_dir() / "experiment").glob("*.yaml"):
+        words = path.read_text().replace("/", " ").split()
+        needs[path.stem] = {w.partition(":")[2] for w in words if w.startswith("experiment:")}
+
+    def depth(name: str, above: tuple[str, ...] = ()) -> int:
+        assert name not in above, above
+        return 1 + max((depth(each, (*above, name)) for each in needs[name]), default=0)
+
+    assert max(depth(name) for name in needs) >= 3
+
+
+COMMON = (
+    *("scale=demo", "scale.lr=0.5", "dataset=synth_freiburg", "++dataset.num_test=4"),
+    *("data.on_error=skip", "trainer.max_steps=3", "trainer.threads=1", "metric=ring9"),
+    "metric.absent=exclude",
+)
+OWN = (
+    *("optimizer.lr=0.1", "scheme.weight=0.5", "seed=3", "loss=cross_entropy"),
+    *("trainer.clip_norm=1.0", "transform.test_short_edge=96", "masker=none"),
+    *("model.fresh=[]", "tracking=none"),
+)
+
+
+def test_upstream_overrides_are_those_that_both_runs_share() -> None:
+    model = ["model.base_width=7", "model=deeplabv2_two_heads_tiny"]
+    (stage,) = spec_of("multi_head_night", *COMMON, *OWN, *model).upstream
+    (teacher,) = stage.upstream
+    silent = ["tracking=none"]  # no name has it
+    assert stage.overrides[1:] == (*COMMON, *silent, *model)
+    assert teacher.overrides[1:] == (*COMMON, *silent)
+
+
+def test_upstream_overrides_leave_out_own_weights() -> None:
+    weights = "model.weights=experiment:sh_source/best.pt"
+    own = ("model.fresh=[auxiliary]", "optimizer.momentum=0.5")
+    (source,) = spec_of("sh_max_squares", weights, *own).upstream
+    assert source.overrides == ("+experiment=sh_source",)
+
+
+def test_key_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads whole files of weights."""
+    from rgbt.spec import run_spec
+
+    (source,) = spec_of("sh_adversarial", "runs_dir=/runs").upstream
+    digests: list[object] = []
+    monkeypatch.setattr(
+        run_spec, "settings_digest", lambda settings: digests.append(settings) or "key"
+    )
+    assert source.folder == source.folder == Path("/runs/key")
+    assert not source.is_finished
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        ([], "train_night_thermal_best"),
+        (["domains.target.labels=experiment:thermal_teacher/last.pt"], "train_night_thermal_last"),
+        (["domains.target.threshold=0.9"], "train_night_thermal_best_0.9"),
+        (["domains.target.threshold=0.95"], "train_night_thermal_best_0.95"),
+        (["domains.target.teacher_view=null"], "train_night_default_best"),
+        (["domains.target.split=train_day"], "train_day_thermal_best"),
+    ],
+)
+def test_labels_folder_names_what_is_predicted(typed: list[str], name: str) -> None:
+    run = spec_of("multi_head_night_stage1", *typed)
+    (teacher,) = run.upstream
+    assert run.labels_folder("target") == teacher.folder / "pseudo_labels" / name
+
+
+@pytest.mark.slow
+def test_pretrained_weights_count_in_the_first_stage(tmp_path: Path) -> None:
+    def keys(file: Path | None) -> list[str]:
+        typed = [] if file is None else [f"pretrained={file}"]
+        run = spec_of("multi_head_night", *typed)
+        (stage,) = run.upstream
+        (teacher,) = stage.upstream
+        assert stage.weights == (None if file is None else str(file))
+        assert teacher.weights is None
+        return [each.key for each in (run, stage, teacher)]
+
+    files = [tmp_path / name for name in ("one.pth", "same.pth", "other.pth")]
+    for file, content in zip(files, (b"abc", b"abc", b"abd"), strict=True):
+        file.write_bytes(content)
+    none, one, same, other = (keys(file) for file in (None, *files))
+    assert one == same
+    assert len({none[0], one[0], other[0]}) == len({none[1], one[1], other[1]}) == 3
+    assert none[2] == one[2] == other[2]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "typed", "uses"),
+    [
+        ("sh_source", [], True),
+        ("sh_adversarial", [], True),
+        ("multi_head_modified_night_init", [], True),
+        ("sh_source", ["model.weights=/some/file.pth"], False),
+        ("sh_adversarial", ["model.weights=null"], False),
+        ("heatnet", [], False),
+        ("heatnet_rgb_only", [], False),
+    ],
+)
+def test_uses_pretrained_looks_upstream(experiment: str, typed: list[str], uses: bool) -> None:
+    run = spec_of(experiment, "pretrained=/some/imagenet.pth", *typed)
+    assert run.uses_pretrained == uses
