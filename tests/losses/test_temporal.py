@@ -140,7 +140,7 @@ def test_masks_of_queries(make_problem: Any, make_criterion: Any) -> None:
         frames.append(Frame(output, batch, logits))
     valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
     loss = loss_of(segmentation=criterion)
-    assert loss.reads == "masks"
+    assert Requirement("model", "outputs", "masks") in loss.record.requires
     warped = frames[0].logits.softmax(1)
     parts = loss(*frames, warped, valid, torch.Generator().manual_seed(5))
     # The set criterion has a dice of its own.
@@ -157,7 +157,7 @@ def test_passes_are_summed(frames: Any) -> None:
         return {"some": torch.tensor([1.0, 2.0])}
 
     loss = loss_of(segmentation=two_passes, alpha=0.0, beta=0.0, second="none")
-    assert loss.reads is None
+    assert loss.record.requires == (Requirement("scheme", "frames", 2),)
     first, second, _, valid = frames
     parts = loss(first, second, None, valid, NOTHING)
     assert parts == {"some_1": torch.tensor(3.0), "some_2": torch.tensor(3.0)}
