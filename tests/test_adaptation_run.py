@@ -488,11 +488,11 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "no target": (
         ["sh_source", "scheme=adversarial_thesis"],
-        "Adversarial requires num_domains=2 of the domains, Domains provides num_domains=1; choose ",
+        "Adversarial requires num_domains=2 of the domains, Domains provides num_domains=1; choo",
     ),
     "no scheme for a target": (
         ["sh_both", "scheme=supervised"],
-        "requires num_domains=2 of the scheme, Supervised provides num_domains=1; choose scheme=two_",
+        "requires num_domains=2 of the scheme, Supervised provides num_domains=1; choose scheme=",
     ),
     "labels missing": (
         ["sh_adversarial", "scheme.supervise_target=true"],
@@ -508,7 +508,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "no such head": (
         ["multi_head_thermal_stage1", "domains.source.head=left"],
-        "domains.source.head=left requires heads=left of the model, DeepLabV2 provides heads=source",
+        "domains.source.head=left requires heads=left of the model, DeepLabV2 provides heads=sou",
     ),
     "heads of a network with one": (
         ["multi_head_thermal_stage1", "model=deeplab_demo"],
@@ -524,11 +524,11 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "loss that reads masks": (
         ["sh_both", "loss=set_criterion"],
-        "requires outputs=masks of the model, DeepLabV2 provides outputs=scores; choose loss=cross_",
+        "requires outputs=masks of the model, DeepLabV2 provides outputs=scores; choose loss=cro",
     ),
     "masker that hides": (
         ["sh_both", "masker=square"],
-        "requires hides_cells=false of the masker, Masker provides hides_cells=true; choose masker=n",
+        "requires hides_cells=false of the masker, Masker provides hides_cells=true; choose mask",
     ),
     "a view the network has not": (
         ["heatnet_no_teacher", "domains.source.view=thermal"],

@@ -175,7 +175,7 @@ BAD_OVERRIDES = {
     "patch of no tokens": (["masker.patch_size=6"], "masker.patch_size"),
     "distillation without masks": (
         ["masker=none", "scheme=crm"],
-        "requires hides_cells=true of the masker, Masker provides hides_cells=false; choose masker=",
+        "requires hides_cells=true of the masker, Masker provides hides_cells=false; choose mask",
     ),
     "batch above the split": (["data.batch_size=9"], "data.batch_size is 9"),
 }

@@ -220,7 +220,7 @@ REFUSED = {
     "no such mode": (["scheme.view.mode=rot"], "'scheme.view.mode'"),
     "single frames": (
         ["scheme=supervised"],
-        "requires frames=2 of the scheme, Supervised provides frames=1; choose scheme=temporal_paper",
+        "requires frames=2 of the scheme, Supervised provides frames=1; choose scheme=temporal_p",
     ),
     "loss of single frames": (
         ["loss=cross_entropy"],

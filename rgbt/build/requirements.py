@@ -105,8 +105,10 @@ def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any])
         declared = inspect.getattr_static(target, "record", None)
         if isinstance(declared, Record):
             return declared
+        described = Component.from_node(node)
+        others = {key: each for key, each in components.items() if key not in described.values}
         with torch.device("meta"):  # no memory, no random numbers
-            return record_of(Component.from_node(node).build(**components))
+            return record_of(described.build(**others))
     except Exception:  # noqa: BLE001 - a file may miss values, or be a user's: it is no choice
         return None
 
