@@ -107,7 +107,8 @@ def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any])
             return declared
         described = Component.from_node(node)
         others = {key: each for key, each in components.items() if key not in described.values}
-        with torch.device("meta"):  # no memory, no random numbers
+        # A network takes no memory there; a view is checked by numbers that it has elsewhere alone.
+        with torch.device("meta" if group == "model" else "cpu"):
             return record_of(described.build(**others))
     except Exception:  # noqa: BLE001 - a file may miss values, or be a user's: it is no choice
         return None
