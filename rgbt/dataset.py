@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rgbt.requirements import Record, record_of
 from rgbt.types import Sample
 
 
@@ -93,6 +94,11 @@ class DatasetWrapper:
         self.classes = source.classes
         self.palette = source.palette
         self.unscored = source.unscored
+
+    @property
+    def record(self) -> Record:
+        """That of the source."""
+        return record_of(self.source)
 
     @property
     def splits(self) -> Mapping[str, str]:

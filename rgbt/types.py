@@ -25,9 +25,6 @@ View = Literal["rgbt", "rgb", "thermal"]
 
 VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
-Predicts = Literal["scores", "masks"]
-"""What a network returns in training: dense class scores, or masks and classes of queries."""
-
 GeneratorOf = Callable[[str], torch.Generator]
 """purpose -> generator; the same purpose in the same step always gives the same draws."""
 
@@ -176,36 +173,6 @@ class Phase(NamedTuple):
     clear: bool = True
 
 
-class Network(Protocol):
-    """A segmentation network, an `nn.Module` (see `rgbt.models`).
-
-    Attributes:
-        num_classes: K.
-        views: what it can predict from; the first is what it is evaluated with unless told
-            otherwise.
-        predicts: what it returns in training, which its loss must read.
-        pretrained_parts: beginnings of the names of the parameters that an ImageNet file covers;
-            they get the backbone's learning rate.
-    """
-
-    num_classes: int
-    views: tuple[View, ...]
-    predicts: Predicts
-    pretrained_parts: tuple[str, ...]
-
-    def __call__(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,
-    ) -> Output:
-        """Class scores for images (N, 3, H, W) and (N, 1, H, W) in [0, 1]; () = the first view."""
-        ...
-
-
 class Masker(Protocol):
     """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`).
 
@@ -213,8 +180,6 @@ class Masker(Protocol):
     (`rgbt.geometry.padding.padded_hw`: 120 x 160 becomes 128 x 160), so that h and w divide the
     padded height and width.
     """
-
-    hides_nothing: bool
 
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator

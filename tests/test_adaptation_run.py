@@ -483,15 +483,21 @@ BAD: dict[str, tuple[list[str], str]] = {
         ["sh_both", "domains.target.labels=FOLDER"],
         "have the classes road, car, but synth_freiburg has road, sidewalk",
     ),
-    "no target": (["sh_source", "scheme=adversarial_thesis"], "trains on two domains, but there"),
-    "no scheme for a target": (["sh_both", "scheme=supervised"], "names a second one"),
+    "no target": (
+        ["sh_source", "scheme=adversarial_thesis"],
+        "Adversarial requires num_domains=2 of the domains, Domains provides num_domains=1; choo",
+    ),
+    "no scheme for a target": (
+        ["sh_both", "scheme=supervised"],
+        "requires num_domains=2 of the scheme, Supervised provides num_domains=1; choose scheme=",
+    ),
     "labels missing": (
         ["sh_adversarial", "scheme.supervise_target=true"],
-        "domains.target.labels=none, but the scheme reads labels of the target",
+        "with scheme.supervise_target=true requires target_labels=true of the domains",
     ),
     "labels not read": (
         ["sh_adversarial", "domains.target.labels=given"],
-        "domains.target.labels=given, but the scheme does not read labels",
+        "with scheme.supervise_target=false requires target_labels=false of the domains",
     ),
     "source without labels": (
         ["sh_source", "domains.source.labels=none"],
@@ -499,31 +505,31 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "no such head": (
         ["multi_head_thermal_stage1", "domains.source.head=left"],
-        "domains.source.head=left, but DeepLabV2 has the heads source, target",
+        "domains.source.head=left requires heads=left of the model, DeepLabV2 provides heads=sou",
     ),
     "heads of a network with one": (
         ["multi_head_thermal_stage1", "model.heads=[main]"],
-        "domains.source.head=source, but DeepLabV2 has the heads main; choose one of them",
+        "domains.source.head=source requires heads=source of the model, DeepLabV2 provides heads=m",
     ),
     "a head that nothing trains": (
         ["sh_source", "model.heads=[source,target]"],
-        "DeepLabV2 has the heads source, target, of which these domains train only the first",
+        "DeepLabV2 requires heads=source,target of the domains, Domains provides heads=",
     ),
     "network without scores": (
         ["sh_both", "model=mask2former_tiny", "loss=set_criterion"],
-        "returns masks of queries in training; choose one that returns scores",
+        "requires outputs=scores of the model, Mask2Former provides outputs=masks; choose model=",
     ),
     "loss that reads masks": (
         ["sh_both", "loss=set_criterion"],
-        "SetCriterion reads masks, but DeepLabV2 predicts scores",
+        "requires outputs=masks of the model, DeepLabV2 provides outputs=scores; choose loss=cro",
     ),
     "masker that hides": (
         ["sh_both", "masker=square"],
-        "shows whole images, but the masker hides cells; choose masker=none",
+        "requires hides_cells=false of the masker, Masker provides hides_cells=true; choose mask",
     ),
     "a view the network has not": (
         ["heatnet_no_teacher", "domains.source.view=thermal"],
-        "domains.source.view=thermal, but",
+        "Domains with domains.source.view=thermal requires views=thermal of the model, PSPNet",
     ),
     "an unknown split": (["sh_source", "domains.source.split=dusk"], "no split 'dusk'"),
     "batch above the target": (
@@ -532,7 +538,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "scheme that knows no domains": (
         ["sh_both", "scheme=temporal_paper", "loss=temporal_paper"],
-        "trains on one domain as the network sees it by itself",
+        "Domains requires num_domains=2 of the scheme, Temporal provides num_domains=1; choose ",
     ),
     "found before earlier runs are trained": (
         ["multi_head_night", "scheme.weight=-1"],
@@ -540,11 +546,11 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "found before a teacher is trained": (
         ["multi_head_night_stage1", "masker=square"],
-        "shows whole images",
+        "requires hides_cells=false of the masker",
     ),
     "confidence that is not read": (
         ["heatnet_no_teacher", "scheme.weighed_by_confidence=true"],
-        "are read without; set domains.target.confidence=true",
+        "requires target_confidence=true of the domains, Domains provides target_confidence=false",
     ),
 }
 

@@ -15,6 +15,7 @@ from rgbt.build.training_setup import _tell_what_is_not_as_published
 from rgbt.config.compose import conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
+from rgbt.requirements import Record
 from tests.commands import SMALL, Call, only_run, short
 from tests.composed import composed
 from tests.test_run import ELSEWHERE
@@ -146,7 +147,7 @@ class Told:
             ),
             dataset=SimpleNamespace(name=self.data, names=splits.__getitem__),
             trainer=SimpleNamespace(selection_split=self.picked, tested=self.tested),
-            model=SimpleNamespace(pretrained_parts=self.parts),
+            model=SimpleNamespace(record=Record(pretrained_parts=self.parts)),
             weights=self.weights,
         )
 

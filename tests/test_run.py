@@ -173,7 +173,10 @@ BAD_OVERRIDES = {
     "no such folder": (["dataset.root=/no/such"], "dataset.root: there is no folder '/no/such'"),
     "patch that does not divide": (["masker.patch_size=48"], "masker.patch_size"),
     "patch of no tokens": (["masker.patch_size=6"], "masker.patch_size"),
-    "distillation without masks": (["masker=none", "scheme=crm"], "hides nothing"),
+    "distillation without masks": (
+        ["masker=none", "scheme=crm"],
+        "requires hides_cells=true of the masker, Masker provides hides_cells=false; choose mask",
+    ),
     "batch above the split": (["data.batch_size=9"], "data.batch_size is 9"),
 }
 

@@ -218,12 +218,18 @@ REFUSED = {
     ),
     "turned round": (["scheme.view.roll=[5,-5]"], "a list of 2 (the smaller one first)"),
     "no such mode": (["scheme.view.mode=rot"], "'scheme.view.mode'"),
-    "single frames": (["scheme=supervised"], "choose scheme=temporal_paper"),
-    "loss of single frames": (["loss=cross_entropy"], "choose loss=temporal_paper"),
+    "single frames": (
+        ["scheme=supervised"],
+        "requires frames=2 of the scheme, Supervised provides frames=1; choose scheme=temporal_p",
+    ),
+    "loss of single frames": (
+        ["loss=cross_entropy"],
+        "requires frames=2 of the loss, CrossEntropy provides frames=1; choose loss=temporal_paper",
+    ),
     "masks": (["masker=crm", "masker.patch_size=32"], "choose masker=none"),
     "loss of masks": (
         ["loss@loss.segmentation=set_criterion"],
-        "TemporalLoss reads masks, but CMX predicts scores",
+        "TemporalLoss requires outputs=masks of the model, CMX provides outputs=scores; choose ",
     ),
     "beta of nothing": (["loss.second=none"], "set loss.beta=0"),
     "no beta": (["loss.beta=0"], "set loss.second=none"),

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, check_members, described
+from rgbt.requirements import record_of
 from rgbt.types import IGNORE, Batch, GeneratorOf, Output, Phase, Sample
 
 DATASET = (
@@ -188,7 +189,12 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
         raise InputError(f"{returned} {described(found)}; expected Output({expected}, aux={{}}).")
     if not isinstance(found.aux, dict):
         raise InputError(f"{returned} aux {described(found.aux)}; expected a dictionary.")
-    if found.logits is None and module.training:
+    record = record_of(module)
+    if record.auxiliary and "aux_logits" not in found.aux:
+        raise InputError(
+            f"{returned} aux without `aux_logits`, but its record says auxiliary=True."
+        )
+    if found.logits is None and module.training and record.outputs == "masks":
         return  # its loss reads `aux`
     wanted = (shape[0], num_classes, *shape[2:])
     if not isinstance(found.logits, Tensor) or found.logits.shape != wanted:

@@ -8,6 +8,7 @@ from rgbt.checks import InputError
 from rgbt.dataset import reader_of
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.requirements import Camera, record_of
 from rgbt.types import Masker, Sample
 
 
@@ -57,8 +58,30 @@ def check_cells(session: Session, masker: Masker) -> None:
     Raises:
         InputError: they do not, or a user's masker is none.
     """
-    crop_hw = getattr(session.transform, "crop_hw", None)
+    crop_hw = record_of(session.transform).crop_hw
     if crop_hw is None and is_own(masker):
         crop_hw = example_hw(session)
-    if crop_hw is not None and not getattr(masker, "hides_nothing", False):
+    if crop_hw is not None and record_of(masker).hides_cells:
         check_masker(masker, crop_hw, torch_generator(session.spec.seed, "probe"))
+
+
+def check_cameras(session: Session, scheme: object) -> None:
+    """Refuse the camera of other images: of a scheme of two frames, and of consistency.
+
+    Raises:
+        InputError: naming the key of the camera.
+    """
+    camera = record_of(scheme).camera
+    if camera is not None:
+        _check_camera("scheme", camera, example_hw(session))
+    if session.consistency.sets:
+        shown = session.transform.test(first_readable(session, "test"))
+        for image in (shown.rgb, shown.label):
+            _check_camera("consistency", session.consistency.view.camera, image.shape[:2])
+
+
+def _check_camera(node: str, camera: Camera, image_hw: tuple[int, int]) -> None:
+    try:
+        camera.matrix(image_hw)
+    except InputError as error:
+        raise InputError(f"{node}.view.{error}") from error

@@ -9,7 +9,13 @@ import torch
 from torch import nn
 
 from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
-from rgbt.build.probes import check_cells, check_own_parts, example_hw, first_readable
+from rgbt.build.probes import (
+    check_cameras,
+    check_cells,
+    check_own_parts,
+    first_readable,
+)
+from rgbt.build.requirements import check_requirements
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import available
@@ -20,23 +26,11 @@ from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
-from rgbt.losses.adversarial import cross_entropy, judged, least_squares
-from rgbt.losses.distillation import sdc, sdn
-from rgbt.losses.guidance import guidance
 from rgbt.randomness import derive
-from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec, labels_key
+from rgbt.requirements import record_of
+from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.tracking.terminal import info
-from rgbt.transforms.virtual_view import VirtualView
-from rgbt.types import VIEWS, Loadable, Masker, View
-
-FUNCTIONS = {
-    "sdc": sdc,
-    "sdn": sdn,
-    "guide": guidance,
-    "judged_map": judged,
-    "verdict_losses": {"least_squares": least_squares, "cross_entropy": cross_entropy},
-}
-"""What schemes compute with, by the name that they ask for it; they know no losses themselves."""
+from rgbt.types import Loadable, Masker
 
 
 @dataclass(frozen=True)
@@ -100,22 +94,15 @@ def validate(spec: RunSpec) -> None:
     Raises:
         InputError: as `set_up_training`; what unfinished upstream runs will write is left out.
     """
-    for name, domain in spec.domains.named.items():
+    for name in spec.domains.named:
         teacher = spec.dependency(labels_key(name))
         if teacher is not None:
-            _check_teacher_view(domain.teacher_view, teacher)
+            with torch.device("meta"):
+                network = teacher.run.model.build()
+            check_requirements(
+                {"domains": spec.domains, f"network of {teacher.key}": network}, spec.plain
+            )
     set_up_training(spec, upstream_finished=False)
-
-
-def _check_teacher_view(view: View | None, teacher: Dependency) -> None:
-    """Refuse a view that the network of an upstream run does not predict from."""
-    with torch.device("meta"):
-        views = getattr(teacher.run.model.build(), "views", VIEWS)
-    if view is not None and view not in views:
-        raise InputError(
-            f"{teacher.key.removesuffix('labels')}teacher_view={view}, but the network of "
-            f"{teacher.run.name} predicts from {', '.join(views)}; choose one of these, or null."
-        )
 
 
 def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> TrainingSetup:
@@ -132,6 +119,17 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     session = open_session(spec, load_weights=WEIGHTS not in missing)
     domains = session.domains
+    masker: Masker = spec.masker.build()
+    loss = spec.loss.build()
+    checked = CheckedLoss(loss) if is_own(loss) else loss
+    model = session.fabric.setup_module(session.model)
+    scheme = _scheme(session, model=model, loss=checked, masker=masker)
+    components = {
+        **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
+        **{"masker": masker, "transform": session.transform, "data": session.loading},
+        "dataset": session.dataset,
+    }
+    check_requirements(components, spec.plain)
     for split in (
         *(domain.split for domain in domains.named.values()),
         *(session.trainer.selection_split, "test"),
@@ -144,19 +142,11 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     for name, domain in domains.named.items():
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
-    _where_to_augment(session)
     check_own_parts(session)
-    masker: Masker = spec.masker.build()
     check_cells(session, masker)
+    check_cameras(session, scheme)
     if upstream_finished:
         _tell_what_is_not_as_published(session)
-    loss = spec.loss.build()
-    loss = CheckedLoss(loss) if is_own(loss) else loss
-    _check_loss(loss, session)
-    model = session.fabric.setup_module(session.model)
-    scheme = _scheme(session, model=model, loss=loss, masker=masker)
-    _check_domains(scheme, session)
-    _check_views(scheme, loss, session)
     others, optimizers = _set_up(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     return TrainingSetup(
@@ -167,7 +157,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
 def _tell_what_is_not_as_published(session: Session) -> None:
     """Remarks on what is no mistake, and yet not what a paper's numbers were made with."""
     spec, data = session.spec, session.dataset
-    expected: object = spec.scale.pretrained and getattr(session.model, "pretrained_parts", ())
+    expected: object = spec.scale.pretrained and record_of(session.model).pretrained_parts
     if expected and session.weights is None:
         info(
             "the published recipe starts from ImageNet weights, this run from random ones; name a "
@@ -193,19 +183,12 @@ def _tell_what_is_not_as_published(session: Session) -> None:
 
 
 def _where_to_augment(session: Session) -> Literal["loader", "device"]:
-    """What `LoaderSettings.augment` comes to; InputError where the transform cannot do it."""
-    asked = session.loading.augment
-    can = getattr(session.transform, "works_on_batches", False)
-    if asked == "device" and not can:
-        has_choice = "colour" in session.spec.transform.values
-        works = "transform.colour=intended" if has_choice else "transform=crm"
-        raise InputError(
-            f"data.augment=device, but {type(session.transform).__name__} works on single images "
-            f"as it is set; choose {works}, or data.augment=loader."
-        )
-    if asked == "auto":
+    """What `LoaderSettings.augment` comes to on this device with this transform."""
+    requested = session.loading.augment
+    if requested == "auto":
+        can = record_of(session.transform).works_on_batches
         return "device" if can and session.fabric.device.type == "cuda" else "loader"
-    return asked
+    return requested
 
 
 def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
@@ -261,7 +244,7 @@ def _scheme(session: Session, **collaborators: Any) -> Scheme:
     spec = session.spec
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "scheme weights"))
-        scheme: Scheme = spec.scheme.build(**collaborators, domains=session.domains, **FUNCTIONS)
+        scheme: Scheme = spec.scheme.build(**collaborators, domains=session.domains)
     return scheme
 
 
@@ -270,100 +253,13 @@ def _set_up(
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
     builder, fabric = session.spec.optimizer.build(), session.fabric
-    parts: dict[str, tuple[str, ...]] = getattr(scheme, "optimizers", {"main": ()})
+    record = record_of(scheme)
+    parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
-    others: dict[str, nn.Module] = getattr(scheme, "others", {})
     for name, module in others.items():
-        built[name] = scheme.builders[name](module)
+        built[name] = record.builders[name](module)
         others[name] = fabric.setup_module(module)
     optimizers: dict[str, Any] = {
         name: fabric.setup_optimizers(each) for name, each in built.items()
     }
     return others, optimizers
-
-
-def _check_loss(loss: object, session: Session) -> None:
-    """Refuse a loss that reads what it does not get, and what no loss reads."""
-    model = session.model
-    reads, predicts = getattr(loss, "reads", None), getattr(model, "predicts", None)
-    if None not in (reads, predicts) and reads != predicts:
-        key = "loss@loss.segmentation" if hasattr(loss, "reads_warped") else "loss"
-        advice = {"scores": f"{key}=cross_entropy", "masks": f"{key}=set_criterion"}
-        raise InputError(
-            f"{type(loss).__name__} reads {reads}, but {type(model).__name__} predicts "
-            f"{predicts}; choose {advice[str(predicts)]}, or another network."
-        )
-    classes = getattr(loss, "num_classes", session.dataset.num_classes)
-    if classes != session.dataset.num_classes:
-        raise InputError(
-            f"loss.num_classes is {classes} but {session.dataset.name} has "
-            f"{session.dataset.num_classes} classes; omit it, so that the data set decides."
-        )
-    for name, domain in session.domains.named.items():
-        if domain.confidence and not getattr(loss, "reads_confidence", False):
-            raise InputError(
-                f"domains.{name}.confidence=true, but {type(loss).__name__} does not weigh pixels "
-                "by it; choose loss=cross_entropy, or set it to false."
-            )
-
-
-def _check_views(scheme: object, loss: object, session: Session) -> None:
-    """Refuse a loss of two frames without a second one, and cameras of other images."""
-    views = getattr(scheme, "view", None)
-    if views is None and hasattr(loss, "reads_warped"):
-        raise InputError(
-            f"{type(loss).__name__} is a loss of two frames, but {type(scheme).__name__} shows the "
-            "network one; choose scheme=temporal_paper or temporal_released, or "
-            "loss=cross_entropy."
-        )
-    if isinstance(views, VirtualView):
-        # One example for nothing: a camera of other images is told before the run is begun.
-        _check_camera("scheme", views, example_hw(session))
-    if session.consistency.sets:
-        shown = session.transform.test(first_readable(session, "test"))
-        for image in (shown.rgb, shown.label):
-            _check_camera("consistency", session.consistency.view, image.shape[:2])
-
-
-def _check_camera(node: str, view: VirtualView, image_hw: tuple[int, int]) -> None:
-    try:
-        view.camera.matrix(image_hw)
-    except InputError as error:
-        raise InputError(f"{node}.view.{error}") from error
-
-
-def _check_domains(scheme: object, session: Session) -> None:
-    """Refuse domains that the scheme does not train on, and heads that the network lacks."""
-    domains, model = session.domains, session.model
-    if not hasattr(scheme, "domains"):
-        source = domains.source
-        if domains.target is not None or source.view is not None or source.head is not None:
-            raise InputError(
-                f"{type(scheme).__name__} trains on one domain as the network sees it by itself; "
-                "choose domains=one, or scheme=two_domains or adversarial_thesis."
-            )
-    if session.domains.source.labels == NONE:
-        raise InputError(
-            "domains.source.labels=none, but every scheme reads labels of the source; set it to "
-            "given, or name a folder of pseudo-labels."
-        )
-    heads = tuple(getattr(model, "heads", ()))
-    for name, domain in domains.named.items():
-        if domain.head is not None and domain.head not in heads:
-            raise InputError(
-                f"domains.{name}.head={domain.head}, but {type(model).__name__} has "
-                + (f"the heads {', '.join(heads)}" if heads else "no heads to choose from")
-                + "; choose one of them, or a DeepLab v2 with model.heads=[source,target]."
-            )
-        views = getattr(model, "views", VIEWS)
-        if domain.view is not None and domain.view not in views:
-            raise InputError(
-                f"domains.{name}.view={domain.view}, but {type(model).__name__} predicts from "
-                f"{', '.join(views)}; choose one of these, or another network."
-            )
-    if len(heads) > 1 and len(domains.heads) < len(heads):
-        raise InputError(
-            f"{type(model).__name__} has the heads {', '.join(heads)}, of which these domains "
-            f"train {', '.join(domains.heads) or 'only the first'}; choose domains=day_to_night or "
-            "rgb_to_thermal, or a network with one head."
-        )

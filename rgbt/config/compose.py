@@ -65,7 +65,7 @@ def compose(overrides: Sequence[str]) -> DictConfig:
     Files are looked up in ``conf/`` and in the folders of `search_path`.
     """
     others = [word for word in overrides if not word.startswith(f"{SEARCH_PATH}=")]
-    with _own_hydra():
+    with own_hydra():
         return hydra.compose("config", [*others, *search_path(overrides)])
 
 
@@ -91,13 +91,13 @@ def _searched(overrides: Sequence[str]) -> tuple[str | None, *tuple[str, ...]]:
 @cache
 def _listed(group: str, kind: ObjectType, _own: str | None, *words: str) -> tuple[str, ...]:
     """Names in a group; cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
-    with _own_hydra():
+    with own_hydra():
         loader = GlobalHydra.instance().config_loader()
         return tuple(loader.get_group_options(group, kind, "config", list(words)))
 
 
 @contextmanager
-def _own_hydra() -> Iterator[None]:
+def own_hydra() -> Iterator[None]:
     """Hydra with our configuration, also inside a command that Hydra runs."""
     register_resolvers()
     outer = GlobalHydra.instance().hydra

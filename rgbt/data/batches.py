@@ -89,8 +89,6 @@ class BatchTransform(Protocol):
     ``stack([drawn(sample, rng), ...]).to(device)`` is the batch of ``train(sample, rng)``.
     """
 
-    works_on_batches: bool
-
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Any:
         """The sample and the draws of `train`, not yet applied; every draw comes from `rng`."""
         ...

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.ranges import ShareBelowOne, Text
+from rgbt.requirements import Record, Requirement
 from rgbt.types import View
 
 GIVEN, NONE = "given", "none"
@@ -61,6 +63,20 @@ class Domain:
                 "wrote, or set confidence=false."
             )
 
+    def requires(self, key: str) -> Iterator[Requirement]:
+        """What follows from the settings of the domain at `key` of the configuration."""
+        if self.view is not None:
+            yield Requirement("scheme", "shows_views", True, f"{key}.view={self.view}")
+            yield Requirement("model", "views", (self.view,), f"{key}.view={self.view}")
+        if self.head is not None:
+            yield Requirement("scheme", "shows_views", True, f"{key}.head={self.head}")
+            yield Requirement("model", "heads", (self.head,), f"{key}.head={self.head}")
+        if self.teacher_view is not None:
+            setting = f"{key}.teacher_view={self.teacher_view}"
+            yield Requirement(f"network of {key}.labels", "views", (self.teacher_view,), setting)
+        if self.confidence:
+            yield Requirement("loss", "weighs_confidence", True, f"{key}.confidence=true")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Domains:
@@ -86,6 +102,11 @@ class Domains:
     tested_head: Literal["own", "source"]
 
     def __post_init__(self) -> None:
+        if self.source.labels == NONE:
+            raise InputError(
+                "domains.source.labels=none, but every scheme reads labels of the source; set it "
+                "to given, or name a folder of pseudo-labels."
+            )
         heads = self.heads
         if self.target is not None and len(heads) == 1 and None in self._own_heads():
             raise InputError(
@@ -108,6 +129,23 @@ class Domains:
                 "domains.tested_head=source chooses between two heads, but there are "
                 f"{len(heads)}; set it to own."
             )
+
+    @property
+    def record(self) -> Record:
+        """What both domains are, and what these require of the network, the loss and the scheme."""
+        of_two = Requirement("scheme", "num_domains", 2)
+        named = self.named.items()
+        return Record(
+            requires=(
+                *((of_two,) if self.target is not None else ()),
+                *(each for name, domain in named for each in domain.requires(f"domains.{name}")),
+            ),
+            num_domains=1 if self.target is None else 2,
+            heads=self.heads,
+            separate_heads=len(self.heads) > 1,
+            target_labels=self.target is not None and self.target.labels != NONE,
+            target_confidence=self.target is not None and self.target.confidence,
+        )
 
     @property
     def named(self) -> dict[str, Domain]:

@@ -25,6 +25,7 @@ from rgbt.data.named_files import check_lengths, check_split, existing_file, exi
 from rgbt.data.prepare.freiburg import PREPARATION
 from rgbt.data.report.freiburg import FreiburgChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import IGNORE, Sample
 
 CLASSES = (
@@ -138,6 +139,11 @@ class Freiburg:
                 check_choice(f"dataset.{key}", word, classes)
         _check_numbers(crop, thermal_range)
         self.images = FreiburgImages(crop, thermal_range)
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether `split` has frames; InputError if the split is unknown."""

@@ -42,6 +42,7 @@ from rgbt.data.named_files import (
 from rgbt.data.prepare.kp import PREPARATION
 from rgbt.data.report.kp import KPChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import IGNORE, Sample
 
 ListSource = Literal["auto", "files", "sets"]
@@ -142,6 +143,11 @@ class KP:
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)
         self._names: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:

@@ -33,6 +33,7 @@ from rgbt.data.reader import (
 )
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import BatchSize, Text, Workers
+from rgbt.requirements import Record, Requirement
 from rgbt.types import Batch, Loadable
 
 LOG = logging.getLogger(__name__)
@@ -77,6 +78,12 @@ class LoaderSettings:
 
     def __post_init__(self) -> None:
         check_cache("data.cache", self.cache)
+
+    @property
+    def record(self) -> Record:
+        """Augmentation on the device, where it is requested, is the transform's work."""
+        on_device = Requirement("transform", "works_on_batches", True, "data.augment=device")
+        return Record(requires=(on_device,) if self.augment == "device" else ())
 
 
 class Batches(Iterator[Kind]):

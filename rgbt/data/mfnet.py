@@ -26,6 +26,7 @@ from rgbt.data.named_files import (
 from rgbt.data.prepare.mfnet import PREPARATION
 from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import Sample
 
 LayoutName = Literal["auto", "packed", "folders"]
@@ -100,6 +101,11 @@ class MFNet:
         check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether the list of `split` exists; InputError if the split is unknown."""

@@ -31,6 +31,7 @@ from rgbt.data.prepare.pst900 import PREPARATION
 from rgbt.data.pst900_layout import FOLDERS, PARTS, SPLITS, bag_of
 from rgbt.data.report.pst900 import PST900Checks
 from rgbt.ranges import Colour, Names, NumClasses, Text
+from rgbt.requirements import Record
 from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
@@ -118,6 +119,11 @@ class PST900:
                 )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:

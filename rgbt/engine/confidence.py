@@ -9,6 +9,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.engine.evaluate import label_scores
+from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 
 FAINTEST = 1e-6
@@ -42,6 +43,6 @@ def probabilities(
     """
     with torch.inference_mode():
         scores = label_scores(model, batch, fabric, view, heads)
-        if getattr(model, "predicts", "scores") == "masks":
+        if record_of(model).outputs == "masks":
             return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
         return scores.softmax(1)

@@ -10,6 +10,7 @@ from annotated_types import Interval
 from torch import nn
 
 from rgbt.ranges import Epsilon, LearningRate, NonNegative, ShareBelowOne
+from rgbt.requirements import record_of
 
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table",)
@@ -28,7 +29,7 @@ class AdamW:
     Attributes:
         lr: learning rate of everything outside the backbone, > 0.
         backbone_multiplier: factor of `lr` for the parameters that the network counts as
-            pretrained (the prefixes of names in its attribute `pretrained_parts`).
+            pretrained (`pretrained_parts` of its record).
         weight_decay: for every parameter except affine parameters of normalisations, embeddings
             and relative position tables, which get 0.
         decay_biases: whether biases are decayed, as in the CRM release; CMX and the temporal
@@ -168,7 +169,7 @@ def parameter_groups(
     """
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
     seen: set[int] = set()
-    parts: tuple[str, ...] = getattr(model, "pretrained_parts", ())
+    parts = record_of(model).pretrained_parts
     known = [name for name, _ in model.named_parameters()]
     for beginning in without:
         if not any(name.startswith(beginning) for name in known):

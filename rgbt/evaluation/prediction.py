@@ -12,13 +12,8 @@ from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
 from rgbt.engine.evaluate import HeadsOf
 from rgbt.engine.progress import progress
-from rgbt.types import VIEWS, View
-
-
-def network_views(session: Session) -> tuple[View, ...]:
-    """What the network of a session can predict from."""
-    views: tuple[View, ...] = getattr(session.model, "views", VIEWS)
-    return views
+from rgbt.requirements import record_of
+from rgbt.types import View
 
 
 def view_of(session: Session, view: View | None = None) -> View:
@@ -31,7 +26,7 @@ def view_of(session: Session, view: View | None = None) -> View:
     Raises:
         InputError: the network does not predict from `view`.
     """
-    known = network_views(session)
+    known = record_of(session.model).views
     if view is None:
         return session.domains.source.view or known[0]
     check_choice("modality", view, known)

@@ -16,13 +16,14 @@ from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.engine.progress import progress
 from rgbt.evaluation.corruption_request import CorruptionRequest
-from rgbt.evaluation.prediction import network_views, view_of
+from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
 from rgbt.files import budgets
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import miou
+from rgbt.requirements import record_of
 from rgbt.types import View
 
 FORMAT = "rgbt robustness 1"
@@ -78,7 +79,7 @@ class Measured:
 
 def conditions(session: Session, corruptions: Sequence[CorruptionRequest]) -> tuple[Condition, ...]:
     """Clean images, single branches as far as the network decodes them, every severity."""
-    view, known = view_of(session), network_views(session)
+    view, known = view_of(session), record_of(session.model).views
     branches = {each: title for each, title in FEATURES.items() if view == "rgbt" and each in known}
     found = [Condition(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
     for branch, title in branches.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -47,6 +48,13 @@ def cross_entropy(verdicts: Tensor, value: float) -> Tensor:
     """
     verdicts = single(verdicts)
     return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
+
+
+VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "least_squares": least_squares,
+    "cross_entropy": cross_entropy,
+}
+"""By their names in the configuration."""
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:

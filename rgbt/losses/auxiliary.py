@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.ranges import NonNegative
+from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Loss, Output
 
 
@@ -20,9 +22,6 @@ class WithAuxiliary:
         loss: of class scores.
         weight: finite, >= 0.
 
-    Attributes:
-        reads: what `loss` reads; None where it does not say.
-
     Raises:
         InputError: a weight out of range.
     """
@@ -30,8 +29,13 @@ class WithAuxiliary:
     def __init__(self, *, loss: Loss, weight: NonNegative) -> None:
         self.loss = loss
         self.weight = weight
-        self.reads_confidence = getattr(loss, "reads_confidence", False)
-        self.reads = getattr(loss, "reads", None)
+
+    @property
+    def record(self) -> Record:
+        """That of `loss`, and a network with an auxiliary head."""
+        record = record_of(self.loss)
+        auxiliary = Requirement("model", "auxiliary", True)
+        return replace(record, requires=(*record.requires, auxiliary))
 
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
@@ -45,16 +49,7 @@ class WithAuxiliary:
 
         Returns:
             weighted parts, shapes as those of `loss`.
-
-        Raises:
-            InputError: a network without auxiliary head.
         """
-        if "aux_logits" not in output.aux:
-            raise InputError(
-                "loss=cross_entropy_auxiliary needs a network with an auxiliary head, and this one "
-                "returns no auxiliary scores; choose a DeepLab v2 with model.auxiliary=true, or "
-                "loss=cross_entropy."
-            )
         parts = self.loss(output, batch, generator)
         auxiliary = self.loss(Output(output.aux["aux_logits"], {}), batch, generator)
         return {**parts, **{f"{name}_aux": self.weight * part for name, part in auxiliary.items()}}

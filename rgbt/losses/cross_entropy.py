@@ -11,7 +11,8 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
 from rgbt.ranges import NonNegative
-from rgbt.types import IGNORE, Batch, Output, Predicts
+from rgbt.requirements import Record, Requirement
+from rgbt.types import IGNORE, Batch, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
@@ -31,8 +32,7 @@ class CrossEntropy:
         InputError: a negative weight.
     """
 
-    reads: Predicts = "scores"
-    reads_confidence = True
+    record = Record(requires=(Requirement("model", "outputs", "scores"),), weighs_confidence=True)
 
     def __init__(self, *, class_weights: ClassWeights | None) -> None:
         self.class_weights = class_weights
@@ -54,14 +54,10 @@ class CrossEntropy:
             one value, shape (1,), float32.
 
         Raises:
-            InputError: a network without dense scores, or class weights of another number.
+            InputError: class weights of another number.
             ValueError: label or confidence, and scores, of different size.
         """
-        if output.logits is None:
-            raise InputError(
-                "loss=cross_entropy needs a network that returns dense class scores in training; "
-                "choose loss=set_criterion for this one."
-            )
+        assert output.logits is not None, "the record requires scores"
         sizes = check_shape("logits", output.logits, "B K H W")
         check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
         weights = self._weights(sizes["K"], output.logits.device)

@@ -21,7 +21,8 @@ from rgbt.losses.matcher import Matcher, Matches, targets_of
 from rgbt.losses.points import Points, PointSource
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
-from rgbt.types import Batch, Output, Predicts
+from rgbt.requirements import Record, Requirement
+from rgbt.types import Batch, Output
 
 
 class SetCriterion:
@@ -54,8 +55,6 @@ class SetCriterion:
         InputError: a setting out of its range.
     """
 
-    reads: Predicts = "masks"
-
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         *,
@@ -83,6 +82,17 @@ class SetCriterion:
             class_weight=class_weight,
             mask_weight=mask_weight,
             dice_weight=dice_weight,
+        )
+
+    @property
+    def record(self) -> Record:
+        """Masks of as many classes."""
+        setting = f"loss.num_classes={self.num_classes}"
+        return Record(
+            requires=(
+                Requirement("model", "outputs", "masks"),
+                Requirement("dataset", "num_classes", self.num_classes, setting),
+            )
         )
 
     def __call__(
@@ -138,8 +148,9 @@ class SetCriterion:
         missing = {"class_logits", "mask_logits"} - set(output.aux)
         if missing:
             raise InputError(
-                f"loss=set_criterion needs a network that predicts masks; its output lacks "
-                f"{sorted(missing)}. Choose model=mask2former_tiny or loss=cross_entropy."
+                f"loss: SetCriterion reads class_logits and mask_logits, but the output of the "
+                f"network lacks {', '.join(sorted(missing))}; a network whose record says "
+                'outputs="masks" must return them in `aux`.'
             )
         class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
         sizes = check_shape("class_logits", class_logits, "L P B Q C", C=self.num_classes + 1)

@@ -14,6 +14,7 @@ from rgbt.checks import InputError
 from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.dice import Form, dice, single
 from rgbt.ranges import NonNegative
+from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import IGNORE, Frame, Loss
 
 Second = Literal["none", "dice", "con", "con_acc"]
@@ -37,10 +38,6 @@ class TemporalLoss:
         second: X: Dice loss of the second frame (`rgbt.losses.dice`), or the first prediction
             against the second (`rgbt.losses.consistency`).
         form: of the Dice and the consistency losses, see there.
-
-    Attributes:
-        reads: what `segmentation` reads; None where it does not say.
-        reads_warped: whether X compares the second frame with the first.
 
     Raises:
         InputError: a coefficient out of its range; a beta without a loss, a loss without a beta.
@@ -70,8 +67,16 @@ class TemporalLoss:
         self.beta = beta
         self.second = second
         self.form: Form = form
-        self.reads = getattr(segmentation, "reads", None)
-        self.reads_warped = second in ("con", "con_acc")
+
+    @property
+    def record(self) -> Record:
+        """What the loss of each frame requires, and a scheme of two frames."""
+        of_frames = Requirement("scheme", "frames", 2)
+        return Record(
+            requires=(*record_of(self.segmentation).requires, of_frames),
+            frames=2,
+            reads_warped=self.second in ("con", "con_acc"),
+        )
 
     def __call__(
         self,
@@ -86,8 +91,9 @@ class TemporalLoss:
         Args:
             first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
             second: frame 2, of the same sizes.
-            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; what `reads_warped`
-                asks for. Whether a gradient goes through it is for the caller to decide.
+            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only with
+                `reads_warped` in the record. Whether a gradient goes through it is for the caller
+                to decide.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
                 "con" and "con_acc".
             generator: of the segmentation loss, frame 1 first.
@@ -110,7 +116,7 @@ class TemporalLoss:
             parts["dice_1"] = self.alpha * self._dice(first)
         if self.second == "dice":
             parts["dice_2"] = self.beta * self._dice(second)
-        elif self.reads_warped:
+        elif self.second != "none":
             parts[self.second] = self.beta * self._against(second, warped, valid)
         return parts
 

@@ -14,6 +14,7 @@ from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.maskers import pairing as pairings
 from rgbt.maskers import pattern
 from rgbt.ranges import Pixels, Share
+from rgbt.requirements import Record
 from rgbt.types import MaskPair
 
 Sampler = Literal["none", "uniform", "square", "gaussian_count", "gaussian_bernoulli"]
@@ -98,9 +99,9 @@ class Masker:
         self._check_settings()
 
     @property
-    def hides_nothing(self) -> bool:
-        """True for the sampler "none": a scheme can then leave out the masked pass."""
-        return self.sampler == "none"
+    def record(self) -> Record:
+        """Cells are hidden, but by the sampler "none"; a scheme then omits the masked pass."""
+        return Record(hides_cells=self.sampler != "none")
 
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
@@ -121,7 +122,7 @@ class Masker:
         """
         check_shape("centre_yx", centre_yx, "B yx", yx=2)
         grid_hw = self.grid_hw(image_hw)
-        if self.hides_nothing:
+        if self.sampler == "none":
             nothing = centre_yx.new_zeros((len(centre_yx), *grid_hw), dtype=torch.bool)
             return MaskPair(nothing, nothing.clone())
         taken = self._draw(grid_hw, centre_yx, generator)

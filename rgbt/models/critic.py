@@ -7,6 +7,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
 from rgbt.ranges import BaseWidth, Channels
+from rgbt.requirements import Record, Requirement
 
 STRIDE = 32
 
@@ -47,6 +48,12 @@ class Critic(nn.Module):
         self.conv3 = nn.Conv2d(widths[1], widths[2], 4, stride=2, padding=1)
         self.conv4 = nn.Conv2d(widths[2], widths[3], 4, stride=2, padding=1)
         self.classifier = nn.Conv2d(widths[3], 1, 4, stride=2, padding=1)
+
+    @property
+    def record(self) -> Record:
+        """It sees a map for each class."""
+        setting = f"scheme.critic.in_channels={self.in_channels}"
+        return Record(requires=(Requirement("dataset", "num_classes", self.in_channels, setting),))
 
     def forward(self, x: Tensor) -> Tensor:
         """Verdicts, not squashed; which number stands for which domain is the loss's choice.

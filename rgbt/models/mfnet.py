@@ -14,7 +14,8 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.ranges import Channels, NumClasses, Widths
-from rgbt.types import MaskPair, Output, Predicts, View
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
 
 STRIDE = 16
 """Four halvings, which the decoder undoes exactly."""
@@ -99,9 +100,7 @@ class MFNet(nn.Module):
         InputError: widths that are not positive, or odd where a mini-inception halves them.
     """
 
-    views: tuple[View, ...] = ("rgbt",)
-    predicts: Predicts = "scores"
-    pretrained_parts: tuple[str, ...] = ()
+    record = Record(views=("rgbt",))
 
     def __init__(
         self,
@@ -153,7 +152,7 @@ class MFNet(nn.Module):
             ValueError: shapes that do not fit each other.
             InputError: another view, or mask cells that do not divide the padded image.
         """
-        only_view(views, self.views, "MFNet")
+        only_view(views, self.record.views, "MFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         encoded = (self._encode("rgb", images.rgb), self._encode("inf", images.thermal))
         half, quarter, eighth, last = (torch.cat(pair, 1) for pair in zip(*encoded, strict=True))

@@ -12,7 +12,8 @@ from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.models.upsampling import DropRates, UpBlock, enlarge
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
-from rgbt.types import MaskPair, Output, Predicts, View
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
 
 STRIDE = 8
 """Of the encoder; the decoder doubles the size three times."""
@@ -55,9 +56,6 @@ class PSPNet(nn.Module):
         inputs: normalisation of the images.
     """
 
-    predicts: Predicts = "scores"
-    pretrained_parts: tuple[str, ...] = ("feats.",)
-
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
         *,
@@ -72,7 +70,6 @@ class PSPNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
-        self.views = VIEWS_OF[modalities]
         self.modalities = modalities
         self.dropout = dropout
         thermal = inputs.thermal_channels
@@ -92,6 +89,14 @@ class PSPNet(nn.Module):
         self.apply(_initialise)
         self.inputs = inputs
 
+    @property
+    def record(self) -> Record:
+        """What it returns, and what it predicts from."""
+        return Record(
+            views=VIEWS_OF[self.modalities],
+            pretrained_parts=("feats.",),
+        )
+
     def forward(
         self,
         rgb: Tensor,
@@ -107,7 +112,7 @@ class PSPNet(nn.Module):
             rgb: (N, 3, H, W) float in [0, 1].
             thermal: (N, 1, H, W) float in [0, 1].
             masks: cells of the image padded to multiples of 32, True = the pixels are hidden.
-            views: () or the one of `self.views`.
+            views: () or the one of its record.
             generator: draws the dropped channels; needed in training unless `dropout` is 0.
 
         Returns:
@@ -121,7 +126,7 @@ class PSPNet(nn.Module):
             ValueError: shapes that do not fit; no generator where one is needed.
             InputError: another view; mask cells that do not divide the padded image.
         """
-        only_view(views, self.views, "PSPNet")
+        only_view(views, self.record.views, "PSPNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         features = self.feats(self._seen(images))
         rates = self.dropout if self.training else (0.0, 0.0)

@@ -15,7 +15,8 @@ from torch.nn import functional as F
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.resnet import basic_stage, bottleneck_stage
 from rgbt.ranges import BaseWidth, NumClasses
-from rgbt.types import MaskPair, Output, Predicts, View
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
 
 STRIDE = 32
 """Five halvings, which the decoder undoes exactly."""
@@ -109,10 +110,6 @@ class RTFNet(nn.Module):
         inputs: normalisation of the images.
     """
 
-    views: tuple[View, ...] = ("rgbt",)
-    predicts: Predicts = "scores"
-    pretrained_parts: tuple[str, ...] = ("encoder_",)
-
     def __init__(
         self,
         *,
@@ -153,6 +150,16 @@ class RTFNet(nn.Module):
         self.inputs = inputs
         self._start()
 
+    @property
+    def record(self) -> Record:
+        """What it returns, what it predicts from, and what no file of ImageNet weights gives it."""
+        reason = "drawn anew with model.thermal_stem=xavier"
+        return Record(
+            views=("rgbt",),
+            pretrained_parts=("encoder_",),
+            drawn_anew={"encoder_thermal_conv1.": reason} if self.thermal_stem == "xavier" else {},
+        )
+
     def forward(
         self,
         rgb: Tensor,
@@ -179,7 +186,7 @@ class RTFNet(nn.Module):
             ValueError: shapes that do not fit each other.
             InputError: another view, or mask cells that do not divide the padded image.
         """
-        only_view(views, self.views, "RTFNet")
+        only_view(views, self.record.views, "RTFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
 
         x = F.relu(self.encoder_rgb_bn1(self.encoder_rgb_conv1(images.rgb)))

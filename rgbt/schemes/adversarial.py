@@ -10,23 +10,13 @@ from annotated_types import Interval
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, check_choice
+from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
+from rgbt.losses.adversarial import judged as judged_map
 from rgbt.ranges import NonNegative
-from rgbt.schemes.domains import (
-    Domains,
-    Gradients,
-    Passes,
-    check_labels,
-    check_whole,
-    scores,
-    target_of,
-)
-from rgbt.types import GeneratorOf, Loss, Masker, Phase, TwoDomains
+from rgbt.requirements import Record, Requirement, record_of
+from rgbt.schemes.domains import Domains, Gradients, Passes, scores
+from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
-Judged = Literal["probabilities", "logits", "self_information"]
-JudgedMap = Callable[[Tensor, Judged], Tensor]
-"""(B, K, H, W) scores -> what the critic sees (see `rgbt.losses.adversarial.judged`)."""
-
-VerdictLoss = Callable[[Tensor, float], Tensor]
 DomainValue = Annotated[float, Interval(ge=-10, le=10)]
 """Verdicts and the number they should be -> scalar (see `rgbt.losses.adversarial`)."""
 
@@ -50,7 +40,6 @@ class Adversarial:
     Args:
         model: the network.
         loss: L_s, of one domain.
-        masker: must hide nothing.
         domains: source and target.
         critic: D (see `rgbt.models.critic.Critic`).
         critic_optimizer: builder of its optimiser, which phases call "critic".
@@ -70,12 +59,9 @@ class Adversarial:
             false: both in every step.
         gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "together"; the code of
             its basic network: "kept".
-        judged_map: makes what the critic sees.
-        verdict_losses: d by its name.
 
     Raises:
-        InputError: one domain alone, labels of the target that are missing or not read, no
-            confidence where it weighs, equal numbers for both domains.
+        InputError: equal numbers for both domains, or one that its verdict loss does not take.
     """
 
     def __init__(  # noqa: PLR0913 - each is a way in which the releases differ
@@ -83,7 +69,6 @@ class Adversarial:
         *,
         model: nn.Module,
         loss: Loss,
-        masker: Masker,
         domains: Domains,
         critic: nn.Module,
         critic_optimizer: Callable[..., torch.optim.Optimizer],
@@ -98,12 +83,8 @@ class Adversarial:
         supervise_target: bool,
         alternates: bool,
         gradients: Gradients,
-        judged_map: JudgedMap,
-        verdict_losses: Mapping[str, VerdictLoss],
     ) -> None:
-        check_whole(masker, "adversarial")
-        target = target_of(domains, "adversarial")
-        check_choice("scheme.verdict_loss", verdict_loss, verdict_losses)
+        check_choice("scheme.verdict_loss", verdict_loss, VERDICT_LOSSES)
         outside = not 0 <= min(source_value, target_value) <= max(source_value, target_value) <= 1
         if verdict_loss == "cross_entropy" and outside:
             raise InputError(
@@ -115,27 +96,11 @@ class Adversarial:
                 f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "
                 "the critic has nothing to tell apart; choose two numbers, such as 0 and 1."
             )
-        advice = "set domains.target.labels and scheme.supervise_target so that they fit."
-        check_labels(target, "target", wanted=supervise_target, advice=advice)
-        if weighed_by_confidence and not target.confidence:
-            raise InputError(
-                "scheme.weighed_by_confidence=true weighs the adversarial loss by the confidence "
-                "of the target's labels, which are read without; set "
-                "domains.target.confidence=true, or scheme.weighed_by_confidence=false."
-            )
-        classes = getattr(model, "num_classes", None)
-        if classes is not None and getattr(critic, "in_channels", classes) != classes:
-            raise InputError(
-                f"scheme.critic.in_channels={critic.in_channels}, but the critic sees a map for "
-                f"each of the network's {classes} classes; leave it at ${{dataset.num_classes}}."
-            )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
-        self.optimizers = self.passes.optimizers
-        self.domains = domains
         self.others: dict[str, nn.Module] = {CRITIC: critic}
         self.builders = {CRITIC: critic_optimizer}
         self.judged = judged
-        self.verdict_loss = verdict_losses[verdict_loss]
+        self.verdict_loss = VERDICT_LOSSES[verdict_loss]
         self.values = {"source": source_value, "target": target_value}
         self.weight = weight
         self.both_ways = both_ways
@@ -143,7 +108,23 @@ class Adversarial:
         self.halved = halved
         self.supervise_target = supervise_target
         self.alternates = alternates
-        self.judged_map = judged_map
+
+    @property
+    def record(self) -> Record:
+        """Labels of the target where they are read, confidence where it weighs; the critic."""
+        labels, weighed = self.supervise_target, self.weighed_by_confidence
+        confidence = Requirement(
+            "domains", "target_confidence", True, "scheme.weighed_by_confidence=true"
+        )
+        return self.passes.record_with(
+            Requirement(
+                "domains", "target_labels", labels, f"scheme.supervise_target={str(labels).lower()}"
+            ),
+            *((confidence,) if weighed else ()),
+            *record_of(self.others[CRITIC]).requires,
+            networks=self.others,
+            builders=self.builders,
+        )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """The segmentation's phases, then the critic's; or one of both kinds.
@@ -157,7 +138,7 @@ class Adversarial:
             with torch.no_grad():
                 for name, each in (("source", batch.source), ("target", batch.target)):
                     output = self.passes.output(name, each, generator_of)
-                    seen[name] = self.judged_map(scores(output), self.judged)
+                    seen[name] = judged_map(scores(output), self.judged)
             yield self._critic_phase(seen)
             return
         self.others[CRITIC].requires_grad_(False)
@@ -173,7 +154,7 @@ class Adversarial:
         self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
     ) -> dict[str, Tensor]:
         output, parts = self.passes.supervised("source", batch.source, generator_of)
-        seen["source"] = self.judged_map(scores(output), self.judged)
+        seen["source"] = judged_map(scores(output), self.judged)
         if self.both_ways:
             parts["source/adversarial"] = self._adversarial("source", batch, seen)
         return parts
@@ -186,7 +167,7 @@ class Adversarial:
             output, parts = self.passes.supervised("target", batch.target, generator_of)
         else:
             output = self.passes.output("target", batch.target, generator_of)
-        seen["target"] = self.judged_map(scores(output), self.judged)
+        seen["target"] = judged_map(scores(output), self.judged)
         return parts | {"target/adversarial": self._adversarial("target", batch, seen)}
 
     def _adversarial(self, name: str, batch: TwoDomains, seen: Mapping[str, Tensor]) -> Tensor:
@@ -195,7 +176,7 @@ class Adversarial:
         cost = self.verdict_loss(self.others[CRITIC](seen[name]), self.values[other])
         if self.weighed_by_confidence:
             confidence = batch.target.confidence
-            assert confidence is not None, "the constructor has seen that it is read"
+            assert confidence is not None, "the record requires it"
             cost = cost * (1.0 - confidence).mean()
         return self.weight * cost
 

@@ -6,16 +6,15 @@ release; SpatialSeg trains with the same scheme and other masks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError
+from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
+from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import VIEWS, Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
-
-Distillation = Callable[..., Tensor]
 
 
 class CRM:
@@ -32,15 +31,9 @@ class CRM:
         model: network with the argument `passes` and `views` of `rgbt.models.mask2former`.
         loss: criterion that returns one value per stacked pass.
         masker: draws the masks of the masked pass.
-        sdc: distillation of one student, (teacher, student) -> scalar.
-        sdn: distillation of two students, (teacher, rgb, thermal) -> scalar.
         modality_weight: w_m. 1 in the release.
         complementary_weight: w_c. 1 in the release.
         nonlocal_weight: w_n. 1 in the release.
-
-    Raises:
-        InputError: distillation asked for without a masked pass; a network that does not predict
-            from each image alone.
     """
 
     def __init__(  # noqa: PLR0913 - three collaborators, three published weights
@@ -49,33 +42,38 @@ class CRM:
         model: nn.Module,
         loss: Loss,
         masker: Masker,
-        sdc: Distillation,
-        sdn: Distillation,
         modality_weight: NonNegative,
         complementary_weight: NonNegative,
         nonlocal_weight: NonNegative,
     ) -> None:
-        if masker.hides_nothing and (complementary_weight or nonlocal_weight):
-            raise InputError(
-                "scheme=crm distils from a masked pass, but the masker hides nothing; choose "
-                "a masker (masker=crm) or set scheme.complementary_weight and "
-                "scheme.nonlocal_weight to 0."
-            )
-        if not set(VIEWS) <= set(getattr(model, "views", ())):
-            raise InputError(
-                "scheme=crm trains a network that predicts from RGB-T, RGB and thermal features "
-                "in one pass, as model=mask2former_* does; for others choose scheme=supervised."
-            )
         self.model = model
         self.loss = loss
         self.masker = masker
-        self.sdc = sdc
-        self.sdn = sdn
+        self.hides_cells = record_of(masker).hides_cells
         self.modality_weight = modality_weight
         self.complementary_weight = complementary_weight
         self.nonlocal_weight = nonlocal_weight
         # Single-modality predictions cost two thirds of the head: only where they are read.
         self.views = VIEWS if modality_weight or nonlocal_weight else VIEWS[:1]
+
+    @property
+    def record(self) -> Record:
+        """A network of all views in one pass; where something is distilled, a masked pass."""
+        weights = {
+            "complementary_weight": self.complementary_weight,
+            "nonlocal_weight": self.nonlocal_weight,
+        }
+        return Record(
+            requires=(
+                Requirement("model", "views", VIEWS),
+                Requirement("model", "stacks_passes", True),
+                *(
+                    Requirement("masker", "hides_cells", True, f"scheme.{name}={weight:g}")
+                    for name, weight in weights.items()
+                    if weight
+                ),
+            )
+        )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase: the criterion of the supervised passes and the distillation terms.
@@ -97,7 +95,7 @@ class CRM:
     def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:
         height, width = batch.rgb.shape[-2:]
         generator = generator_of("stochastic depth")
-        if self.masker.hides_nothing:
+        if not self.hides_cells:
             output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
             return output, 1
         masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
@@ -123,8 +121,8 @@ class CRM:
         terms = {}
         if self.complementary_weight:
             student = class_logits_PBQK[views]
-            terms["sdc"] = self.complementary_weight * self.sdc(teacher, student)
+            terms["sdc"] = self.complementary_weight * sdc(teacher, student)
         if self.nonlocal_weight:
             rgb, thermal = class_logits_PBQK[views + 1 :]
-            terms["sdn"] = self.nonlocal_weight * self.sdn(teacher, rgb, thermal)
+            terms["sdn"] = self.nonlocal_weight * sdn(teacher, rgb, thermal)
         return terms

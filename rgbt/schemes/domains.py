@@ -7,8 +7,8 @@ from typing import Any, Literal, Protocol
 
 from torch import Tensor, nn
 
-from rgbt.checks import InputError
-from rgbt.types import Batch, GeneratorOf, Loss, Masker, Output, Phase, View
+from rgbt.requirements import Record, Requirement
+from rgbt.types import Batch, GeneratorOf, Loss, Output, Phase, View
 
 Gradients = Literal["apart", "kept", "together"]
 """What the optimisers of two heads step the parameters with that they share.
@@ -80,12 +80,6 @@ class Passes:
     def __init__(
         self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
     ) -> None:
-        if getattr(model, "predicts", "scores") == "masks":
-            raise InputError(
-                f"domain adaptation compares class scores, but {type(model).__name__} returns "
-                "masks of queries in training; choose one that returns scores, such as "
-                "model=deeplabv2_tiny."
-            )
         self.model = model
         self.loss = loss
         self.source = domains.source
@@ -97,12 +91,26 @@ class Passes:
                 name: tuple(f"heads.{head}." for other, head in heads.items() if other != name)
                 for name in heads
             }
-        if gradients != "apart" and len(self.optimizers) == 1:
-            raise InputError(
-                f"scheme.gradients={gradients} is about the optimisers of two heads, but this run "
-                "has one head for all images; set it to apart."
-            )
         self.gradients = gradients
+
+    def record_with(self, *requires: Requirement, **provides: Any) -> Record:
+        """Of a scheme of two domains, whole images and class scores, with what else it says."""
+        of_heads = Requirement(
+            "domains", "separate_heads", True, f"scheme.gradients={self.gradients}"
+        )
+        return Record(
+            requires=(
+                Requirement("model", "outputs", "scores"),
+                Requirement("masker", "hides_cells", False),
+                Requirement("domains", "num_domains", 2),
+                *((of_heads,) if self.gradients != "apart" else ()),
+                *requires,
+            ),
+            num_domains=2,
+            shows_views=True,
+            optimizers=self.optimizers,
+            **provides,
+        )
 
     def output(self, name: str, batch: Batch, generator_of: GeneratorOf) -> Output:
         """What the network returns for a batch of the domain "source" or "target"."""
@@ -138,38 +146,5 @@ class Passes:
 
 def scores(output: Output) -> Tensor:
     """(B, K, H, W) class scores of an output."""
-    assert output.logits is not None, "networks without scores have been refused"
+    assert output.logits is not None, "the record requires scores"
     return output.logits
-
-
-def check_whole(masker: Masker, scheme: str) -> None:
-    """Refuse a masker that hides something, which these schemes do not apply."""
-    if not masker.hides_nothing:
-        raise InputError(
-            f"the scheme {scheme} shows whole images, but the masker hides cells; choose "
-            "masker=none."
-        )
-
-
-def target_of(domains: Domains, scheme: str) -> Domain:
-    """The target domain.
-
-    Raises:
-        InputError: there is none.
-    """
-    if domains.target is None:
-        raise InputError(
-            f"the scheme {scheme} trains on two domains, but there is one; choose "
-            "domains=day_to_night, rgb_to_thermal or heatnet, or scheme=supervised."
-        )
-    return domains.target
-
-
-def check_labels(domain: Domain, name: str, wanted: bool, advice: str) -> None:
-    """Refuse a domain without labels where they are read, and with labels where they are not."""
-    has = domain.labels != "none"
-    if has != wanted:
-        raise InputError(
-            f"domains.{name}.labels={domain.labels}, but the scheme "
-            f"{'reads' if wanted else 'does not read'} labels of the {name} domain; {advice}"
-        )

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from rgbt.checks import InputError
+from rgbt.requirements import Record, record_of
 from rgbt.schemes.domains import Domains
 from rgbt.types import Batch, GeneratorOf, Loss, Masker, Phase
 
@@ -19,22 +19,16 @@ class Supervised:
         model: the network.
         loss: of its output and the labels.
         masker: what it does not see.
-        domains: how the source is seen, and by which head; a target is refused.
-
-    Raises:
-        InputError: two domains.
+        domains: how the source is seen, and by which head.
     """
 
+    record = Record(shows_views=True)
+
     def __init__(self, *, model: nn.Module, loss: Loss, masker: Masker, domains: Domains) -> None:
-        if domains.target is not None:
-            raise InputError(
-                "scheme=supervised trains on one domain, but domains.target names a second one; "
-                "choose domains=one, or scheme=two_domains."
-            )
         self.model = model
         self.loss = loss
         self.masker = masker
-        self.domains = domains
+        self.hides_cells = record_of(masker).hides_cells
         source = domains.source
         self.asked: dict[str, Any] = {} if source.view is None else {"views": (source.view,)}
         self.asked |= {} if source.head is None else {"head": source.head}
@@ -48,7 +42,7 @@ class Supervised:
         """
         height, width = batch.rgb.shape[-2:]
         masks = None
-        if not self.masker.hides_nothing:
+        if self.hides_cells:
             masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
         generator = generator_of("stochastic depth")
         output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.asked)

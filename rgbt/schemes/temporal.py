@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.checks import InputError
 from rgbt.geometry.warp import Warp
-from rgbt.types import Batch, Frame, GeneratorOf, Masker, Output, Phase
+from rgbt.requirements import Record, Requirement, record_of
+from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
 DenseLogits = Callable[[Output, tuple[int, int]], Tensor]
 """(output, image_hw) -> (B, K, H, W) scores of a network that predicts masks of queries."""
@@ -54,50 +54,42 @@ class Temporal:
     Args:
         model: any network; one that returns masks of queries needs `dense_logits`.
         loss: loss of two frames (see `rgbt.losses.temporal.TemporalLoss`).
-        masker: must hide nothing: virtual views and masks are not trained together.
         view: draws virtual views and applies them.
         warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
         detach: whether the first prediction is a fixed teacher of the second.
-
-    Raises:
-        InputError: a loss of single frames, a masker that hides something, or a network that the
-            loss between frames cannot read.
     """
 
-    def __init__(  # noqa: PLR0913 - four collaborators, two choices of the paper
+    def __init__(  # noqa: PLR0913 - three collaborators, two choices of the paper
         self,
         *,
         model: nn.Module,
         loss: Any,
-        masker: Masker,
         view: VirtualViews,
         warps: Literal["logits", "probabilities"],
         detach: bool,
     ) -> None:
-        if not hasattr(loss, "reads_warped"):
-            raise InputError(
-                f"the temporal scheme trains on pairs of frames, but {type(loss).__name__} is a "
-                "loss of single ones; choose loss=temporal_paper or temporal_released, or "
-                "scheme=supervised."
-            )
-        if not masker.hides_nothing:
-            raise InputError(
-                "the temporal scheme shows both frames whole, but the masker hides cells; choose "
-                "masker=none."
-            )
-        if getattr(model, "predicts", "scores") == "masks" and not hasattr(model, "dense_logits"):
-            raise InputError(
-                "the temporal scheme compares class scores of two frames, but "
-                f"{type(model).__name__} predicts masks of queries and has no `dense_logits` that "
-                "makes scores of them; choose another network."
-            )
         self.model = model
         self.loss = loss
         self.view = view
         self.warps = warps
         self.detach = detach
-        self.stacks = bool(getattr(model, "stacks_passes", False))
+        self.stacks = record_of(model).stacks_passes
+        self.reads_warped = record_of(loss).reads_warped
         self.apart = any(isinstance(module, _BatchNorm) for module in model.modules())
+
+    @property
+    def record(self) -> Record:
+        """A loss of two frames, whole images, and class scores of both."""
+        makes_masks = record_of(self.model).outputs == "masks"
+        return Record(
+            requires=(
+                Requirement("loss", "frames", 2),
+                Requirement("masker", "hides_cells", False),
+                *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
+            ),
+            frames=2,
+            camera=record_of(self.view).camera,
+        )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of Eq. 4.
@@ -110,7 +102,7 @@ class Temporal:
         angles = self.view.draw(len(batch.name), generator_of("virtual view"))
         warp = self.view.warp(angles, image_hw)
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
-        warped = self._warped(first.logits, warp) if self.loss.reads_warped else None
+        warped = self._warped(first.logits, warp) if self.reads_warped else None
         parts = self.loss(first, second, warped, self.view.valid(warp), generator_of("loss"))
         yield Phase(("main",), parts)
 

@@ -8,24 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
+from rgbt.losses.guidance import guidance
 from rgbt.ranges import NonNegative, Share
-from rgbt.schemes.domains import (
-    Domains,
-    Gradients,
-    Passes,
-    check_labels,
-    check_whole,
-    scores,
-    target_of,
-)
-from rgbt.types import IGNORE, GeneratorOf, Loss, Masker, Output, Phase, TwoDomains
+from rgbt.requirements import Record, Requirement
+from rgbt.schemes.domains import Domains, Gradients, Passes, scores
+from rgbt.types import IGNORE, GeneratorOf, Loss, Output, Phase, TwoDomains
 
 UnlabelledLoss = Callable[[Tensor], dict[str, Tensor]]
 """(B, K, H, W) probabilities -> named, weighted scalars (see `rgbt.losses.unlabelled`)."""
-
-Guide = Callable[[Tensor, Tensor, float], Tensor]
-"""Labels of an unlabelled image from two heads (see `rgbt.losses.guidance.guidance`)."""
 
 
 class LabelledDomains:
@@ -36,31 +26,19 @@ class LabelledDomains:
     Args:
         model: the network.
         loss: of one domain.
-        masker: must hide nothing.
         domains: source and target, both with labels.
         gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "kept".
-
-    Raises:
-        InputError: one domain alone, no labels of the target, a masker that hides something.
     """
 
     def __init__(
-        self,
-        *,
-        model: nn.Module,
-        loss: Loss,
-        masker: Masker,
-        domains: Domains,
-        gradients: Gradients,
+        self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
     ) -> None:
-        check_whole(masker, "two_domains")
-        target = target_of(domains, "two_domains")
-        check_labels(
-            target, "target", wanted=True, advice="name them, or choose scheme=max_squares."
-        )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
-        self.optimizers = self.passes.optimizers
-        self.domains = domains
+
+    @property
+    def record(self) -> Record:
+        """Labels of the target, beside what two domains require."""
+        return self.passes.record_with(Requirement("domains", "target_labels", True))
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase, or one per optimiser.
@@ -83,17 +61,11 @@ class UnlabelledTarget:
     Args:
         model: the network.
         loss: of the source.
-        masker: must hide nothing.
         domains: a labelled source and a target whose labels are "none".
         unlabelled: loss of the target's probabilities (`rgbt.losses.unlabelled`).
         guidance_weight: of the cross-entropy of the auxiliary head with the guidance of both heads
             (`rgbt.losses.guidance`); 0 for none. Released: 0.01, the product of 0.1 and 0.1.
         guidance_threshold: probability above which a head is sure. Released: 0.95.
-        guide: makes the guidance.
-
-    Raises:
-        InputError: one domain alone, a target with labels, guidance of a network without auxiliary
-            head.
     """
 
     def __init__(  # noqa: PLR0913 - collaborators, and one setting with its threshold
@@ -101,35 +73,22 @@ class UnlabelledTarget:
         *,
         model: nn.Module,
         loss: Loss,
-        masker: Masker,
         domains: Domains,
         unlabelled: UnlabelledLoss,
         guidance_weight: NonNegative,
         guidance_threshold: Share,
-        guide: Guide,
     ) -> None:
-        check_whole(masker, "max_squares")
-        target = target_of(domains, "max_squares")
-        check_labels(
-            target,
-            "target",
-            wanted=False,
-            advice="set domains.target.labels=none, or choose scheme=two_domains.",
-        )
-        if guidance_weight and getattr(model, "auxiliary", None) is None:
-            raise InputError(
-                f"scheme.guidance_weight={guidance_weight:g} trains an auxiliary head, which "
-                "this network does not have; choose a DeepLab v2 with model.auxiliary=true, or "
-                "set it to 0."
-            )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients="apart")
-        self.optimizers = self.passes.optimizers
-        self.domains = domains
-        self.target = target
         self.unlabelled = unlabelled
         self.guidance_weight = guidance_weight
         self.guidance_threshold = guidance_threshold
-        self.guide = guide
+
+    @property
+    def record(self) -> Record:
+        """No labels of the target; for guidance, an auxiliary head."""
+        setting = f"scheme.guidance_weight={self.guidance_weight:g}"
+        guided = (Requirement("model", "auxiliary", True, setting),) if self.guidance_weight else ()
+        return self.passes.record_with(Requirement("domains", "target_labels", False), *guided)
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase, or one per optimiser; see `LabelledDomains.phases`."""
@@ -148,7 +107,7 @@ class UnlabelledTarget:
     def _guidance(self, output: Output) -> Tensor:
         auxiliary = output.aux["aux_logits"].float()
         probabilities = scores(output).float().softmax(1)
-        label = self.guide(probabilities, auxiliary.softmax(1), self.guidance_threshold)
+        label = guidance(probabilities, auxiliary.softmax(1), self.guidance_threshold)
         total = F.cross_entropy(auxiliary, label, ignore_index=IGNORE, reduction="sum")
         # Where neither head is sure anywhere, the sum is 0 and so is the cost.
         return total / torch.clamp((label != IGNORE).sum(), min=1)

@@ -10,6 +10,7 @@ from annotated_types import Interval, Len
 from numpy.typing import ArrayLike, NDArray
 
 from rgbt.ranges import GreyLevel, Pixels, Share, Size
+from rgbt.requirements import Record
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample
@@ -59,6 +60,11 @@ class CmxTransform:
         self.padding_thermal = np.rint(np.mean(padding_thermal)).astype(np.uint8)
         self.test_short_edge = test_short_edge
         self.track_position = track_position
+
+    @property
+    def record(self) -> Record:
+        """The size of its examples."""
+        return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example of `crop_hw`; what is padding is 255 in its label.

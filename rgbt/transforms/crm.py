@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from rgbt.ranges import GreyLevel, Lengths, Pixels, Share, Size
+from rgbt.requirements import Record
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View, draw_view, short_edge_hw
 from rgbt.transforms.on_batch import Drawn, DrawnBatch
@@ -103,9 +104,9 @@ class CrmTransform:
         )
 
     @property
-    def works_on_batches(self) -> bool:
-        """Whether `drawn` and `stack` make what `train` makes: of uint8 images alone."""
-        return self.dtype == np.uint8
+    def record(self) -> Record:
+        """`drawn` and `stack` make what `train` makes of uint8 images alone."""
+        return Record(crop_hw=self.crop_hw, works_on_batches=self.dtype == np.uint8)
 
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Drawn:
         """What `train` would read and do, not done yet; the same draws.

@@ -8,6 +8,7 @@ import numpy as np
 from annotated_types import Interval
 
 from rgbt.ranges import Pixels, Share, Size
+from rgbt.requirements import Record
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import Part, View
 from rgbt.types import Sample
@@ -47,6 +48,11 @@ class RtfnetTransform:
         self.crop_hw = crop_hw
         self.test_short_edge = test_short_edge
         self.track_position = track_position
+
+    @property
+    def record(self) -> Record:
+        """The size of its examples."""
+        return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example of `crop_hw`.

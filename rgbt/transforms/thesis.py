@@ -11,6 +11,7 @@ from annotated_types import Interval, Predicate, doc
 from numpy.typing import DTypeLike, NDArray
 
 from rgbt.ranges import Pixels, Share, Size
+from rgbt.requirements import Record
 from rgbt.transforms.example import Example, evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
 from rgbt.types import IGNORE, Sample
@@ -69,6 +70,11 @@ class ThesisTransform:
         self.of_label = View.nearest if label_resize == "nearest" else mixed
         self.test_short_edge = test_short_edge
         self.track_position = track_position
+
+    @property
+    def record(self) -> Record:
+        """The size of its examples."""
+        return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example of `crop_hw`.

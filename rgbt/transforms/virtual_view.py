@@ -21,6 +21,7 @@ from rgbt.geometry.homography import Order, homography
 from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
 from rgbt.geometry.warp import Resampling, Warp
 from rgbt.ranges import rising
+from rgbt.requirements import Record
 from rgbt.types import IGNORE, Batch
 
 Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]
@@ -85,6 +86,11 @@ class VirtualView:
         self.outside_label = IGNORE if outside == "ignore" else 0
         self.ranges = {"yaw": yaw, "pitch": pitch, "roll": roll}
         self._check_ranges()
+
+    @property
+    def record(self) -> Record:
+        """Its camera."""
+        return Record(camera=self.camera)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) float64: yaw, pitch, roll in degrees, on the device of `generator`."""

@@ -15,6 +15,7 @@ from rgbt.build import contracts
 from rgbt.checks import described
 from rgbt.data.mfnet import MFNet
 from rgbt.maskers.contract import check_masker
+from rgbt.requirements import Record, record_of
 from rgbt.types import MaskPair, Output, Phase, Sample
 from tests.conftest import WriteMFNet
 from tests.data.folder_files import refused
@@ -108,7 +109,6 @@ def test_samples_of_a_data_set(changes: dict[str, Any], sentence: str) -> None:
 
 
 class Halves:
-    hides_nothing = False
     found: Any = MaskPair(torch.zeros(1, 4, 5).bool(), torch.zeros(1, 4, 5).bool())
 
     def __call__(self, image_hw, centre_yx, generator):
@@ -151,12 +151,6 @@ def test_masks(changes: dict[str, Any], sentence: str) -> None:
     assert sentence in refused(lambda: drawn(masker(**changes)))
 
 
-def test_a_masker_without_hides_nothing() -> None:
-    assert "masker: SimpleNamespace has no attribute `hides_nothing`; docs/extending.md has" in (
-        refused(lambda: drawn(SimpleNamespace()))
-    )
-
-
 class Net(nn.Module):
     def __init__(self, found: Any) -> None:
         super().__init__()
@@ -187,8 +181,19 @@ def test_what_a_network_returns(found: Any, sentence: str) -> None:
     assert sentence in refused(lambda: net(RGB, RGB[:, :1]))
 
 
+def test_auxiliary_in_the_record_requires_auxiliary_scores() -> None:
+    net = Net(Output(torch.zeros(2, 5, *HW), {}))
+    net.record = Record(auxiliary=True)
+    contracts.watch_model(net, 5)
+    assert "aux without `aux_logits`" in refused(lambda: net(RGB, RGB[:, :1]))
+
+
 def test_a_network_is_looked_at_once_in_training_and_once_in_evaluation() -> None:
     net = Net(Output(None, {"masks": RGB}))
+    contracts.watch_model(net, 5)
+    assert "returned logits None; expected" in refused(lambda: net(RGB, RGB[:, :1]))
+    net = Net(Output(None, {"masks": RGB}))
+    net.record = Record(outputs="masks")
     contracts.watch_model(net, 5)
     net(RGB, RGB[:, :1])
     assert "returned logits None; expected" in refused(lambda: net.eval()(RGB, RGB[:, :1]))
@@ -231,14 +236,14 @@ def test_what_a_loss_returns(found: Any, sentence: str) -> None:
 
 def test_a_loss_passes_its_attributes_on() -> None:
     class Loss:
-        reads = "scores"
+        record = Record(weighs_confidence=True)
 
         def __call__(self, output, batch, generator):
             return {"a": VALUE[None]}
 
     loss = contracts.CheckedLoss(Loss())
-    assert loss.reads == "scores"
-    assert not hasattr(loss, "reads_warped")
+    assert record_of(loss).weighs_confidence
+    assert record_of(contracts.CheckedLoss(lambda output, batch, generator: {})) == Record()
     assert loss(None, None, None)["a"].shape == (1,)
     assert "loss: list has no method __call__(output, batch, generator)" in refused(
         lambda: contracts.CheckedLoss([])

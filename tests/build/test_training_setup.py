@@ -22,6 +22,7 @@ from rgbt.data.pseudo_labels import FORMAT
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, Teacher, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
+from rgbt.requirements import Record
 from rgbt.spec.specify import specify
 from rgbt.training import pipeline as earlier
 from rgbt.types import Batch
@@ -180,21 +181,21 @@ def test_predicted_labels_of_other_files(
 BEFORE_TRAINING = {
     "a view of another network": (
         ["multi_head_night_stage1", "domains.target.teacher_view=rgb"],
-        "domains.target.teacher_view=rgb, but the network of thermal_teacher predicts from thermal",
+        "requires views=rgb of the network of domains.target.labels, PSPNet provides views=thermal",
     ),
     "a confidence that masks do not read": (
         [
             *("multi_head_night_stage1", "domains.target.confidence=true"),
             *("model=mask2former_tiny", "loss=set_criterion"),
         ],
-        "domains.target.confidence=true, but SetCriterion does not weigh pixels by it",
+        "requires outputs=scores of the model, Mask2Former provides outputs=masks",
     ),
     "a confidence that two frames do not read": (
         [
             *("multi_head_night_stage1", "domains.target.confidence=true"),
             *("loss=temporal_paper", "loss@loss.segmentation=cross_entropy"),
         ],
-        "domains.target.confidence=true, but TemporalLoss does not weigh pixels by it",
+        "TemporalLoss requires frames=2 of the scheme",
     ),
 }
 
@@ -273,36 +274,19 @@ def test_all_that_is_read_is_decoded_before_the_first_step(
     assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
 
 
-def place_of(asked: str, device: str, transform: object, **settings: object) -> str:
+def where(requested: str, device: str, transform: object) -> str:
     session: Any = SimpleNamespace(
-        loading=SimpleNamespace(augment=asked),
+        loading=SimpleNamespace(augment=requested),
         transform=transform,
         fabric=SimpleNamespace(device=torch.device(device)),
-        config=SimpleNamespace(transform=settings),
     )
     return _where_to_augment(session)
 
 
 def test_where_batches_are_augmented() -> None:
-    able, unable = SimpleNamespace(works_on_batches=True), SimpleNamespace(works_on_batches=False)
-    for device, where in (("cpu", "loader"), ("cuda", "device")):
-        assert place_of("auto", device, able) == where
-        assert place_of("auto", device, unable) == "loader"
-        assert place_of("auto", device, object()) == "loader"
-        assert place_of("device", device, able) == "device", "as asked"
-        assert place_of("loader", device, able) == "loader"
-        assert place_of("loader", device, unable) == "loader"
-
-
-def test_a_transform_of_single_images_is_refused_on_the_device() -> None:
-    """With the key that helps: the one value that differs, or another transform."""
-    unable = SimpleNamespace(works_on_batches=False)
-    for settings, key in (
-        ({"colour": "released"}, "transform.colour=intended"),
-        ({}, "transform=crm"),
-    ):
-        sentence = rf"^data\.augment=device, but SimpleNamespace works on .*; choose {key}, or "
-        with pytest.raises(InputError, match=sentence):
-            place_of("device", "cuda", unable, **settings)
-    with pytest.raises(InputError, match="but object works on single images"):
-        place_of("device", "cpu", object())
+    able = SimpleNamespace(record=Record(works_on_batches=True))
+    for device, expected in (("cpu", "loader"), ("cuda", "device")):
+        assert where("auto", device, able) == expected
+        assert where("auto", device, object()) == "loader"
+        assert where("device", device, able) == "device", "as requested"
+        assert where("loader", device, able) == "loader"

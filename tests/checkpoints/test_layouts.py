@@ -317,9 +317,7 @@ def test_resnets_fill_both_encoders_of_rtfnet(tmp_path: Path, layers: int) -> No
 
 
 def rtfnet(thermal_stem: str) -> nn.Module:
-    model = network("rtfnet_18", base_width=4, thermal_stem=thermal_stem)
-    model.thermal_stem = thermal_stem
-    return model
+    return network("rtfnet_18", base_width=4, thermal_stem=thermal_stem)
 
 
 def test_the_thermal_stem_of_rtfnet_is_the_mean_or_drawn_anew(tmp_path: Path) -> None:

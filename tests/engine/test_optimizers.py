@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from rgbt.config.component import build
 from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
 from rgbt.models.critic import Critic
+from rgbt.requirements import Record
 from tests.models.golden import compose, network
 
 ADAMW: dict[str, Any] = {
@@ -32,7 +33,7 @@ BUILDERS = (
 class TwoHeads(nn.Module):
     """A backbone and two heads."""
 
-    pretrained_parts = ("backbone.",)
+    record = Record(pretrained_parts=("backbone.",))
 
     def __init__(self) -> None:
         super().__init__()

@@ -18,6 +18,7 @@ from rgbt.engine.schedules import Exponential, Poly
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
+from rgbt.requirements import Record
 from rgbt.types import Batch, GeneratorOf, Phase
 
 SETTINGS = {
@@ -194,7 +195,7 @@ def test_schedule_values() -> None:
 def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings() -> None:
     model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
     model["query"] = nn.Embedding(3, 2)
-    model.pretrained_parts = ("backbone.",)
+    model.record = Record(pretrained_parts=("backbone.",))
     builder = AdamW(
         lr=1.0,
         backbone_multiplier=0.1,
@@ -226,7 +227,7 @@ def test_biases_are_left_undecayed_where_asked() -> None:
 
 def test_sgd_steps_as_written_and_decays_everything() -> None:
     model = nn.ModuleDict({"backbone": nn.Linear(1, 1), "norm": nn.BatchNorm1d(1)})
-    model.pretrained_parts = ("backbone.",)
+    model.record = Record(pretrained_parts=("backbone.",))
     for parameter in model.parameters():
         nn.init.constant_(parameter, 2.0)
         parameter.grad = torch.ones_like(parameter)

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.losses.auxiliary import WithAuxiliary
 from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.requirements import Requirement
 from rgbt.types import Output
 from tests.models.golden import compose
 
@@ -48,14 +48,17 @@ def test_both_heads_get_a_gradient(make_batch: Any) -> None:
     assert main.grad.abs().sum() > 0
 
 
-def test_it_says_what_it_reads() -> None:
-    assert with_auxiliary().reads == "scores"
+def test_record_requires_scores_of_both_heads() -> None:
+    assert with_auxiliary().record.requires == (
+        Requirement("model", "outputs", "scores"),
+        Requirement("model", "auxiliary", True),
+    )
 
 
-def test_it_reads_confidence_where_its_loss_does(make_batch: Any) -> None:
-    assert with_auxiliary().reads_confidence is True
-    assert WithAuxiliary(loss=lambda *_: {}, weight=0.1).reads_confidence is False
-    assert build(compose("loss=cross_entropy_auxiliary").loss).reads_confidence is True
+def test_record_weighs_confidence_where_its_loss_does(make_batch: Any) -> None:
+    assert with_auxiliary().record.weighs_confidence is True
+    assert WithAuxiliary(loss=lambda *_: {}, weight=0.1).record.weighs_confidence is False
+    assert build(compose("loss=cross_entropy_auxiliary").loss).record.weighs_confidence is True
     # And weighs by it, in both: a half of log 2.
     label = torch.zeros(1, 1, 1, dtype=torch.long)
     batch = replace(make_batch(label), confidence=torch.full((1, 1, 1), 0.5))
@@ -63,12 +66,6 @@ def test_it_reads_confidence_where_its_loss_does(make_batch: Any) -> None:
     parts = with_auxiliary()(Output(scores, {"aux_logits": scores}), batch, NOTHING)
     assert parts["cross_entropy"].item() == pytest.approx(math.log(2) / 2)
     assert parts["cross_entropy_aux"].item() == pytest.approx(0.1 * math.log(2) / 2)
-
-
-def test_raises(make_batch: Any) -> None:
-    batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
-    with pytest.raises(InputError, match="choose a DeepLab v2 with model.auxiliary=true"):
-        with_auxiliary()(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
 
 
 def test_configuration() -> None:

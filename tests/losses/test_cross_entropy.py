@@ -49,8 +49,6 @@ def test_nothing_labelled_costs_nothing(make_batch: Any) -> None:
 def test_raises(make_batch: Any) -> None:
     batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long))
     plain = CrossEntropy(class_weights=None)
-    with pytest.raises(InputError, match="set_criterion"):
-        plain(Output(None, {}), batch, NOTHING)
     with pytest.raises(ValueError, match="label"):
         plain(Output(torch.zeros(1, 3, 4, 4), {}), batch, NOTHING)
     with pytest.raises(InputError, match="2 numbers"):

@@ -20,6 +20,7 @@ from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.dice import dice
 from rgbt.losses.temporal import TemporalLoss
+from rgbt.requirements import Record, Requirement
 from rgbt.types import Frame, Output
 from tests.models.golden import FOLDER, compose, requires_golden
 
@@ -69,9 +70,9 @@ TABLE_1 = {  # Temporal, Table I: alpha, beta, second -> parts beside the two cr
 def test_the_variants_of_table_1(variant: str, frames: Any) -> None:
     alpha, beta, second, names = TABLE_1[variant]
     loss = loss_of(alpha=alpha, beta=beta, second=second)
-    assert loss.reads_warped == (second in ("con", "con_acc"))
+    assert loss.record.reads_warped == (second in ("con", "con_acc"))
     first, other, warped, valid = frames
-    parts = loss(first, other, warped if loss.reads_warped else None, valid, NOTHING)
+    parts = loss(first, other, warped if loss.record.reads_warped else None, valid, NOTHING)
     assert list(parts) == ["cross_entropy_1", "cross_entropy_2", *names]
     for part in parts.values():
         assert part.shape == ()
@@ -139,7 +140,7 @@ def test_masks_of_queries(make_problem: Any, make_criterion: Any) -> None:
         frames.append(Frame(output, batch, logits))
     valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
     loss = loss_of(segmentation=criterion)
-    assert loss.reads == "masks"
+    assert Requirement("model", "outputs", "masks") in loss.record.requires
     warped = frames[0].logits.softmax(1)
     parts = loss(*frames, warped, valid, torch.Generator().manual_seed(5))
     # The set criterion has a dice of its own.
@@ -156,7 +157,7 @@ def test_passes_are_summed(frames: Any) -> None:
         return {"some": torch.tensor([1.0, 2.0])}
 
     loss = loss_of(segmentation=two_passes, alpha=0.0, beta=0.0, second="none")
-    assert loss.reads is None
+    assert loss.record.requires == (Requirement("scheme", "frames", 2),)
     first, second, _, valid = frames
     parts = loss(first, second, None, valid, NOTHING)
     assert parts == {"some_1": torch.tensor(3.0), "some_2": torch.tensor(3.0)}
@@ -193,10 +194,13 @@ def built(*overrides: str) -> TemporalLoss:
 @pytest.mark.parametrize("form", ["paper", "released"])
 def test_the_files_build(form: str) -> None:
     loss = built(f"loss=temporal_{form}")
-    found = (loss.alpha, loss.beta, loss.second, loss.form, loss.reads, loss.reads_warped)
-    assert found == (1.0, 1.0, "con", form, "scores", True)
+    assert (loss.alpha, loss.beta, loss.second, loss.form) == (1.0, 1.0, "con", form)
+    assert loss.record.reads_warped
+    assert Requirement("model", "outputs", "scores") in loss.record.requires
+    assert Requirement("scheme", "frames", 2) in loss.record.requires
     loss = built(f"loss=temporal_{form}", "loss.alpha=0.5", "loss.beta=0", "loss.second=none")
-    assert (loss.alpha, loss.beta, loss.second, loss.reads_warped) == (0.5, 0, "none", False)
+    assert (loss.alpha, loss.beta, loss.second) == (0.5, 0, "none")
+    assert not loss.record.reads_warped
 
 
 @pytest.mark.parametrize("criterion", ["set_criterion", "set_criterion_spatial"])
@@ -204,7 +208,9 @@ def test_the_files_build(form: str) -> None:
 def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> None:
     config = compose(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
     loss = built(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
-    assert loss.reads == build(config.model).predicts == "masks"
+    (required,) = [each for each in loss.record.requires if each.key == "outputs"]
+    assert required.is_met_by(build(config.model).record)
+    assert not required.is_met_by(Record(outputs="scores"))
     assert config.loss.segmentation == compose(f"loss={criterion}").loss
 
 

@@ -106,7 +106,7 @@ def test_backbone_has_the_names_of_torchvision() -> None:
         expected |= {f"{name}.bn{k}.{part}" for name in at for k in (1, 2, 3) for part in norm}
         expected |= {f"{at[0]}.downsample.0.weight"}
         expected |= {f"{at[0]}.downsample.1.{part}" for part in norm}
-    assert net.pretrained_parts == ("backbone.",)
+    assert net.record.pretrained_parts == ("backbone.",)
     names = set(net.state_dict())
     assert {f"backbone.{name}" for name in expected} == {n for n in names if "heads." not in n}
     parts = {f"{index}.{part}" for index in range(4) for part in ("weight", "bias")}
@@ -207,7 +207,7 @@ def test_against_a_second_computation(
 
 def test_heads_and_views() -> None:
     net, pair = nano().eval(), images(1, 32, 32)
-    assert net.views == ("rgb", "thermal")
+    assert net.record.views == ("rgb", "thermal")
     with torch.no_grad():
         first = net(*pair).logits
         assert torch.equal(first, net(*pair, views=("rgb",), head="source").logits)

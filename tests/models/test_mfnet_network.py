@@ -240,5 +240,5 @@ def test_released_parameter_count_and_names() -> None:
 def test_tiny_stays_tiny_and_nothing_is_pretrained() -> None:
     net = network("mfnet_tiny")
     assert sum(p.numel() for p in net.parameters()) < 2e5
-    assert net.views == ("rgbt",)
-    assert net.pretrained_parts == ()
+    assert net.record.views == ("rgbt",)
+    assert net.record.pretrained_parts == ()

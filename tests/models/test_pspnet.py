@@ -84,7 +84,7 @@ def test_sizes_of_the_release() -> None:
 
 
 def test_one_view() -> None:
-    assert [nano(modalities=name).views for name in ALL] == [
+    assert [nano(modalities=name).record.views for name in ALL] == [
         ("rgbt",),
         ("rgbt",),
         ("rgb",),
@@ -218,4 +218,4 @@ def test_pretrained_part_is_the_encoder() -> None:
     net = nano()
     names = {name.split(".")[0] for name, _ in net.named_parameters()}
     assert names == {"feats", "psp", "up_1", "up_2", "up_3", "final"}
-    assert net.pretrained_parts == ("feats.",)
+    assert net.record.pretrained_parts == ("feats.",)

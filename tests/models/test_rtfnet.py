@@ -312,8 +312,8 @@ def test_state_dict_names() -> None:
 def test_tiny_stays_tiny_and_has_a_pretrained_part() -> None:
     net = network("rtfnet_tiny")
     assert count(net) < 2e6
-    assert net.views == ("rgbt",)
-    covered = {n for n, _ in net.named_parameters() if n.startswith(net.pretrained_parts)}
+    assert net.record.views == ("rgbt",)
+    covered = {n for n, _ in net.named_parameters() if n.startswith(net.record.pretrained_parts)}
     others = {n for n, _ in net.named_parameters()} - covered
     assert covered
     assert all(name.startswith("deconv") for name in others)

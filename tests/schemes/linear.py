@@ -20,6 +20,7 @@ from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
+from rgbt.requirements import Record, record_of
 from rgbt.types import Batch, Output, View
 
 K = 3
@@ -29,11 +30,6 @@ Values = dict[str, Tensor]
 
 class Linear(nn.Module):
     """Scores of a pixel: head @ backbone @ its RGB (or thermal, three times); "mixed" adds both."""
-
-    num_classes = K
-    views = ("rgbt", "rgb", "thermal")
-    predicts = "scores"
-    pretrained_parts = ()
 
     def __init__(self, heads: tuple[str, ...], *, auxiliary: bool = False) -> None:
         super().__init__()
@@ -70,11 +66,7 @@ def cross_entropy(output: Output, batch: Batch, generator: torch.Generator) -> V
 
 
 class Nothing:
-    hides_nothing = True
-
-
-class Something:
-    hides_nothing = False
+    record = Record(hides_cells=False)
 
 
 def domains(heads: bool, **target: Any) -> Domains:
@@ -116,9 +108,11 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     """The real loop with SGD for every optimiser that the scheme names."""
     fabric = Fabric(accelerator="cpu", devices=1)
     builder = SGD(lr=LR, backbone_multiplier=1.0, momentum=MOMENTUM, weight_decay=0.0)
-    built = {name: builder(model, without=parts) for name, parts in scheme.optimizers.items()}
-    others: dict[str, nn.Module] = getattr(scheme, "others", {})
-    built |= {name: scheme.builders[name](module) for name, module in others.items()}
+    built = {
+        name: builder(model, without=parts) for name, parts in record_of(scheme).optimizers.items()
+    }
+    others = record_of(scheme).networks
+    built |= {name: record_of(scheme).builders[name](module) for name, module in others.items()}
     settings: dict[str, Any] = {
         **{"max_steps": steps, "eval_every": 1000, "checkpoint_every": 1000, "log_every": 1},
         **{"accumulate": 1, "clip_norm": None, "precision": "32-true", "accelerator": "cpu"},

@@ -16,9 +16,8 @@ from rgbt.checks import InputError
 from rgbt.data.pairs import LoadedPair
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
-from rgbt.losses.adversarial import cross_entropy as verdict_entropy
-from rgbt.losses.adversarial import judged, least_squares
 from rgbt.models.critic import Critic
+from rgbt.requirements import record_of
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.types import TwoDomains
 from tests.schemes.linear import (
@@ -28,8 +27,6 @@ from tests.schemes.linear import (
     K,
     Linear,
     Momentum,
-    Nothing,
-    Something,
     Values,
     assert_same,
     cross_entropy,
@@ -82,14 +79,11 @@ def scheme_of(model: nn.Module, heads: bool = False, **changes: Any) -> Adversar
     confidence = settings["weighed_by_confidence"]
     given: dict[str, Any] = {
         "loss": cross_entropy,
-        "masker": Nothing(),
         "domains": domains(heads, labels=labels, confidence=confidence),
         "critic": critic(),
         "critic_optimizer": SGD(
             lr=LR, backbone_multiplier=1.0, momentum=MOMENTUM, weight_decay=0.0
         ),
-        "judged_map": judged,
-        "verdict_losses": {"least_squares": least_squares, "cross_entropy": verdict_entropy},
     }
     return Adversarial(model=model, **{**given, **settings})
 
@@ -413,35 +407,12 @@ def test_the_step_after_a_critics_step_that_broke_off_is_whole() -> None:
 
 NETWORK = network(False)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "one domain": ({"domains": replace(domains(False), target=None)}, "but there is one"),
-    "masker": ({"masker": Something()}, "shows whole images"),
     "verdict loss": ({"verdict_loss": "least_square"}, "did you mean 'least_squares'"),
     "no probability": (
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
         r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
     ),
     "equal values": ({"target_value": 0.0}, "are both 0, so that the critic has nothing"),
-    "labels not read": (
-        {"domains": domains(False)},
-        "labels=given, but the scheme does not read labels",
-    ),
-    "labels missing": (
-        {"supervise_target": True, "domains": domains(False, labels="none")},
-        "labels=none, but the scheme reads labels of the target domain",
-    ),
-    "no confidence": (
-        {
-            **HEATNET,
-            "domains": domains(False, labels="/folder"),
-        },
-        "which are read without; set domains.target.confidence=true",
-    ),
-    "gradients of one head": ({"gradients": "kept"}, "scheme.gradients=kept is about"),
-    "critic of more classes": (
-        {"critic": Critic(in_channels=4, base_width=4, upsample=False, align_corners=False)},
-        "scheme.critic.in_channels=4, but the critic sees a map for each of the network's 3 ",
-    ),
-    "critic of fewer classes": ({"critic": nn.Conv2d(2, 1, 1)}, "scheme.critic.in_channels=2"),
 }
 
 
@@ -451,9 +422,26 @@ def test_what_does_not_fit_is_refused(changes: dict[str, Any], sentence: str) ->
         scheme_of(NETWORK, **changes)
 
 
-def test_a_critic_of_the_networks_classes_is_taken() -> None:
+def required(**changes: Any) -> dict[tuple[str, str], Any]:
+    record = record_of(scheme_of(NETWORK, **changes))
+    return {(each.node, each.key): each.value for each in record.requires}
+
+
+def test_a_critic_requires_the_classes_that_it_was_built_for() -> None:
     judge = Critic(in_channels=K, base_width=4, upsample=False, align_corners=False)
-    assert scheme_of(NETWORK, critic=judge).others["critic"] is judge
+    record = record_of(scheme_of(NETWORK, critic=judge))
+    assert record.networks["critic"] is judge
+    assert required(critic=judge)[("dataset", "num_classes")] == K
+
+
+def test_labels_and_confidence_are_required_where_they_are_read() -> None:
+    found = required()
+    assert found[("domains", "target_labels")] is False
+    assert ("domains", "target_confidence") not in found
+    found = required(**HEATNET)
+    assert found[("domains", "target_labels")] is True
+    assert found[("domains", "target_confidence")] is True
+    assert found[("model", "outputs")] == "scores"
 
 
 def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
@@ -474,13 +462,6 @@ def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
     judging = scheme_of(network(True), True, **HEATNET)  # the critic's step
     list(judging.phases(next(pairs(confidence=True)).to("cpu"), noting))
     assert asked == ["source network", "target network"]
-
-
-def test_masks_of_queries_are_refused() -> None:
-    model = network(False)
-    model.predicts = "masks"
-    with pytest.raises(InputError, match="returns masks of queries in training"):
-        scheme_of(model)
 
 
 def test_another_map_is_refused_when_it_is_judged() -> None:

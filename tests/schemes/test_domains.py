@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
-from rgbt.losses.guidance import guidance
 from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.requirements import record_of
 from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.types import IGNORE
@@ -24,7 +23,6 @@ from tests.schemes.linear import (
     Linear,
     Momentum,
     Nothing,
-    Something,
     Values,
     assert_same,
     cross_entropy,
@@ -50,7 +48,6 @@ def labelled(model: Linear, heads: bool, gradients: str, **target: Any) -> Label
     return LabelledDomains(
         model=model,
         loss=cross_entropy,
-        masker=Nothing(),
         domains=domains(heads, **target),
         gradients=gradients,
     )
@@ -59,12 +56,10 @@ def labelled(model: Linear, heads: bool, gradients: str, **target: Any) -> Label
 def unlabelled(model: Linear, heads: bool = False, **changes: Any) -> UnlabelledTarget:
     given: dict[str, Any] = {
         "loss": cross_entropy,
-        "masker": Nothing(),
         "domains": domains(heads, labels="none"),
         "unlabelled": MaxSquares(weight=0.7, normalisation="entries", image_wise_ratio=None),
         "guidance_weight": 0.0,
         "guidance_threshold": 0.5,
-        "guide": guidance,
     }
     return UnlabelledTarget(model=model, **{**given, **changes})
 
@@ -191,9 +186,7 @@ def test_the_network_draws_from_the_generator_of_its_pass() -> None:
         return cross_entropy(output, batch, torch.Generator())
 
     model = Drawing(("day", "dark"))
-    scheme = LabelledDomains(
-        model=model, loss=loss, masker=Nothing(), domains=domains(True), gradients="apart"
-    )
+    scheme = LabelledDomains(model=model, loss=loss, domains=domains(True), gradients="apart")
     pair = next(pairs()).to("cpu")
     pair = replace(pair, target=replace(pair.target, name=("t", "u")))
     list(scheme.phases(pair, generator_of))
@@ -286,67 +279,45 @@ def test_guidance_of_nothing_sure_costs_nothing() -> None:
     assert model.auxiliary.weight.grad.abs().sum() == 0
 
 
-# ---- what does not fit ----------------------------------------------------------------------
+# ---- what is required -----------------------------------------------------------------------
+
+
+def required(scheme: object) -> dict[tuple[str, str], Any]:
+    return {(each.node, each.key): each.value for each in record_of(scheme).requires}
+
+
+TWO_DOMAINS = {
+    ("model", "outputs"): "scores",
+    ("masker", "hides_cells"): False,
+    ("domains", "num_domains"): 2,
+}
+
+
+def test_two_domains_require_scores_whole_images_and_a_target() -> None:
+    assert required(labelled(network(False), False, "apart")) == {
+        **TWO_DOMAINS,
+        ("domains", "target_labels"): True,
+    }
+    assert required(unlabelled(network(False))) == {
+        **TWO_DOMAINS,
+        ("domains", "target_labels"): False,
+    }
+    record = record_of(labelled(network(True), True, "apart"))
+    assert (record.num_domains, record.shows_views) == (2, True)
+    assert set(record.optimizers) == {"source", "target"}
 
 
 @pytest.mark.parametrize("mode", ["kept", "together"])
-def test_gradients_of_one_head_are_refused(mode: str) -> None:
-    with pytest.raises(InputError, match=f"scheme.gradients={mode} is about the optimisers"):
-        labelled(network(False), False, mode)
+def test_gradients_of_two_heads_require_separate_heads(mode: str) -> None:
+    found = required(labelled(network(True), True, mode))
+    assert found[("domains", "separate_heads")] is True
+    assert record_of(domains(True)).separate_heads
+    assert not record_of(domains(False)).separate_heads
 
 
-def test_a_masker_that_hides_is_refused() -> None:
-    for made in (
-        lambda: unlabelled(network(False), masker=Something()),
-        lambda: LabelledDomains(
-            model=network(False),
-            loss=cross_entropy,
-            masker=Something(),
-            domains=domains(False),
-            gradients="apart",
-        ),
-    ):
-        with pytest.raises(InputError, match="shows whole images.*masker=none"):
-            made()
-
-
-def test_labels_that_are_missing_or_not_read_are_refused() -> None:
-    with pytest.raises(InputError, match=r"labels=none, but the scheme reads labels.*max_squares"):
-        labelled(network(False), False, "apart", labels="none")
-    for labels in ("given", "/folder"):
-        with pytest.raises(InputError, match=rf"labels={labels}, but the scheme does not read"):
-            unlabelled(network(False), domains=domains(False, labels=labels))
-
-
-def test_one_domain_is_refused_where_there_must_be_two_and_two_where_one() -> None:
-    alone = replace(domains(False), target=None)
-    with pytest.raises(InputError, match="trains on two domains, but there is one"):
-        unlabelled(network(False), domains=alone)
-    with pytest.raises(InputError, match="trains on two domains, but there is one"):
-        LabelledDomains(
-            model=network(False),
-            loss=cross_entropy,
-            masker=Nothing(),
-            domains=alone,
-            gradients="apart",
-        )
-    with pytest.raises(InputError, match="scheme=supervised trains on one domain"):
-        Supervised(
-            model=network(False), loss=cross_entropy, masker=Nothing(), domains=domains(False)
-        )
-
-
-def test_guidance_without_an_auxiliary_head_is_refused() -> None:
-    with pytest.raises(InputError, match="trains an auxiliary head, which this network does not"):
-        unlabelled(network(False), guidance_weight=0.1)
-
-
-def test_masks_of_queries_are_refused() -> None:
-    model = network(False)
-    model.predicts = "masks"
-    for made in (lambda: labelled(model, False, "apart"), lambda: unlabelled(model)):
-        with pytest.raises(InputError, match="Linear returns masks of queries in training"):
-            made()
+def test_guidance_requires_an_auxiliary_head() -> None:
+    found = required(unlabelled(network(False), guidance_weight=0.1))
+    assert found[("model", "auxiliary")] is True
 
 
 def test_supervised_shows_the_domain_to_its_head() -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.data.domains import Domain, Domains
+from rgbt.requirements import Record, record_of
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import Batch, MaskPair, Output
@@ -40,8 +39,6 @@ def generator_of(purpose: str) -> torch.Generator:
 class Numbered:
     """Pass p predicts class logits that are all p; remembers how it was called."""
 
-    views = ("rgbt", "rgb", "thermal")
-
     def __call__(self, rgb, thermal, masks=None, *, passes=1, views=("rgbt",), generator=None):
         self.call = {"n": len(rgb), "masks": masks, "passes": passes, "views": views}
         count = passes * len(views)
@@ -59,8 +56,6 @@ class OneEach:
 
 
 class Halves:
-    hides_nothing = False
-
     def __call__(self, image_hw, centre_yx: Tensor, generator) -> MaskPair:
         hidden = torch.zeros(len(centre_yx), 2, 2, dtype=torch.bool)
         hidden[:, 0] = True
@@ -68,21 +63,13 @@ class Halves:
 
 
 class Nothing(Halves):
-    hides_nothing = True
-
-
-def sdc(teacher: Tensor, student: Tensor) -> Tensor:
-    return (teacher.detach() - student).abs().mean()
-
-
-def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
-    return sdc(teacher, rgb) + sdc(teacher, thermal)
+    record = Record(hides_cells=False)
 
 
 def scheme(masker: object, **weights: float) -> CRM:
     names = ("modality_weight", "complementary_weight", "nonlocal_weight")
     given = {name: weights.get(name, 1.0) for name in names}
-    return CRM(model=Numbered(), loss=OneEach(), masker=masker, sdc=sdc, sdn=sdn, **given)
+    return CRM(model=Numbered(), loss=OneEach(), masker=masker, **given)
 
 
 def test_full_step_weights_four_supervised_passes_and_two_distillations() -> None:
@@ -123,9 +110,21 @@ def test_single_modalities_are_not_decoded_where_nothing_reads_them() -> None:
     assert phase.parts["sdc"] == 1.0
 
 
-def test_distillation_without_masks_is_refused() -> None:
-    with pytest.raises(InputError, match="the masker hides nothing; choose a masker"):
-        scheme(Nothing())
+def test_distillation_requires_a_masker_that_hides_cells() -> None:
+    required = [each for each in record_of(scheme(Halves())).requires if each.node == "masker"]
+    assert [(each.key, each.value, each.setting) for each in required] == [
+        ("hides_cells", True, "scheme.complementary_weight=1"),
+        ("hides_cells", True, "scheme.nonlocal_weight=1"),
+    ]
+    plain = record_of(scheme(Nothing(), complementary_weight=0.0, nonlocal_weight=0.0))
+    assert [each.node for each in plain.requires] == ["model", "model"]
+
+
+def test_crm_requires_all_views_in_one_pass() -> None:
+    single, stacked = Record(views=("rgbt",)), Record(stacks_passes=True)
+    required = [each for each in record_of(scheme(Halves())).requires if each.node == "model"]
+    assert [each.is_met_by(single) for each in required] == [False, False]
+    assert [each.is_met_by(stacked) for each in required] == [True, True]
 
 
 def test_supervised_sums_the_parts_of_one_pass() -> None:
@@ -139,19 +138,3 @@ def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:
     supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves(), domains=ONE)
     list(supervised.phases(batch(), generator_of))
     assert supervised.model.call["masks"].rgb.shape == (B, 2, 2)
-
-
-def test_crm_is_refused_for_a_network_of_one_view() -> None:
-    single = Numbered()
-    single.views = ("rgbt",)
-    with pytest.raises(InputError, match="scheme=supervised"):
-        CRM(
-            model=single,
-            loss=OneEach(),
-            masker=Halves(),
-            sdc=sdc,
-            sdn=sdn,
-            modality_weight=1.0,
-            complementary_weight=1.0,
-            nonlocal_weight=1.0,
-        )

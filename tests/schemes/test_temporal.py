@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import TemporalLoss
 from rgbt.models.mask2former.model import Mask2Former, semantic_logits
+from rgbt.requirements import Record, record_of
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import Batch, Frame, Output
@@ -64,7 +64,7 @@ class Net(nn.Module):
 class Recorded:
     """A loss of two frames that keeps what it is given."""
 
-    reads_warped = True
+    record = Record(frames=2, reads_warped=True)
 
     def __call__(
         self,
@@ -82,15 +82,7 @@ class Recorded:
 
 
 class Segmentation(Recorded):
-    reads_warped = False
-
-
-class Nothing:
-    hides_nothing = True
-
-
-class Halves:
-    hides_nothing = False
+    record = Record(frames=2)
 
 
 def view(**changes: Any) -> VirtualView:
@@ -105,7 +97,7 @@ def view(**changes: Any) -> VirtualView:
 
 def scheme(model: Any, **changes: Any) -> Temporal:
     settings: dict[str, Any] = {
-        **{"loss": Recorded(), "masker": Nothing(), "view": view()},
+        **{"loss": Recorded(), "view": view()},
         **{"warps": "probabilities", "detach": False},
     }
     return Temporal(model=model, **{**settings, **changes})
@@ -359,24 +351,26 @@ def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
     assert masks.grad.isfinite().all()
 
 
-# ---- what is refused ------------------------------------------------------------------------
+# ---- what is required -----------------------------------------------------------------------
 
 
-def test_a_loss_of_single_frames_is_refused() -> None:
-    with pytest.raises(InputError, match="CrossEntropy is a loss of single ones; choose loss="):
-        scheme(Net(nn.Identity()), loss=CrossEntropy(class_weights=None))
+def test_temporal_requires_two_frames_and_whole_images() -> None:
+    record = record_of(scheme(Net(nn.Identity())))
+    assert [(each.node, each.key, each.value) for each in record.requires] == [
+        ("loss", "frames", 2),
+        ("masker", "hides_cells", False),
+    ]
+    assert record.frames == 2
+    assert record.camera == view().camera
 
 
-def test_a_masker_that_hides_something_is_refused() -> None:
-    with pytest.raises(InputError, match="the masker hides cells; choose masker=none"):
-        scheme(Net(nn.Identity()), masker=Halves())
-
-
-def test_masks_without_class_scores_are_refused() -> None:
+def test_temporal_with_masks_requires_dense_logits() -> None:
     net = Net(nn.Identity())
-    net.predicts = "masks"
-    with pytest.raises(InputError, match="Net predicts masks of queries and has no `dense_logits`"):
-        scheme(net)
+    net.record = Record(outputs="masks")
+    required = record_of(scheme(net)).requires[-1]
+    assert (required.node, required.key) == ("model", "dense_logits")
+    assert not required.is_met_by(net.record)
+    assert required.is_met_by(nano().record)
 
 
 def test_the_loss_of_the_papers_goes_through_the_scheme() -> None:

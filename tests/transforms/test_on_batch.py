@@ -133,8 +133,8 @@ def test_a_gpu_gives_the_same_bits() -> None:
 
 
 def test_released_colours_stay_with_single_images() -> None:
-    assert transform().works_on_batches
-    assert not transform(colour="released").works_on_batches
+    assert transform().record.works_on_batches
+    assert not transform(colour="released").record.works_on_batches
 
 
 def test_refuses_crops_of_different_size() -> None:

@@ -8,6 +8,7 @@ from torch import nn
 
 from rgbt.checkpoints.layout import NOT_IN_FILE, Facts, Rule, count_blocks, shapes_of
 from rgbt.checkpoints.read import Contents
+from rgbt.requirements import record_of
 
 DEPTHS: dict[tuple[bool, tuple[int, ...]], int] = {
     (False, (2, 2, 2, 2)): 18,
@@ -73,11 +74,13 @@ def _rtfnet(model: nn.Module) -> Rule:
     Released: the thermal stem is the mean of the RGB stem. Paper (model.thermal_stem=xavier): it is
     drawn anew, like the decoder.
     """
-    drawn = getattr(model, "thermal_stem", "rgb_mean") == "xavier"
-    stem = (r"encoder_thermal_conv1\.", "drawn anew with model.thermal_stem=xavier")
+    anew = record_of(model).drawn_anew
     return Rule(
         source=lambda entry: re.sub(r"^encoder_(rgb|thermal)_", "", entry),
-        fresh=((r"deconv\d\.", NOT_IN_FILE), *((stem,) if drawn else ())),
+        fresh=(
+            (r"deconv\d\.", NOT_IN_FILE),
+            *((re.escape(part), why) for part, why in anew.items()),
+        ),
         leftover=(CLASSIFIER,),
         stems=("encoder_thermal_conv1.weight",),
     )

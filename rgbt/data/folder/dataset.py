@@ -41,6 +41,7 @@ from rgbt.data.named_files import (
 )
 from rgbt.data.report.folder import FolderChecks
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
+from rgbt.requirements import Record
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
@@ -134,6 +135,11 @@ class Folder:
         if set(self.splits) - set(unlabelled):
             self._check_labels()
             self._check_night()
+
+    @property
+    def record(self) -> Record:
+        """The number of its classes."""
+        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> dict[str, str]:

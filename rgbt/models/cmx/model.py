@@ -17,7 +17,8 @@ from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_
 from rgbt.models.inputs import Images, Inputs, only_view
 from rgbt.models.stochastic import keep_factors
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
-from rgbt.types import MaskPair, Output, Predicts, View
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
 
 STREAMS = ("", "extra_")
 """Beginnings of the released names: RGB, and the other modality."""
@@ -123,9 +124,7 @@ class CMX(nn.Module):
         inputs: normalisation of the images.
     """
 
-    views: tuple[View, ...] = ("rgbt",)
-    predicts: Predicts = "scores"
-    pretrained_parts: tuple[str, ...] = ("backbone.",)
+    record = Record(views=("rgbt",), pretrained_parts=("backbone.",))
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -202,7 +201,7 @@ class CMX(nn.Module):
                 smaller than the deepest reduction of attention takes.
         """
         images = self.inputs(rgb, thermal, masks, multiple=1)
-        only_view(views, self.views, "CMX")
+        only_view(views, self.record.views, "CMX")
         image_hw = rgb.shape[2], rgb.shape[3]
         if min(image_hw) < self.shortest_side:
             raise InputError(

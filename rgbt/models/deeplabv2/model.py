@@ -16,7 +16,8 @@ from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid, Rates
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.upsampling import DropRates
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
-from rgbt.types import MaskPair, Output, Predicts, View
+from rgbt.requirements import Record, Requirement
+from rgbt.types import MaskPair, Output, View
 
 STRIDE = 8
 """Of the backbone; the modified decoders double the size three times."""
@@ -54,10 +55,6 @@ class DeepLabV2(nn.Module):
     Raises:
         InputError: values that do not fit each other.
     """
-
-    views: tuple[View, ...] = ("rgb", "thermal")
-    predicts: Predicts = "scores"
-    pretrained_parts: tuple[str, ...] = ("backbone.",)
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -100,6 +97,18 @@ class DeepLabV2(nn.Module):
                 nn.init.normal_(module.weight, 0.0, 0.01)
         self.inputs = inputs
 
+    @property
+    def record(self) -> Record:
+        """What it returns, what it predicts from; of several heads, the domains train each."""
+        heads = tuple(self.heads)
+        return Record(
+            requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
+            views=("rgb", "thermal"),
+            heads=heads,
+            auxiliary=self.auxiliary is not None,
+            pretrained_parts=("backbone.",),
+        )
+
     def forward(  # noqa: PLR0913 - what every network takes, and the head
         self,
         rgb: Tensor,
@@ -128,7 +137,7 @@ class DeepLabV2(nn.Module):
             ValueError: shapes that do not fit; no generator where one is needed.
             InputError: another view or head; mask cells that do not divide the padded image.
         """
-        view = only_view(views, self.views, "DeepLabV2")
+        view = only_view(views, self.record.views, "DeepLabV2")
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
         images = self.inputs(rgb, thermal, masks, multiple=self.multiple)

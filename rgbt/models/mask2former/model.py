@@ -17,7 +17,8 @@ from rgbt.models.mask2former.decoder import Predictions, Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
-from rgbt.types import VIEWS, MaskPair, Output, Predicts, View
+from rgbt.requirements import Record
+from rgbt.types import VIEWS, MaskPair, Output, View
 
 FAINTEST = 1e-6
 """Smallest semantic score whose logarithm is taken."""
@@ -64,12 +65,13 @@ class Mask2Former(nn.Module):
         inputs: normalisation of the images.
     """
 
-    views: tuple[View, ...] = VIEWS
-    predicts: Predicts = "masks"
-    stacks_passes = True
-    """`forward` takes several passes of a batch at once and treats each as a call of its own."""
-
-    pretrained_parts: tuple[str, ...] = ("backbone.",)
+    record = Record(
+        outputs="masks",
+        views=VIEWS,
+        stacks_passes=True,
+        dense_logits=True,
+        pretrained_parts=("backbone.",),
+    )
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -160,7 +162,7 @@ class Mask2Former(nn.Module):
             ValueError: shapes, passes or views that do not fit; no generator where one is needed.
             InputError: mask cells that do not divide the padded image.
         """
-        views = views or self.views[:1]
+        views = views or VIEWS[:1]
         _check_passes(len(rgb), passes, views)
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 needs `generator`, got None.")

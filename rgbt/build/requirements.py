@@ -1,0 +1,126 @@
+"""The components of a run are compared by their records (`rgbt.requirements`), before it starts."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+
+from rgbt.checks import InputError
+from rgbt.config.choices import choices
+from rgbt.config.component import Component
+from rgbt.config.targets import constructor
+from rgbt.requirements import Record, Requirement, record_of
+
+MOST_CHOICES = 6
+"""Names that a message lists of one group."""
+
+
+class Failure(NamedTuple):
+    """A requirement that is not met: the key of the component that has it, and what it is."""
+
+    node: str
+    requirement: Requirement
+
+
+def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
+    """Refuse components of which one lacks what another one requires.
+
+    Args:
+        components: by their keys in the configuration ("model", "loss"), in the order in which
+            their requirements are looked at.
+        plain: the whole configuration as resolved values, for the files that could be chosen.
+
+    Raises:
+        InputError: the first requirement that is not met, with the files of ``conf/`` that help.
+    """
+    records = {node: record_of(component) for node, component in components.items()}
+    failures = list(_failures(records))
+    if failures:
+        raise InputError(_sentence(failures, records, components, plain))
+
+
+def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
+    for node, record in records.items():
+        for requirement in record.requires:
+            other = records.get(requirement.node)
+            if other is not None and not requirement.is_met_by(other):
+                yield Failure(node, requirement)
+
+
+def _sentence(
+    failures: list[Failure],
+    records: Mapping[str, Record],
+    components: Mapping[str, Any],
+    plain: Mapping[str, Any],
+) -> str:
+    node, wanted = failures[0]
+    both = {key: records[key] for key in (node, wanted.node)}
+    options = _options(failures, records, components, plain)
+    # Where no single file helps with everything, those that help with this.
+    options = options or _options(failures[:1], both, components, plain)
+    advice = [f"choose {', or '.join(options)}"] if options else []
+    advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
+    subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
+    provided = records[wanted.node].get(wanted.key)
+    return (
+        f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, "
+        f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
+        f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
+    )
+
+
+def _options(
+    failures: list[Failure],
+    records: Mapping[str, Record],
+    components: Mapping[str, Any],
+    plain: Mapping[str, Any],
+) -> list[str]:
+    """Files of either group with which the first failure is gone and no other one is new."""
+    remaining = set(failures[1:])
+
+    def helps(group: str, node: DictConfig) -> bool:
+        record = _record_of_file(node, group, components)
+        return record is not None and remaining.issuperset(_failures({**records, group: record}))
+
+    options = []
+    for group in (failures[0].requirement.node, failures[0].node):
+        # A data set is no choice: to build one may write its images.
+        files = choices(plain, group) if group in plain and group != "dataset" else ()
+        found = (name for name, node in files if helps(group, node))
+        names = list(islice(found, MOST_CHOICES + 1))
+        listed = ", ".join(names[:MOST_CHOICES]) + (", ..." if names[MOST_CHOICES:] else "")
+        options += [f"{group}={listed}"] if names else []
+    return options
+
+
+def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any]) -> Record | None:
+    """The record of what a node describes; None where that cannot be built here."""
+    try:
+        target = constructor(node["_target_"], group)
+        declared = inspect.getattr_static(target, "record", None)
+        if isinstance(declared, Record):
+            return declared
+        described = Component.from_node(node)
+        others = {key: each for key, each in components.items() if key not in described.values}
+        # A network takes no memory there; a view is checked by numbers that it has elsewhere alone.
+        with torch.device("meta" if group == "model" else "cpu"):
+            return record_of(described.build(**others))
+    except Exception:  # noqa: BLE001 - a file may miss values, or be a user's: it is no choice
+        return None
+
+
+def _name(component: Any) -> str:
+    is_callable = inspect.isfunction(component) or inspect.isclass(component)
+    return str(component.__name__) if is_callable else type(component).__name__
+
+
+def _shown(value: Any) -> str:
+    """A value as it is written in a configuration."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,0 +1,139 @@
+"""What a component provides to the other components of a run, and what it requires of them.
+
+A component (network, loss, scheme, masker, transform, domains, ...) states both in one `Record`,
+its attribute or property `record`. `rgbt.build.requirements` compares the records of a run before
+anything is trained; whoever needs to know something of a component reads it with `record_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from rgbt.checks import InputError, described
+from rgbt.types import VIEWS, View
+
+Outputs = Literal["scores", "masks"]
+"""What a network returns in training: dense class scores, or masks and classes of queries."""
+
+
+class Camera(Protocol):
+    """What a second frame is drawn with (see `rgbt.geometry.camera.Camera`)."""
+
+    def matrix(self, image_hw: tuple[int, int]) -> Any:
+        """For images of this size; InputError where it is the camera of other images."""
+        ...
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One thing that a component requires of another one.
+
+    Attributes:
+        node: key of the other component in the configuration, such as "model".
+        key: attribute of its `Record`, or a key of `Record.others`.
+        value: that it must have; where the record holds a tuple, values that it must hold.
+        setting: what the requirement follows from, "scheme.guidance_weight=0.01"; "" where the
+            component always has it.
+    """
+
+    node: str
+    key: str
+    value: Any
+    setting: str = ""
+
+    def is_met_by(self, record: Record) -> bool:
+        """Whether a component with this record will do; None in a record is not compared."""
+        provided = record.get(self.key)
+        if isinstance(provided, tuple):
+            return set(self.value) <= set(provided)
+        return provided is None or bool(provided == self.value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """What a component provides and requires; a component without a record has the defaults.
+
+    Attributes:
+        requires: of other components.
+        outputs: network: what it returns in training.
+        views: network: what it predicts from; it is evaluated with the first one.
+        heads: network and domains: names of the heads.
+        auxiliary: network: whether it returns `aux["aux_logits"]`.
+        stacks_passes: network: whether `forward` takes `passes` of a batch, each as its own call.
+        dense_logits: network: whether it has a method `dense_logits` that makes scores of masks.
+        pretrained_parts: network: beginnings of the names of the parameters that an ImageNet file
+            covers; they get the backbone's learning rate.
+        drawn_anew: network: beginnings of the names of parameters that are not read from a file
+            that has them -> why.
+        weighs_confidence: loss: whether it weighs pixels by the confidence of their labels.
+        frames: loss and scheme: how many frames of a scene it takes, 1 or 2.
+        reads_warped: loss of two frames: whether it reads the first prediction in the second frame.
+        num_domains: scheme and domains: 1 or 2.
+        shows_views: scheme: whether a domain's view and head are passed on to the network.
+        optimizers: scheme: names that its phases use -> beginnings of the names of the parameters
+            of the network that this optimizer leaves out.
+        networks: scheme: further networks that are trained, by the names of their optimizers;
+            each is replaced by what Fabric makes of it.
+        builders: scheme: of the optimizers of `networks`.
+        camera: scheme and view of a second frame: the camera that draws it.
+        hides_cells: masker: whether any cell is ever hidden.
+        crop_hw: transform: size of a training example; None where that differs.
+        works_on_batches: transform: whether it can augment whole batches on the device.
+        target_labels: domains: whether the target has labels.
+        target_confidence: domains: whether these carry a confidence.
+        separate_heads: domains: whether source and target have a head each.
+        num_classes: data set: K.
+        others: further things that a user's components agree on, by name.
+    """
+
+    requires: tuple[Requirement, ...] = ()
+    outputs: Outputs = "scores"
+    views: tuple[View, ...] = VIEWS
+    heads: tuple[str, ...] = ()
+    auxiliary: bool = False
+    stacks_passes: bool = False
+    dense_logits: bool = False
+    pretrained_parts: tuple[str, ...] = ()
+    drawn_anew: Mapping[str, str] = field(default_factory=dict)
+    weighs_confidence: bool = False
+    frames: Literal[1, 2] = 1
+    reads_warped: bool = False
+    num_domains: Literal[1, 2] = 1
+    shows_views: bool = False
+    optimizers: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"main": ()})
+    networks: dict[str, Any] = field(default_factory=dict)
+    builders: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    camera: Camera | None = None
+    hides_cells: bool = True
+    crop_hw: tuple[int, int] | None = None
+    works_on_batches: bool = False
+    target_labels: bool = False
+    target_confidence: bool = False
+    separate_heads: bool = False
+    num_classes: int | None = None
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+    def get(self, key: str) -> Any:
+        """The value of `key`; False where neither an attribute nor `others` has it."""
+        return {**vars(self), **self.others}.get(key, False)
+
+
+PLAIN = Record()
+"""Of every component that has no record."""
+
+
+def record_of(component: object) -> Record:
+    """The record of a component; `PLAIN` where it has none.
+
+    Raises:
+        InputError: its attribute `record` is something else.
+    """
+    record = getattr(component, "record", PLAIN)
+    if not isinstance(record, Record):
+        raise InputError(
+            f"{type(component).__name__}.record is {described(record)}; expected "
+            "rgbt.requirements.Record."
+        )
+    return record
