@@ -23,6 +23,9 @@ from typing import Any, TypeVar
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.words import with_home
 
+RENAMED = {"degradation": "corruption", "degradations": "corruptions"}
+"""Options by the name that they had before, with the name that they have now."""
+
 WIDTH = 100
 """Columns of a help text."""
 
@@ -133,6 +136,10 @@ def _as_hydra_reads(key: str, text: str) -> Any:
 
 def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None) -> None:
     key = word.lstrip("+~").partition("=")[0]
+    option, dot, setting = key.partition(".")
+    if option in RENAMED:
+        now = f"{RENAMED[option]}{dot}{setting}"
+        raise InputError(f"'{key}' is called '{now}' now; give {now}=...")
     if heeds is None:
         _check_key(word, key, names)
         return

@@ -222,16 +222,7 @@ def choose_corruptions(
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Overrides below ``corruption``, and the others.
-
-    Raises:
-        InputError: an option by the name that it had before.
-    """
-    for word in overrides:
-        key = word.partition("=")[0]
-        if re.fullmatch(r"degradations?(\..*)?", key):
-            now = key.replace("degradation", NODE)
-            raise InputError(f"'{key}' is called '{now}' now; give {now}=...")
+    """Overrides below ``corruption``, and the others."""
     own = [word for word in overrides if word.startswith(f"{NODE}.")]
     return own, [word for word in overrides if word not in own]
 

@@ -121,13 +121,6 @@ def test_split_overrides() -> None:
     assert split_overrides(words) == (["corruption.block=16"], ["dataset=mfnet", words[2]])
 
 
-@pytest.mark.parametrize("key", ["degradation", "degradations", "degradation.block"])
-def test_split_overrides_names_the_new_option(key: str) -> None:
-    now = key.replace("degradation", "corruption")
-    with pytest.raises(InputError, match=f"'{key}' is called '{now}' now; give {now}="):
-        split_overrides([f"{key}=16"])
-
-
 def test_identity_of_a_request() -> None:
     """On disk: counts that exist are recognised by it."""
     request = choose_corruption("occluded:thermal", ["corruption.block=16"]).at("0.5")
