@@ -3,27 +3,21 @@
 A component (network, loss, scheme, masker, transform, domains, ...) states both in one `Record`,
 its attribute or property `record`. `rgbt.build.requirements` compares the records of a run before
 anything is trained; whoever needs to know something of a component reads it with `record_of`.
+A class that takes long to build has a static method `record_from`, which makes the record of an
+object from its settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from rgbt.checks import InputError, described
 from rgbt.types import VIEWS, View
 
 Outputs = Literal["scores", "masks"]
 """What a network returns in training: dense class scores, or masks and classes of queries."""
-
-
-class Camera(Protocol):
-    """What a second frame is drawn with (see `rgbt.geometry.camera.Camera`)."""
-
-    def matrix(self, image_hw: tuple[int, int]) -> Any:
-        """For images of this size; InputError where it is the camera of other images."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -77,7 +71,7 @@ class Record:
         networks: scheme: further networks that are trained, by the names of their optimizers;
             each is replaced by what Fabric makes of it.
         builders: scheme: of the optimizers of `networks`.
-        camera: scheme and view of a second frame: the camera that draws it.
+        camera: scheme and view of a second frame: the `rgbt.geometry.camera.Camera` that draws it.
         hides_cells: masker: whether any cell is ever hidden.
         crop_hw: transform: size of a training example; None where that differs.
         works_on_batches: transform: whether it can augment whole batches on the device.
@@ -105,7 +99,7 @@ class Record:
     optimizers: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"main": ()})
     networks: dict[str, Any] = field(default_factory=dict)
     builders: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
-    camera: Camera | None = None
+    camera: Any = None
     hides_cells: bool = True
     crop_hw: tuple[int, int] | None = None
     works_on_batches: bool = False

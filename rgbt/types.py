@@ -173,7 +173,7 @@ class Phase(NamedTuple):
     clear: bool = True
 
 
-class Masker(Protocol):
+class AnyMasker(Protocol):
     """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`).
 
     A crop is padded at the bottom and right to multiples of 32 pixels before cells are cut

@@ -339,7 +339,7 @@ RESUMED: dict[str, tuple[Callable[[Runs], list[str]], int]] = {
     # The sixth step, after the segmentation has stepped.
     "one head": (lambda _: ["sh_adversarial", "model.weights=null"], 6),
     "two heads": (lambda _: ["multi_head_thermal", "model.weights=null"], 6),
-    # Steps 1, 3, 5 are the critic's: the fifth one.
+    # Steps 1, 3, 5 are the discriminator's: the fifth one.
     "heatnet": (heatnets, 3),
 }
 

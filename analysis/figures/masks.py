@@ -16,7 +16,7 @@ from rgbt.checks import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rgbt.types import Masker, Sample
+    from rgbt.types import AnyMasker, Sample
 
 PATCHES = (8, 16, 32, 64)
 """Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b)."""
@@ -59,7 +59,7 @@ def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
 
 
 def mask_examples(
-    sample: Sample, maskers: Mapping[str, Masker], multiple: int, seed: int
+    sample: Sample, maskers: Mapping[str, AnyMasker], multiple: int, seed: int
 ) -> tuple[MaskExample, ...]:
     """The pair under each mask.
 

@@ -6,10 +6,11 @@ from rgbt.build.contracts import check_first_sample, check_regions, check_transf
 from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.dataset import reader_of
+from rgbt.geometry.camera import Camera
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.requirements import Camera, record_of
-from rgbt.types import Masker, Sample
+from rgbt.requirements import record_of
+from rgbt.types import AnyMasker, Sample
 
 
 def first_readable(session: Session, split: str) -> Sample:
@@ -52,7 +53,7 @@ def check_own_parts(session: Session) -> None:
         check_regions(session.regions, first_readable(session, "test").thermal.shape)
 
 
-def check_cells(session: Session, masker: Masker) -> None:
+def check_cells(session: Session, masker: AnyMasker) -> None:
     """Draw one mask, so that cells that do not fit the crop are reported before the run starts.
 
     Raises:

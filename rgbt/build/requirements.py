@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping
-from itertools import islice
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -25,6 +24,14 @@ class Failure(NamedTuple):
 
     node: str
     requirement: Requirement
+
+
+class Candidate(NamedTuple):
+    """A file of ``conf/`` that could be chosen, and the record of what it describes."""
+
+    group: str
+    name: str
+    record: Record
 
 
 def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
@@ -60,9 +67,9 @@ def _sentence(
 ) -> str:
     node, wanted = failures[0]
     both = {key: records[key] for key in (node, wanted.node)}
-    options = _options(failures, records, components, plain)
+    candidates = list(_candidates((wanted.node, node), components, plain))
     # Where no single file helps with everything, those that help with this.
-    options = options or _options(failures[:1], both, components, plain)
+    options = _options(failures, records, candidates) or _options(failures[:1], both, candidates)
     advice = [f"choose {', or '.join(options)}"] if options else []
     advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
@@ -74,28 +81,31 @@ def _sentence(
     )
 
 
-def _options(
-    failures: list[Failure],
-    records: Mapping[str, Record],
-    components: Mapping[str, Any],
-    plain: Mapping[str, Any],
-) -> list[str]:
-    """Files of either group with which the first failure is gone and no other one is new."""
-    remaining = set(failures[1:])
-
-    def helps(group: str, node: DictConfig) -> bool:
-        record = _record_of_file(node, group, components)
-        return record is not None and remaining.issuperset(_failures({**records, group: record}))
-
-    options = []
-    for group in (failures[0].requirement.node, failures[0].node):
+def _candidates(
+    groups: Iterable[str], components: Mapping[str, Any], plain: Mapping[str, Any]
+) -> Iterator[Candidate]:
+    for group in groups:
         # A data set is no choice: to build one may write its images.
-        files = choices(plain, group) if group in plain and group != "dataset" else ()
-        found = (name for name, node in files if helps(group, node))
-        names = list(islice(found, MOST_CHOICES + 1))
-        listed = ", ".join(names[:MOST_CHOICES]) + (", ..." if names[MOST_CHOICES:] else "")
-        options += [f"{group}={listed}"] if names else []
-    return options
+        if group in plain and group != "dataset":
+            for name, node in choices(plain, group):
+                record = _record_of_file(node, group, components)
+                if record is not None:
+                    yield Candidate(group, name, record)
+
+
+def _options(
+    failures: list[Failure], records: Mapping[str, Record], candidates: list[Candidate]
+) -> list[str]:
+    """Files with which the first failure is gone and no other one is new, by group."""
+    remaining = set(failures[1:])
+    names: dict[str, list[str]] = {}
+    for group, name, record in candidates:
+        if remaining.issuperset(_failures({**records, group: record})):
+            names.setdefault(group, []).append(name)
+    return [
+        f"{group}={', '.join(each[:MOST_CHOICES])}{', ...' if len(each) > MOST_CHOICES else ''}"
+        for group, each in names.items()
+    ]
 
 
 def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any]) -> Record | None:
@@ -106,6 +116,9 @@ def _record_of_file(node: DictConfig, group: str, components: Mapping[str, Any])
         if isinstance(declared, Record):
             return declared
         described = Component.from_node(node)
+        if hasattr(target, "record_from"):
+            record: Record = target.record_from(**described.values)
+            return record
         others = {key: each for key, each in components.items() if key not in described.values}
         # A network takes no memory there; a view is checked by numbers that it has elsewhere alone.
         with torch.device("meta" if group == "model" else "cpu"):

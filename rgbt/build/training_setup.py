@@ -30,7 +30,7 @@ from rgbt.randomness import derive
 from rgbt.requirements import record_of
 from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.tracking.terminal import info
-from rgbt.types import Loadable, Masker
+from rgbt.types import AnyMasker, Loadable
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     session = open_session(spec, load_weights=WEIGHTS not in missing)
     domains = session.domains
-    masker: Masker = spec.masker.build()
+    masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
     model = session.fabric.setup_module(session.model)

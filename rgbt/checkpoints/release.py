@@ -58,8 +58,8 @@ CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
 
 SAID: Mapping[tuple[str, str], str] = {
     ("released", "pspnet"): (
-        "no name under module.critics. is written, because a critic is not part of this network; "
-        "HeatNet's code loads the file with no_conf, without critics"
+        "no name under module.critics. is written, because a discriminator is not part of this "
+        "network; HeatNet's code loads the file with no_conf, without its critics"
     ),
     ("released_temporal", "cmx"): (
         "voting.weight and voting.bias are zeros, because nothing ever uses them"

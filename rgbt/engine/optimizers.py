@@ -120,7 +120,7 @@ class RMSprop:
 
 @dataclass(frozen=True, kw_only=True)
 class Adam:
-    """Builder of a `torch.optim.Adam` with one rate, for critics.
+    """Builder of a `torch.optim.Adam` with one rate, for discriminators.
 
     Source: AdaptSegNet (rate 1e-4, betas 0.9 and 0.99, no weight decay); thesis (J. Sun), code
     (rate 1e-5).

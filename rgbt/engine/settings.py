@@ -76,7 +76,7 @@ class Recipe:
         crop_hw: training crop, pixels.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for what is pretrained.
-        critic_lr: learning rate of a critic, where the scheme has one.
+        critic_lr: learning rate of a discriminator, where the scheme has one.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         demo_steps: optimiser steps at scale=demo.
@@ -117,8 +117,8 @@ class Scale:
         eval_every: steps between evaluations.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for the backbone.
-        critic_width: channels of a critic's first convolution, where the scheme has a critic.
-        critic_lr: learning rate of a critic, where the scheme has one.
+        critic_width: channels of a discriminator's first convolution, where there is one.
+        critic_lr: learning rate of a discriminator, where the scheme has one.
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.

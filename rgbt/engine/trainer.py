@@ -69,7 +69,7 @@ class Trainer:
         settings: durations and limits.
         scheme: yields the phases of a step.
         model: the network as Fabric wrapped it.
-        others: further networks that are trained (a critic), by the name they have in checkpoints.
+        others: further networks that are trained (a discriminator), by their name in checkpoints.
         optimizers: by the names that phases use.
         schedule: learning rate factor per step.
         steps_per_epoch: optimiser steps in one epoch.

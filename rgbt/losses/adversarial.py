@@ -1,4 +1,4 @@
-"""A network against a critic: what verdicts cost, and which map is judged."""
+"""A network against a discriminator: what verdicts cost, and which map is judged."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.checks import check_choice, check_shape
 from rgbt.losses.dice import single
 
 Judged = Literal["probabilities", "logits", "self_information"]
-"""What a critic sees of a prediction."""
+"""What a discriminator sees of a prediction."""
 
 JUDGED: tuple[Judged, ...] = ("probabilities", "logits", "self_information")
 
@@ -25,7 +25,7 @@ def least_squares(verdicts: Tensor, value: float) -> Tensor:
     Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
 
     Args:
-        verdicts: of the critic, any shape and float dtype.
+        verdicts: of the discriminator, any shape and float dtype.
         value: that they should have.
 
     Returns:
@@ -40,7 +40,7 @@ def cross_entropy(verdicts: Tensor, value: float) -> Tensor:
     Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
 
     Args:
-        verdicts: of the critic, not squashed; any shape and float dtype.
+        verdicts: of the discriminator, not squashed; any shape and float dtype.
         value: that s(D) should have, in [0, 1].
 
     Returns:
@@ -58,7 +58,7 @@ VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:
-    """The map that a critic is shown.
+    """The map that a discriminator is shown.
 
         probabilities       p = softmax of the class scores    AdaptSegNet, thesis (J. Sun)
         logits              the class scores                   HeatNet

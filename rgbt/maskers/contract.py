@@ -13,7 +13,7 @@ CALL = {"__call__": ("image_hw", "centre_yx", "generator")}
 
 
 def check_masker(masker: object, image_hw: tuple[int, int], generator: torch.Generator) -> None:
-    """Draw one mask and refuse a masker that does not do what `rgbt.types.Masker` says.
+    """Draw one mask and refuse a masker that does not do what `rgbt.types.AnyMasker` says.
 
     Args:
         masker: any object.

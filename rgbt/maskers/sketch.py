@@ -23,14 +23,14 @@ from rgbt.config.component import build
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.types import Masker
+from rgbt.types import AnyMasker
 
 SAMPLES = 5
 DRAWS = 2000
 GREY = 127
 
 
-class Example(Protocol):
+class DrawnExample(Protocol):
     """What a transform returns (see `rgbt.transforms.example.Example`), as far as it is drawn."""
 
     rgb: NDArray[np.uint8] | NDArray[np.float32]
@@ -59,7 +59,9 @@ class Sketch(NamedTuple):
     thermal_frequency: NDArray[np.float64]
 
 
-def sketch(masker: Masker, examples: Iterable[Example], seed: int, draws: int = DRAWS) -> Sketch:
+def sketch(
+    masker: AnyMasker, examples: Iterable[DrawnExample], seed: int, draws: int = DRAWS
+) -> Sketch:
     """Masked images of `examples`, and how often each cell is hidden.
 
     Args:
@@ -144,7 +146,7 @@ def _picture_path(out: str | None) -> Path:
 def main(config: DictConfig) -> int:
     """Write the picture of the configured masker to `out`."""
     path = _picture_path(config.out)
-    masker: Masker = build(config.masker)
+    masker: AnyMasker = build(config.masker)
     dataset, transform = build(config.dataset), build(config.transform)
     names = dataset.names("train")[:SAMPLES]
     examples = [

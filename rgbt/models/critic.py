@@ -1,4 +1,4 @@
-"""The critic of adversarial adaptation: which domain does this map come from?"""
+"""The discriminator of adversarial adaptation: which domain does this map come from?"""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STRIDE = 32
 class Critic(nn.Module):
     """Five strided 4x4 convolutions, no normalisation, no sigmoid.
 
-    Source: AdaptSegNet, Sec. 3.2 (its discriminator); HeatNet and the thesis use the same.
+    Source: AdaptSegNet, Sec. 3.2 ("discriminator"); HeatNet and the thesis use the same.
     Weights keep torch's initialisation, as released.
 
     Args:
@@ -72,8 +72,8 @@ class Critic(nn.Module):
         sizes = check_shape("map", x, "N C H W", C=self.conv1.in_channels)
         if min(sizes["H"], sizes["W"]) < STRIDE:
             raise InputError(
-                f"a critic judges maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} x "
-                f"{sizes['W']}; use larger crops, or a critic on the class scores."
+                f"a discriminator judges maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} x "
+                f"{sizes['W']}; use larger crops, or a discriminator on the class scores."
             )
         for conv in (self.conv1, self.conv2, self.conv3, self.conv4):
             x = F.leaky_relu(conv(x), 0.2)

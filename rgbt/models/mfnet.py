@@ -24,7 +24,7 @@ LEAKY_SLOPE = 0.2
 """Of every leaky ReLU, as released."""
 
 
-class Features(NamedTuple):
+class MFNetFeatures(NamedTuple):
     """Features of an encoder at strides 2, 4, 8 (before they are pooled) and 16."""
 
     half: Tensor
@@ -177,7 +177,7 @@ class MFNet(nn.Module):
         for name, unit in units.items():
             self.add_module(f"{name}_{suffix}", unit)
 
-    def _encode(self, suffix: str, image: Tensor) -> Features:
+    def _encode(self, suffix: str, image: Tensor) -> MFNetFeatures:
         def unit(name: str, x: Tensor) -> Tensor:
             result: Tensor = self.get_submodule(f"{name}_{suffix}")(x)
             return result
@@ -185,7 +185,7 @@ class MFNet(nn.Module):
         half = unit("conv2_2", unit("conv2_1", F.max_pool2d(unit("conv1", image), 2)))
         quarter = unit("conv3_2", unit("conv3_1", F.max_pool2d(half, 2)))
         eighth = unit("conv4", F.max_pool2d(quarter, 2))
-        return Features(half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2)))
+        return MFNetFeatures(half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2)))
 
 
 def doubled(x: Tensor) -> Tensor:

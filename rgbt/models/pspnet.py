@@ -70,6 +70,7 @@ class PSPNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
+        self.record = self.record_from(modalities=modalities)
         self.modalities = modalities
         self.dropout = dropout
         thermal = inputs.thermal_channels
@@ -79,7 +80,7 @@ class PSPNet(nn.Module):
             "rgb": (3,),
             "thermal": (thermal,),
         }
-        self.feats = Encoder(channels[modalities], depths, base_width)
+        self.feats = PSPNetEncoder(channels[modalities], depths, base_width)
         pooled, wide, narrow = 16 * base_width, 4 * decoder_width, decoder_width
         self.psp = PyramidPooling(32 * base_width, pooled, align_corners=align_corners)
         self.up_1 = UpBlock(pooled, wide, align_corners=align_corners)
@@ -89,13 +90,10 @@ class PSPNet(nn.Module):
         self.apply(_initialise)
         self.inputs = inputs
 
-    @property
-    def record(self) -> Record:
+    @staticmethod
+    def record_from(*, modalities: str, **_: object) -> Record:
         """What it returns, and what it predicts from."""
-        return Record(
-            views=VIEWS_OF[self.modalities],
-            pretrained_parts=("feats.",),
-        )
+        return Record(views=VIEWS_OF[modalities], pretrained_parts=("feats.",))
 
     def forward(
         self,
@@ -117,7 +115,7 @@ class PSPNet(nn.Module):
 
         Returns:
             logits: (N, K, H, W).
-            aux: what critics may judge, besides the logits. With w = base_width, branches
+            aux: what discriminators may judge, besides the logits. With w = base_width, branches
                 concatenated, sides H and W rounded up to multiples of 8 and then divided by s:
                 "layer4" (32 w, s = 8), "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8),
                 "layer1" (4 w per branch, s = 4), "stem" (w per branch, s = 4).
@@ -144,7 +142,7 @@ class PSPNet(nn.Module):
         return (images.rgb if self.modalities == "rgb" else images.thermal,)
 
 
-class Encoder(nn.Module):
+class PSPNetEncoder(nn.Module):
     """ResNet whose last two stages are dilated instead of strided.
 
     Stem and first two stages exist once per image. The first block of a dilated stage is not

@@ -122,6 +122,7 @@ class RTFNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
+        self.record = self.record_from(thermal_stem=thermal_stem)
         self.thermal_stem = thermal_stem
         self.encoder_rgb_conv1 = _stem(3, base_width)
         self.encoder_rgb_bn1 = nn.BatchNorm2d(base_width)
@@ -150,14 +151,14 @@ class RTFNet(nn.Module):
         self.inputs = inputs
         self._start()
 
-    @property
-    def record(self) -> Record:
+    @staticmethod
+    def record_from(*, thermal_stem: str, **_: object) -> Record:
         """What it returns, what it predicts from, and what no file of ImageNet weights gives it."""
         reason = "drawn anew with model.thermal_stem=xavier"
         return Record(
             views=("rgbt",),
             pretrained_parts=("encoder_",),
-            drawn_anew={"encoder_thermal_conv1.": reason} if self.thermal_stem == "xavier" else {},
+            drawn_anew={"encoder_thermal_conv1.": reason} if thermal_stem == "xavier" else {},
         )
 
     def forward(

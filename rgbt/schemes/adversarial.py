@@ -1,4 +1,4 @@
-"""A critic tells the domains' predictions apart; the network learns to leave it nothing to tell."""
+"""Adversarial adaptation: a network against a discriminator of its predictions' domain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
 from rgbt.losses.adversarial import judged as judged_map
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
-from rgbt.schemes.domains import Domains, Gradients, Passes, scores
+from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
 DomainValue = Annotated[float, Interval(ge=-10, le=10)]
@@ -24,12 +24,12 @@ CRITIC = "critic"
 
 
 class Adversarial:
-    """A segmentation phase and a critic phase, in every step or in alternating steps.
+    """A segmentation phase and a discriminator phase, in every step or in alternating steps.
 
-        segmentation   L_s(source) [+ L_s(target)] + weight w A
-        critic         C = d(D(source), y_s) + d(D(target), y_t), halved on request
+        segmentation    L_s(source) [+ L_s(target)] + weight w A
+        discriminator   C = d(D(source), y_s) + d(D(target), y_t), halved on request
 
-    with D the critic, d the verdict loss, y_s and y_t the numbers that stand for the domains, and
+    with D the discriminator, d the verdict loss, y_s and y_t the domains' numbers, and
 
         A = d(D(target), y_s) [+ d(D(source), y_t) with `both_ways`]
 
@@ -42,9 +42,9 @@ class Adversarial:
         loss: L_s, of one domain.
         domains: source and target.
         critic: D (see `rgbt.models.critic.Critic`).
-        critic_optimizer: builder of its optimiser, which phases call "critic".
-        judged: what the critic sees: class probabilities (thesis, AdaptSegNet), raw scores
-            (HeatNet), or weighted self-information (ADVENT).
+        critic_optimizer: builder of its optimiser, named "critic" in phases.
+        judged: what the discriminator sees: class probabilities (thesis, AdaptSegNet), raw
+            scores (HeatNet), or weighted self-information (ADVENT).
         verdict_loss: d: "least_squares" (thesis, HeatNet), or "cross_entropy" with logits
             (AdaptSegNet, ADVENT).
         source_value: y_s. Thesis, AdaptSegNet, ADVENT: 0; HeatNet: 1.
@@ -55,8 +55,8 @@ class Adversarial:
         halved: whether C is halved (AdaptSegNet, ADVENT).
         supervise_target: whether L_s of the target is computed. Thesis, Eq. 4: no; the code of its
             basic network and HeatNet: yes.
-        alternates: whether steps alternate between the two phases, the critic's first (HeatNet);
-            false: both in every step.
+        alternates: whether steps alternate between the two phases, the discriminator's first
+            (HeatNet); false: both in every step.
         gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "together"; the code of
             its basic network: "kept".
 
@@ -69,7 +69,7 @@ class Adversarial:
         *,
         model: nn.Module,
         loss: Loss,
-        domains: Domains,
+        domains: SourceAndTarget,
         critic: nn.Module,
         critic_optimizer: Callable[..., torch.optim.Optimizer],
         judged: Judged,
@@ -94,7 +94,7 @@ class Adversarial:
         if source_value == target_value:
             raise InputError(
                 f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "
-                "the critic has nothing to tell apart; choose two numbers, such as 0 and 1."
+                "the discriminator has nothing to distinguish; choose two numbers, such as 0 and 1."
             )
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
         self.others: dict[str, nn.Module] = {CRITIC: critic}
@@ -111,7 +111,7 @@ class Adversarial:
 
     @property
     def record(self) -> Record:
-        """Labels of the target where they are read, confidence where it weighs; the critic."""
+        """Labels of the target where they are read, confidence where it weighs."""
         labels, weighed = self.supervise_target, self.weighed_by_confidence
         confidence = Requirement(
             "domains", "target_confidence", True, "scheme.weighed_by_confidence=true"
@@ -127,7 +127,7 @@ class Adversarial:
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """The segmentation's phases, then the critic's; or one of both kinds.
+        """The segmentation's phases, then the discriminator's; or one of both kinds.
 
         Args:
             batch: of both domains, images in [0, 1].
@@ -139,7 +139,7 @@ class Adversarial:
                 for name, each in (("source", batch.source), ("target", batch.target)):
                     output = self.passes.output(name, each, generator_of)
                     seen[name] = judged_map(scores(output), self.judged)
-            yield self._critic_phase(seen)
+            yield self._discriminator_phase(seen)
             return
         self.others[CRITIC].requires_grad_(False)
         yield from self.passes.phases(
@@ -148,7 +148,7 @@ class Adversarial:
         )
         self.others[CRITIC].requires_grad_(True)
         if not self.alternates:
-            yield self._critic_phase({name: each.detach() for name, each in seen.items()})
+            yield self._discriminator_phase({name: each.detach() for name, each in seen.items()})
 
     def _source(
         self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
@@ -171,7 +171,7 @@ class Adversarial:
         return parts | {"target/adversarial": self._adversarial("target", batch, seen)}
 
     def _adversarial(self, name: str, batch: TwoDomains, seen: Mapping[str, Tensor]) -> Tensor:
-        """Weighted cost of a domain that the critic recognises."""
+        """Weighted loss of a domain that the discriminator recognises."""
         other = {"source": "target", "target": "source"}[name]
         cost = self.verdict_loss(self.others[CRITIC](seen[name]), self.values[other])
         if self.weighed_by_confidence:
@@ -180,7 +180,7 @@ class Adversarial:
             cost = cost * (1.0 - confidence).mean()
         return self.weight * cost
 
-    def _critic_phase(self, seen: Mapping[str, Tensor]) -> Phase:
+    def _discriminator_phase(self, seen: Mapping[str, Tensor]) -> Phase:
         share = 0.5 if self.halved else 1.0
         critic = self.others[CRITIC]
         return Phase(

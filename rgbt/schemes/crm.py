@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
-from rgbt.types import VIEWS, Batch, GeneratorOf, Loss, Masker, MaskPair, Output, Phase
+from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
 
 class CRM:
@@ -41,7 +41,7 @@ class CRM:
         *,
         model: nn.Module,
         loss: Loss,
-        masker: Masker,
+        masker: AnyMasker,
         modality_weight: NonNegative,
         complementary_weight: NonNegative,
         nonlocal_weight: NonNegative,

@@ -24,8 +24,8 @@ source's was clipped to.
 """
 
 
-class Domain(Protocol):
-    """How a domain is seen (see `rgbt.data.domains.Domain`)."""
+class ViewAndHead(Protocol):
+    """How a domain passes the network (see `rgbt.data.domains.Domain`)."""
 
     @property
     def view(self) -> View | None:
@@ -37,27 +37,17 @@ class Domain(Protocol):
         """The head; None where there is one for all."""
         ...
 
-    @property
-    def labels(self) -> str:
-        """Where labels come from; "none"."""
-        ...
 
-    @property
-    def confidence(self) -> bool:
-        """Whether labels carry a confidence."""
-        ...
-
-
-class Domains(Protocol):
+class SourceAndTarget(Protocol):
     """The domains of a run (see `rgbt.data.domains.Domains`)."""
 
     @property
-    def source(self) -> Domain:
+    def source(self) -> ViewAndHead:
         """Labelled."""
         ...
 
     @property
-    def target(self) -> Domain | None:
+    def target(self) -> ViewAndHead | None:
         """To adapt to."""
         ...
 
@@ -78,7 +68,7 @@ class Passes:
     """
 
     def __init__(
-        self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
+        self, *, model: nn.Module, loss: Loss, domains: SourceAndTarget, gradients: Gradients
     ) -> None:
         self.model = model
         self.loss = loss

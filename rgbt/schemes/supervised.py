@@ -8,8 +8,8 @@ from typing import Any
 from torch import nn
 
 from rgbt.requirements import Record, record_of
-from rgbt.schemes.domains import Domains
-from rgbt.types import Batch, GeneratorOf, Loss, Masker, Phase
+from rgbt.schemes.domains import SourceAndTarget
+from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 
 class Supervised:
@@ -24,7 +24,9 @@ class Supervised:
 
     record = Record(shows_views=True)
 
-    def __init__(self, *, model: nn.Module, loss: Loss, masker: Masker, domains: Domains) -> None:
+    def __init__(
+        self, *, model: nn.Module, loss: Loss, masker: AnyMasker, domains: SourceAndTarget
+    ) -> None:
         self.model = model
         self.loss = loss
         self.masker = masker

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from rgbt.losses.guidance import guidance
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
-from rgbt.schemes.domains import Domains, Gradients, Passes, scores
+from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import IGNORE, GeneratorOf, Loss, Output, Phase, TwoDomains
 
 UnlabelledLoss = Callable[[Tensor], dict[str, Tensor]]
@@ -31,7 +31,7 @@ class LabelledDomains:
     """
 
     def __init__(
-        self, *, model: nn.Module, loss: Loss, domains: Domains, gradients: Gradients
+        self, *, model: nn.Module, loss: Loss, domains: SourceAndTarget, gradients: Gradients
     ) -> None:
         self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
 
@@ -73,7 +73,7 @@ class UnlabelledTarget:
         *,
         model: nn.Module,
         loss: Loss,
-        domains: Domains,
+        domains: SourceAndTarget,
         unlabelled: UnlabelledLoss,
         guidance_weight: NonNegative,
         guidance_threshold: Share,

@@ -19,12 +19,12 @@ MILLION = 1e6
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     """Say what is trained on what: device, network, images, steps and the run folder."""
     session, trainer = setup.session, setup.session.trainer
-    critics = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
+    others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
     batch = session.loading.batch_size * trainer.accumulate
     epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
     lines = [
         ("device", device_line(session)),
-        ("network", f"{network_line(session)}{critics}"),
+        ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {_images(setup)}"),
         (
             "steps",

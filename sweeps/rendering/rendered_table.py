@@ -21,7 +21,7 @@ ORDER = (
     "+1: the same order."
 )
 NOT_PRINTED = "Not in the paper."
-PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without critics."
+PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without discriminators."
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ PARAMETERS = {
     "temporal_cmx_b2": 66_566_988,
     "rtfnet_50": 185_238_501,
     "mfnet": 736_275,
-    "heatnet": 54_361_040 + 2_774_977,  # and its critic
+    "heatnet": 54_361_040 + 2_774_977,  # and its discriminator
 }
 """The published or counted ones; of Swin-T four digits are known."""
 

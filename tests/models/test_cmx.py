@@ -16,7 +16,7 @@ from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.fusion import CrossAttention, Rectification
-from rgbt.models.cmx.mit import Attention, Block, MixFfn, drop_rates
+from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn, drop_rates
 from rgbt.models.cmx.model import CMX
 from rgbt.types import MaskPair
 from tests.models.golden import compose, network
@@ -272,7 +272,7 @@ def test_inputs_can_be_exchanged_in_files_that_build_on_another() -> None:
 @pytest.mark.parametrize("reduction", [1, 2])
 def test_attention_by_loops(reduction: int) -> None:
     """Three heads of two channels; a map of 5 x 4 is attended to as 2 x 2 where it is reduced."""
-    layer: Attention = randomise(Attention(6, 3, reduction))
+    layer: MitAttention = randomise(MitAttention(6, 3, reduction))
     x = normal(2, 5, 4, 6)
     expected = torch.empty(2, 20, 6)
     for n in range(2):
@@ -475,7 +475,7 @@ def test_rates_reach_the_blocks_of_each_stream() -> None:
     net = nano(drop_path_rate=0.8, drop_path_stage2="released").train().backbone
     seen: dict[str, Tensor] = {}
     for name, module in net.named_modules():
-        if isinstance(module, Block):
+        if isinstance(module, MitBlock):
             module.register_forward_pre_hook(lambda _m, args, n=name: seen.update({n: args[1]}))
     net(nano().inputs(*images(count, 29, 29)), seeded(0))
     keeps = {
@@ -495,7 +495,7 @@ def test_rates_reach_the_blocks_of_each_stream() -> None:
 
 
 def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block: Block = randomise(Block(4, 2, 1, 8))
+    block: MitBlock = randomise(MitBlock(4, 2, 1, 8))
     x = normal(3, 2, 2, 4)
     keep = torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 2.0]]).view(2, 3, 1, 1, 1)
     out = block(x, keep)

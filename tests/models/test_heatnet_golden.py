@@ -1,4 +1,4 @@
-"""HeatNet's PSPNet and critic against tensors recorded from the release."""
+"""HeatNet's PSPNet and discriminator against tensors recorded from the release."""
 
 from __future__ import annotations
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.decoder import Attention, shrink
+from rgbt.models.mask2former.decoder import QueryAttention, shrink
 from rgbt.models.mask2former.deformable import DeformableAttention
 from rgbt.models.mask2former.position import centre_grid, sine_code
-from rgbt.models.mask2former.swin import Block, PatchMerging, SwinShape
+from rgbt.models.mask2former.swin import PatchMerging, SwinBlock, SwinShape
 from rgbt.models.mask2former.windows import relative_index, shift_mask
 
 CPU = torch.device("cpu")
@@ -50,7 +50,7 @@ def test_shift_mask_by_hand() -> None:
 @pytest.mark.parametrize("shift", [0, 1])
 def test_block_attention_equals_a_loop_over_tokens(shift: int) -> None:
     """5 x 7 tokens padded to 6 x 9, windows of 3; padding is attended to, as released."""
-    block = Block(8, 2, SwinShape(8, (1,) * 4, (2,) * 4, 3, 2.0, 0.0), shift=shift)
+    block = SwinBlock(8, 2, SwinShape(8, (1,) * 4, (2,) * 4, 3, 2.0, 0.0), shift=shift)
     randomise(block)
     x = seeded(1, 5, 7, 8, seed=9)
     with torch.no_grad():
@@ -59,7 +59,7 @@ def test_block_attention_equals_a_loop_over_tokens(shift: int) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def _attend_by_loop(block: Block, x: Tensor, shift: int) -> Tensor:
+def _attend_by_loop(block: SwinBlock, x: Tensor, shift: int) -> Tensor:
     attn, out = block.attn, torch.zeros_like(x)
     padded = F.pad(x, (0, 0, 0, 2, 0, 1))
     q, k, v = attn.qkv(padded).chunk(3, -1)
@@ -167,7 +167,7 @@ def test_deformable_attention_starts_by_looking_around() -> None:
 
 
 def test_attention_equals_torch_module() -> None:
-    ours, theirs = Attention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
+    ours, theirs = QueryAttention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
     randomise(ours)
     theirs.load_state_dict(ours.state_dict())
     query, key, value = seeded(2, 3, 8, seed=1), seeded(2, 5, 8, seed=2), seeded(2, 5, 8, seed=3)

@@ -1,4 +1,4 @@
-"""A network, a critic and a loss that are a few matrices, and SGD written out, to count with."""
+"""A network, a discriminator and a loss of a few matrices, and SGD written out."""
 
 from __future__ import annotations
 

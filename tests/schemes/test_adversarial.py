@@ -1,4 +1,4 @@
-"""A critic in the step: both phases by matrices, numbers from the papers, and who steps what."""
+"""Adversarial steps: both phases by matrices, numbers from the papers, and who steps what."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def distance(verdicts: Tensor, value: float, how: str) -> Tensor:
 
 @dataclass
 class ByHand:
-    """A network and a critic as matrices, stepped as the documentation says."""
+    """A network and a discriminator as matrices, stepped as the documentation says."""
 
     settings: dict[str, Any]
     heads: bool
@@ -238,7 +238,7 @@ def test_the_cases_differ_by_more_than_the_tolerance() -> None:
 
 
 class Undecided(nn.Module):
-    """A critic whose verdict is 0.5 everywhere."""
+    """A discriminator whose verdict is 0.5 everywhere."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -334,7 +334,7 @@ def changed(before: dict[str, Tensor], module: nn.Module) -> set[str]:
 def test_alternating_steps_change_the_critic_and_then_the_network(
     tmp_path: Path, heads: bool
 ) -> None:
-    """In the critic's steps the network runs in training mode: only its statistics go on."""
+    """In the discriminator's steps the network runs in training mode: only its statistics go on."""
     torch.manual_seed(3)
     model = Normalised(("day", "dark") if heads else ())
     scheme = scheme_of(model, heads, **HEATNET)
@@ -355,7 +355,7 @@ def test_alternating_steps_change_the_critic_and_then_the_network(
 
 
 def test_phases_of_one_step_do_not_touch_each_others_networks() -> None:
-    """The segmentation's backward pass leaves no gradient in the critic, and the other way."""
+    """The segmentation leaves no gradient in the discriminator, nor the other way round."""
     for heads, changes in CASES.values():
         model = network(heads)
         scheme = scheme_of(model, heads, **changes)
@@ -374,7 +374,7 @@ def test_phases_of_one_step_do_not_touch_each_others_networks() -> None:
 
 @pytest.mark.parametrize("case", ["HeatNet", "thesis, two heads", "thesis' code, second stage"])
 def test_accumulated_steps_are_the_mean_of_their_batches(tmp_path: Path, case: str) -> None:
-    """Two equal halves are one batch: a step's batches are all of the critic, or none."""
+    """Two equal halves are one batch: a step's batches are all of the discriminator, or none."""
     heads, changes = CASES[case]
     found = []
     for accumulate in (1, 2):
@@ -412,7 +412,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
         r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
     ),
-    "equal values": ({"target_value": 0.0}, "are both 0, so that the critic has nothing"),
+    "equal values": ({"target_value": 0.0}, "are both 0, so that the discriminator has nothing"),
 }
 
 
@@ -459,7 +459,7 @@ def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
     list(scheme_of(network(False)).phases(next(pairs()).to("cpu"), noting))
     assert asked == ["source network", "source loss", "target network"]
     asked.clear()
-    judging = scheme_of(network(True), True, **HEATNET)  # the critic's step
+    judging = scheme_of(network(True), True, **HEATNET)  # the discriminator's step
     list(judging.phases(next(pairs(confidence=True)).to("cpu"), noting))
     assert asked == ["source network", "target network"]
 

@@ -1,4 +1,4 @@
-"""HeatNet's checkpoints: the segmentation network and its critics in one module."""
+"""HeatNet's checkpoints: the segmentation network and its discriminators in one module."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def recognise(contents: Contents) -> Facts | None:
 
 
 def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
-    """Names are ours; critics are networks of their own here."""
+    """Names are ours; discriminators are networks of their own here."""
     if family != "pspnet":
         return None
-    return Rule(leftover=((r"critics\.", "a critic, which is a network of its own here"),))
+    return Rule(leftover=((r"critics\.", "a discriminator, which is a network of its own here"),))
 
 
 def released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The network's released names; there are none of critics."""
+    """The network's released names; there are none of discriminators."""
     return OrderedDict((f"{WRAPPED}{PREFIX}{key}", value) for key, value in state.items())

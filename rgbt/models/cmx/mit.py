@@ -39,7 +39,7 @@ def convolve(convolution: nn.Module, x: Tensor) -> Tensor:
     return out.permute(0, 2, 3, 1)
 
 
-class PatchEmbed(nn.Module):
+class MitPatchEmbed(nn.Module):
     """One token per patch; neighbouring patches overlap."""
 
     def __init__(self, in_channels: int, dim: int, *, kernel: int, stride: int) -> None:
@@ -53,7 +53,7 @@ class PatchEmbed(nn.Module):
         return tokens
 
 
-class Attention(nn.Module):
+class MitAttention(nn.Module):
     """Multi-head attention to a map whose sides are `reduction` times smaller.
 
         softmax(q k' / sqrt(d)) v,   k and v from LayerNorm(conv(x)), kernel = stride = reduction
@@ -113,13 +113,13 @@ class MixFfn(nn.Module):
         return out
 
 
-class Block(nn.Module):
+class MitBlock(nn.Module):
     """Attention and feed-forward, each normalised before and added to its input."""
 
     def __init__(self, dim: int, heads: int, reduction: int, hidden: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
-        self.attn = Attention(dim, heads, reduction)
+        self.attn = MitAttention(dim, heads, reduction)
         self.norm2 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
         self.mlp = MixFfn(dim, hidden)
 
@@ -154,9 +154,9 @@ def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn
     hidden = int(dim * shape.mlp_ratio)
     heads, reduction = shape.num_heads[stage], shape.sr_ratios[stage]
     return {
-        "patch_embed": PatchEmbed(before, dim, kernel=kernel, stride=stride),
+        "patch_embed": MitPatchEmbed(before, dim, kernel=kernel, stride=stride),
         "block": nn.ModuleList(
-            Block(dim, heads, reduction, hidden) for _ in range(shape.depths[stage])
+            MitBlock(dim, heads, reduction, hidden) for _ in range(shape.depths[stage])
         ),
         "norm": nn.LayerNorm(dim, eps=BLOCK_NORM_EPS),
     }

@@ -24,7 +24,7 @@ STREAMS = ("", "extra_")
 """Beginnings of the released names: RGB, and the other modality."""
 
 
-class Encoder(nn.Module):
+class CmxEncoder(nn.Module):
     """Two Mix Transformers with weights of their own that meet after every stage.
 
     What the rectification returns goes on to the next stage; what the fusion returns, only to the
@@ -153,7 +153,7 @@ class CMX(nn.Module):
             for stride, ratio in zip((4, 8, 16, 32), sr_ratios, strict=True)
         )
         rates = drop_rates(depths, drop_path_rate, drop_path_stage2)
-        self.backbone = Encoder(
+        self.backbone = CmxEncoder(
             shape,
             thermal_channels=inputs.thermal_channels,
             drop_rates=rates if drop_path_rate > 0 else None,

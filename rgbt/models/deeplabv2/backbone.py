@@ -12,7 +12,7 @@ from rgbt.models.resnet import bottleneck_stage
 TrainNorm = Literal["all", "statistics"]
 
 
-class Features(NamedTuple):
+class DeepLabFeatures(NamedTuple):
     """Maps at 1/8 of the size: layer3 (N, 16 w, h, w) and layer4 (N, 32 w, h, w)."""
 
     layer3: Tensor
@@ -59,8 +59,8 @@ class Backbone(nn.Module):
         for norm in norms:
             norm.requires_grad_(train_norm == "all")
 
-    def forward(self, image: Tensor) -> Features:
+    def forward(self, image: Tensor) -> DeepLabFeatures:
         """(N, 3, H, W) -> features; h = H / 8, one more where the pooling rounded up."""
         x = self.pool(F.relu(self.bn1(self.conv1(image))))
         layer3 = self.layer3(self.layer2(self.layer1(x)))
-        return Features(layer3, self.layer4(layer3))
+        return DeepLabFeatures(layer3, self.layer4(layer3))

@@ -68,7 +68,7 @@ class HeadShape:
         return widths[self.decoder]
 
 
-class Pyramid(nn.Module):
+class AtrousPyramid(nn.Module):
     """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
 
     Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
@@ -104,8 +104,8 @@ class Pyramid(nn.Module):
         return result
 
 
-class Head(nn.Module):
-    """Pyramid, and in the modified decoders three up blocks.
+class DeepLabHead(nn.Module):
+    """A pyramid, and in the modified decoders three up blocks.
 
     Source: thesis, Sec. III-B and Fig. 5.   Released: the modified decoder ends with a 1x1
     convolution; see `HeadShape.decoder`.
@@ -115,7 +115,7 @@ class Head(nn.Module):
         super().__init__()
         self.dropout = shape.dropout
         widths = shape.widths
-        self.aspp = Pyramid(shape.in_channels, widths[0], shape.rates, shape.summed_rates)
+        self.aspp = AtrousPyramid(shape.in_channels, widths[0], shape.rates, shape.summed_rates)
         self.ups = nn.ModuleList(
             UpBlock(before, after, align_corners=shape.align_corners)
             for before, after in zip(widths, widths[1:], strict=False)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import padded_hw
 from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
-from rgbt.models.deeplabv2.heads import Decoder, Head, HeadShape, Pyramid, Rates
+from rgbt.models.deeplabv2.heads import AtrousPyramid, Decoder, DeepLabHead, HeadShape, Rates
 from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.upsampling import DropRates
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
@@ -83,29 +83,29 @@ class DeepLabV2(nn.Module):
                 f"model.decoder={decoder} enlarges 8 times, which comes back to the size of the "
                 "image only with model.ceil_mode=false."
             )
+        self.record = self.record_from(heads=heads, auxiliary=auxiliary)
         self.num_classes = num_classes
         self.align_corners = align_corners
         # Scores that are interpolated fit images of any size.
         self.multiple = 1 if decoder == "basic" else STRIDE
         self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
-        self.heads = nn.ModuleDict({name: Head(shape) for name in heads})
+        self.heads = nn.ModuleDict({name: DeepLabHead(shape) for name in heads})
         self.auxiliary = (
-            Pyramid(16 * base_width, num_classes, rates, summed_rates) if auxiliary else None
+            AtrousPyramid(16 * base_width, num_classes, rates, summed_rates) if auxiliary else None
         )
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0.0, 0.01)
         self.inputs = inputs
 
-    @property
-    def record(self) -> Record:
+    @staticmethod
+    def record_from(*, heads: tuple[str, ...], auxiliary: bool, **_: object) -> Record:
         """What it returns, what it predicts from; of several heads, the domains train each."""
-        heads = tuple(self.heads)
         return Record(
             requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
             views=("rgb", "thermal"),
             heads=heads,
-            auxiliary=self.auxiliary is not None,
+            auxiliary=auxiliary,
             pretrained_parts=("backbone.",),
         )
 

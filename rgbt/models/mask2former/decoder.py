@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, Pyramid
+from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, PixelPyramid
 from rgbt.models.mask2former.position import sine_code
 
 
@@ -24,7 +24,7 @@ class Predictions(NamedTuple):
     mask_logits: Tensor
 
 
-class Attention(nn.Module):
+class QueryAttention(nn.Module):
     """Multi-head attention with the parameter layout of `torch.nn.MultiheadAttention`.
 
     That module cannot take one mask for all heads of a sample without repeating it.
@@ -68,7 +68,7 @@ class CrossAttentionLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
-        self.multihead_attn = Attention(dim, heads)
+        self.multihead_attn = QueryAttention(dim, heads)
         self.norm = nn.LayerNorm(dim)
 
     def forward(
@@ -89,7 +89,7 @@ class SelfAttentionLayer(nn.Module):
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
-        self.self_attn = Attention(dim, heads)
+        self.self_attn = QueryAttention(dim, heads)
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, queries: Tensor, query_position: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ class Predictor(nn.Module):
         self.class_embed = nn.Linear(dim, num_classes + 1)
         self.mask_embed = MaskEmbed(dim)
 
-    def forward(self, pyramid: Pyramid) -> Predictions:
+    def forward(self, pyramid: PixelPyramid) -> Predictions:
         """Predict classes and masks.
 
         Args:
@@ -206,7 +206,7 @@ class Predictor(nn.Module):
         masks = masks.view(len(masks), len(embeds), -1, *pyramid.fine.shape[-2:])
         return Predictions(class_logits, masks.transpose(0, 1))
 
-    def _memories(self, pyramid: Pyramid) -> list[tuple[Tensor, Tensor]]:
+    def _memories(self, pyramid: PixelPyramid) -> list[tuple[Tensor, Tensor]]:
         """Keys and values of the three levels, each (B, S_l, C)."""
         memories = []
         for tokens, hw, embed in zip(
@@ -218,7 +218,7 @@ class Predictor(nn.Module):
         return memories
 
 
-def _mask_logits(embed: Tensor, pyramid: Pyramid, fine: Tensor) -> Tensor:
+def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:
     """Dot products of mask embeddings with mask features, the latter at any set of pixels.
 
     Args:
@@ -234,7 +234,7 @@ def _mask_logits(embed: Tensor, pyramid: Pyramid, fine: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _reduce(pyramid: Pyramid) -> list[Tensor]:
+def _reduce(pyramid: PixelPyramid) -> list[Tensor]:
     """Fine features at the size of each level, (B, C, S_l).
 
     Resizing is linear: a resized mask is the product of the embedding with resized features,

@@ -24,7 +24,7 @@ FAINTEST = 1e-6
 """Smallest semantic score whose logarithm is taken."""
 
 
-class Head(nn.Module):
+class Mask2FormerHead(nn.Module):
     """Pixel decoder, then query decoder."""
 
     def __init__(self, pixel_decoder: PixelDecoder, predictor: Predictor) -> None:
@@ -122,7 +122,7 @@ class Mask2Former(nn.Module):
             heads=attention_heads,
             ffn_dim=decoder_ffn_dim,
         )
-        self.sem_seg_head = Head(pixel_decoder, predictor)
+        self.sem_seg_head = Mask2FormerHead(pixel_decoder, predictor)
         self.inputs = inputs
 
     def forward(

@@ -17,7 +17,7 @@ GROUPS = 32
 NUM_LEVELS = 3
 
 
-class Pyramid(NamedTuple):
+class PixelPyramid(NamedTuple):
     """What the pixel decoder returns.
 
     Mask features are W f + b with the last 1 x 1 convolution (W, b). They are handed on as the
@@ -130,7 +130,7 @@ class PixelDecoder(nn.Module):
             assert conv.bias is not None, "these convolutions have a bias"
             nn.init.zeros_(conv.bias)
 
-    def forward(self, features: list[Tensor]) -> Pyramid:
+    def forward(self, features: list[Tensor]) -> PixelPyramid:
         """Decode.
 
         Args:
@@ -145,7 +145,7 @@ class PixelDecoder(nn.Module):
     def _precision(self, device_type: str) -> AbstractContextManager[object]:
         return torch.autocast(device_type, enabled=False) if self.fp32 else nullcontext()
 
-    def _decode(self, features: list[Tensor]) -> Pyramid:
+    def _decode(self, features: list[Tensor]) -> PixelPyramid:
         fine, *coarse = features
         maps = [project(x) for project, x in zip(self.input_proj, reversed(coarse), strict=True)]
         levels = tuple((x.shape[2], x.shape[3]) for x in maps)
@@ -161,6 +161,6 @@ class PixelDecoder(nn.Module):
         summed = self.adapter_1(fine.contiguous()) + upsampled
         last = self.mask_features
         assert last.bias is not None, "set in the constructor"
-        return Pyramid(
+        return PixelPyramid(
             F.relu(self.layer_1(summed)), last.weight.flatten(1), last.bias, per_level, levels
         )

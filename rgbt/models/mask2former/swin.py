@@ -37,7 +37,7 @@ class SwinShape:
         return c, 2 * c, 4 * c, 8 * c
 
 
-class PatchEmbed(nn.Module):
+class SwinPatchEmbed(nn.Module):
     """One token per 4 x 4 pixels: linear map of the pixels, then layer normalisation."""
 
     def __init__(self, in_channels: int, dim: int) -> None:
@@ -127,7 +127,7 @@ class Mlp(nn.Module):
         return out
 
 
-class Block(nn.Module):
+class SwinBlock(nn.Module):
     """Window attention and MLP, each normalised before and added to its input."""
 
     def __init__(self, dim: int, heads: int, shape: SwinShape, *, shift: int) -> None:
@@ -195,7 +195,7 @@ class Stage(nn.Module):
         dim, heads = shape.widths[index], shape.num_heads[index]
         shifts = (0, shape.window_size // 2)
         self.blocks = nn.ModuleList(
-            Block(dim, heads, shape, shift=shifts[block % 2])
+            SwinBlock(dim, heads, shape, shift=shifts[block % 2])
             for block in range(shape.depths[index])
         )
         self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
@@ -219,7 +219,7 @@ class Swin(nn.Module):
     def __init__(self, in_channels: int, *, shape: SwinShape, shared: dict[int, Stage]) -> None:
         super().__init__()
         self.shape = shape
-        self.patch_embed = PatchEmbed(in_channels, shape.embed_dim)
+        self.patch_embed = SwinPatchEmbed(in_channels, shape.embed_dim)
         self.mask_token = nn.Parameter(torch.empty(1, shape.embed_dim, 1, 1))
         nn.init.trunc_normal_(self.mask_token, std=0.02)
         self.layers = nn.ModuleList(
