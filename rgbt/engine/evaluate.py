@@ -1,4 +1,4 @@
-"""Predictions of a network over batches: no gradients, no scores, no logging."""
+"""Predictions of a network over batches: no gradients, no logging."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
+from rgbt.requirements import record_of
 from rgbt.types import Batch, View
+
+FAINTEST = 1e-6
+"""Smallest sum of semantic scores that shares are taken of."""
 
 HeadsOf = Callable[[tuple[str, ...]], tuple[str | None, ...]]
 """Names of images -> the head that predicts each; None: the network's only one."""
@@ -70,9 +74,32 @@ def class_maps(
         heads: which head predicts each image of the batch; () leaves it to the network.
     """
     with torch.inference_mode():
+        return label_scores(model, batch, fabric, view, heads).argmax(1).to(torch.uint8)
+
+
+def probabilities(
+    model: nn.Module,
+    batch: Batch,
+    fabric: Fabric,
+    view: View | None = None,
+    heads: Sequence[str | None] = (),
+) -> Tensor:
+    """(B, K, H', W') float32: probabilities of the classes; arguments as in `class_maps`.
+
+    Of class scores this is their softmax, taken after they were resized (bilinear) to the label, so
+    that the most probable class is the one that an evaluation counts.
+
+    Networks that return masks of queries have no class scores in this sense: theirs are sums over
+    queries of probabilities of classes and masks (Mask2Former, semantic inference), >= 0 and not
+    normalised, and a softmax of them would hardly differ between classes. Here each is divided by
+    the sum over classes. That share is low where queries of several classes claim a pixel; it does
+    not tell a pixel that queries of one class hardly claim from one that they claim wholly.
+    """
+    with torch.inference_mode():
         scores = label_scores(model, batch, fabric, view, heads)
-        classes: Tensor = scores.argmax(1).to(torch.uint8)
-    return classes
+        if record_of(model).outputs == "masks":
+            return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
+        return scores.softmax(1)
 
 
 def label_scores(

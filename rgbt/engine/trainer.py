@@ -7,6 +7,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -61,10 +62,11 @@ class Scheme(Protocol):
         ...
 
 
+@dataclass(kw_only=True, eq=False)
 class Trainer:
     """Runs a scheme to its last step, evaluating and writing checkpoints on the way.
 
-    Args:
+    Attributes:
         fabric: device, precision and gradient synchronisation.
         settings: durations and limits.
         scheme: yields the phases of a step.
@@ -79,34 +81,21 @@ class Trainer:
         committed: called after an evaluation has been committed.
     """
 
-    def __init__(  # noqa: PLR0913 - the loop is where everything meets
-        self,
-        *,
-        fabric: Fabric,
-        settings: TrainerSettings,
-        scheme: Scheme,
-        model: nn.Module,
-        others: dict[str, nn.Module],
-        optimizers: dict[str, torch.optim.Optimizer],
-        schedule: Schedule,
-        steps_per_epoch: int,
-        folder: Path,
-        record: RecordStep,
-        validate: Validate,
-        committed: Callable[[], None] = lambda: None,
-    ) -> None:
-        self.fabric = fabric
-        self.settings = settings
-        self.scheme = scheme
-        self.model = model
-        self.others = others
-        self.optimizers = optimizers
-        self.schedule = schedule
-        self.steps_per_epoch = steps_per_epoch
-        self.checkpoints = Checkpoints(folder)
-        self.record = record
-        self.validate = validate
-        self.committed = committed
+    fabric: Fabric
+    settings: TrainerSettings
+    scheme: Scheme
+    model: nn.Module
+    others: dict[str, nn.Module]
+    optimizers: dict[str, torch.optim.Optimizer]
+    schedule: Schedule
+    steps_per_epoch: int
+    folder: Path
+    record: RecordStep
+    validate: Validate
+    committed: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self.checkpoints = Checkpoints(self.folder)
 
     def resume(self, state: State) -> bool:
         """Take up everything from the last checkpoint into `state`; False if there is none.
@@ -174,7 +163,10 @@ class Trainer:
             with at_once():
                 score = self.validate(state.step) if due else -math.inf
             if due:
-                self._choose(score, state)
+                if score > state.best_score or self.settings.tested == "last":
+                    self.checkpoints.save_best(state.step, self.model.state_dict())
+                    state.best_score, state.best_step = score, state.step
+                state.evaluated_step = state.step
             if due or state.step % self.settings.checkpoint_every == 0:
                 self._save(state)
             if due:
@@ -186,12 +178,6 @@ class Trainer:
             stop.step = state.step
             raise
 
-    def _choose(self, score: float, state: State) -> None:
-        if score > state.best_score or self.settings.tested == "last":
-            self.checkpoints.save_best(state.step, self.model.state_dict())
-            state.best_score, state.best_step = score, state.step
-        state.evaluated_step = state.step
-
     def _save(self, state: State) -> None:
         check_weights({"model": self.model, **self.others}, state.step)
         payload = training_payload(self.model, self.others, self.optimizers, state)
@@ -201,12 +187,14 @@ class Trainer:
         """One optimiser step of every phase; what to record of it."""
         started = time.perf_counter()
         rates = self._set_rates(step)
-        first = step * self.settings.accumulate
         micro = [next(batches) for _ in range(self.settings.accumulate)]
         waited = time.perf_counter() - started
+        device = self.fabric.device
         parts = [
-            self.scheme.phases(batch.to(self.fabric.device), self._generators(seed, first + number))
-            for number, batch in enumerate(micro)
+            self.scheme.phases(
+                batch.to(device), partial(torch_generator_of, seed=seed, index=index, device=device)
+            )
+            for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
         with _naming(step):
@@ -220,11 +208,8 @@ class Trainer:
             **rates,
             "images_per_s": sum(len(batch.name) for batch in micro) / elapsed,
             WAIT_SHARE: waited / elapsed,
-            "peak_memory_mib": _peak_memory_mib(self.fabric.device),
+            "peak_memory_mib": _peak_memory_mib(device),
         }
-
-    def _generators(self, seed: int, index: int) -> GeneratorOf:
-        return partial(torch_generator_of, seed=seed, index=index, device=self.fabric.device)
 
     def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
         """Backward through a phase of every accumulated batch, then its optimisers' steps."""
@@ -236,10 +221,8 @@ class Trainer:
             _add(logged, self._backward(next(phases)))
         stepped = [self.optimizers[name] for name in phase.optimizers]
         # Once for all of them: what two optimisers share is clipped as one gradient.
-        norm = nn.utils.clip_grad_norm_(
-            _parameters(stepped),
-            self.settings.clip_norm or math.inf,
-        )
+        limit = self.settings.clip_norm or math.inf
+        norm = nn.utils.clip_grad_norm_(_parameters(stepped), limit)
         names = "+".join(phase.optimizers)
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
         logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]

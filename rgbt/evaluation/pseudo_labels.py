@@ -38,7 +38,7 @@ from rgbt.data.pseudo_labels import (
     label_path,
     read_pair,
 )
-from rgbt.engine.confidence import probabilities
+from rgbt.engine.evaluate import probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
 from rgbt.evaluation.request import EvaluationRequest
@@ -118,7 +118,7 @@ def write_pseudo_labels(
     """Predict a split with the network of `session` and write its sure pixels as labels.
 
     The confidence of a pixel is the largest of its class probabilities
-    (`rgbt.engine.confidence.probabilities`), with a label map that of the network's own class. A
+    (`rgbt.engine.evaluate.probabilities`), with a label map that of the network's own class. A
     folder that is finished with the same settings is returned as it is. A second process that
     writes to the same folder waits for the first.
 

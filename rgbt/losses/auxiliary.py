@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,23 +12,20 @@ from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Loss, Output
 
 
+@dataclass(frozen=True, kw_only=True)
 class WithAuxiliary:
     """A loss of the class scores plus ``weight`` times the same loss of the auxiliary ones.
 
     Source: PSPNet (0.4); AdaptSegNet, Eq. 5, and MaxSquareLoss (0.1); thesis (J. Sun), code (0.1
     with maximum squares).
 
-    Args:
+    Attributes:
         loss: of class scores.
         weight: finite, >= 0.
-
-    Raises:
-        InputError: a weight out of range.
     """
 
-    def __init__(self, *, loss: Loss, weight: NonNegative) -> None:
-        self.loss = loss
-        self.weight = weight
+    loss: Loss
+    weight: NonNegative
 
     @property
     def record(self) -> Record:

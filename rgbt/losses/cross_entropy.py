@@ -27,9 +27,6 @@ class CrossEntropy:
 
     Args:
         class_weights: c, one value >= 0 per class; null weighs all classes alike.
-
-    Raises:
-        InputError: a negative weight.
     """
 
     record = Record(requires=(Requirement("model", "outputs", "scores"),), weighs_confidence=True)

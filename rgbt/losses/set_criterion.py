@@ -50,9 +50,6 @@ class SetCriterion:
         no_object_weight: >= 0.
         deep_supervision: whether the auxiliary layers count, or the last one alone.
         spatial: weights of the pixels in BCE and dice.
-
-    Raises:
-        InputError: a setting out of its range.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration

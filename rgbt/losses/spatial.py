@@ -42,9 +42,6 @@ class SpatialWeight:
         dice_smoothing: 1 in numerator and denominator, as in the unweighted loss, or none (Eq. 17).
         match: whether the matching costs are weighted too.
         passes: which predictions are weighted: all, or those from RGB-T (clean and masked) alone.
-
-    Raises:
-        InputError: alpha below 0.
     """
 
     alpha: NonNegative

@@ -5,6 +5,7 @@ How the second frame is made and how the first prediction is brought into it is 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -23,6 +24,7 @@ Second = Literal["none", "dice", "con", "con_acc"]
 OWN = ("dice", "con", "con_acc")
 
 
+@dataclass(frozen=True, kw_only=True)
 class TemporalLoss:
     """Segmentation of both frames, Dice of the first, and Dice or consistency of the second.
 
@@ -31,7 +33,7 @@ class TemporalLoss:
     Source: Temporal, Eq. (4) with X = con; Table I for the other X, and for what is left out.
     Released: alpha = beta = 1; X is dice, con or con_acc.
 
-    Args:
+    Attributes:
         segmentation: seg, of each frame by itself. Paper and released: cross-entropy.
         alpha: finite, >= 0; with 0, the Dice loss of the first frame is not computed.
         beta: finite, >= 0; 0 if and only if `second` is "none".
@@ -40,33 +42,26 @@ class TemporalLoss:
         form: of the Dice and the consistency losses, see there.
 
     Raises:
-        InputError: a coefficient out of its range; a beta without a loss, a loss without a beta.
+        InputError: a beta without a loss, a loss without a beta.
     """
 
-    def __init__(
-        self,
-        *,
-        segmentation: Loss,
-        alpha: NonNegative,
-        beta: NonNegative,
-        second: Second,
-        form: Form,
-    ) -> None:
-        if second == "none" and beta:
+    segmentation: Loss
+    alpha: NonNegative
+    beta: NonNegative
+    second: Second
+    form: Form
+
+    def __post_init__(self) -> None:
+        if self.second == "none" and self.beta:
             raise InputError(
-                f"loss.beta={beta:g} weighs nothing with loss.second=none; set loss.beta=0, or "
-                "choose loss.second=dice, con or con_acc."
+                f"loss.beta={self.beta:g} weighs nothing with loss.second=none; set loss.beta=0, "
+                "or choose loss.second=dice, con or con_acc."
             )
-        if second != "none" and not beta:
+        if self.second != "none" and not self.beta:
             raise InputError(
-                f"loss.beta=0 leaves nothing of loss.second={second}; set loss.second=none, or a "
-                "loss.beta above 0."
+                f"loss.beta=0 leaves nothing of loss.second={self.second}; set loss.second=none, or "
+                "a loss.beta above 0."
             )
-        self.segmentation = segmentation
-        self.alpha = alpha
-        self.beta = beta
-        self.second = second
-        self.form: Form = form
 
     @property
     def record(self) -> Record:

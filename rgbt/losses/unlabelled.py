@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -17,6 +18,7 @@ LEAST = 1e-30
 """Smallest probability that a logarithm is taken of (ADVENT release)."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class MaxSquares:
     """Negative sum of squared probabilities.
 
@@ -33,21 +35,15 @@ class MaxSquares:
     Source: MaxSquareLoss; thesis (J. Sun), Eq. 2: "pixels".   Released: "entries", by both. The
     released weights belong to it: 0.1 (both), and 0.09 with r = 0.2 (MaxSquareLoss, K = 19).
 
-    Args:
+    Attributes:
         weight: factor of the loss, >= 0.
         normalisation: see above.
         image_wise_ratio: r in [0, 1]; null weighs all pixels alike.
-
-    Raises:
-        InputError: a value out of range.
     """
 
-    def __init__(
-        self, *, weight: NonNegative, normalisation: Normalisation, image_wise_ratio: Share | None
-    ) -> None:
-        self.weight = weight
-        self.normalisation = normalisation
-        self.image_wise_ratio = image_wise_ratio
+    weight: NonNegative
+    normalisation: Normalisation
+    image_wise_ratio: Share | None
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
         """The part "max_squares".
@@ -69,21 +65,18 @@ class MaxSquares:
         return {"max_squares": -self.weight * value / (probabilities.shape[1] if entries else 1)}
 
 
+@dataclass(frozen=True, kw_only=True)
 class Entropy:
     """Mean over pixels of ``-sum_k p_k log p_k / log K``, in [0, 1].
 
     Source: ADVENT, Eqs. 2 and 3; thesis (J. Sun), Eq. 1, which does not print the mean.
     Released: ADVENT, with weight 0.001.
 
-    Args:
+    Attributes:
         weight: factor of the loss, >= 0.
-
-    Raises:
-        InputError: a weight out of range.
     """
 
-    def __init__(self, *, weight: NonNegative) -> None:
-        self.weight = weight
+    weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
         """The part "entropy".

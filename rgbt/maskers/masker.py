@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -37,6 +38,7 @@ NEEDED: dict[str, set[str]] = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
 class Masker:
     """Draws which cells of a crop are hidden in RGB and in thermal.
 
@@ -52,7 +54,7 @@ class Masker:
     Its width: ``sigma_p = N_y / sigma_div`` cells. Whether N_y counts the rows of the image or of
     the crop is open in the paper; the release takes the padded crop (`sigma_height: null`).
 
-    Args:
+    Attributes:
         sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "square" one
             rectangle (CRM, Fig. 5); "gaussian_count" a fixed number, likelier near the anchor
             (SpatialSeg as released); "gaussian_bernoulli" each cell independently with the
@@ -70,33 +72,19 @@ class Masker:
             1/3 each.
 
     Raises:
-        InputError: a setting that cannot take effect is not None, a needed one is None, or a value
-            is out of range.
+        InputError: a setting that cannot take effect is not None, a needed one is None, or the
+            settings do not fit each other.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of conf/masker/
-        self,
-        *,
-        sampler: Sampler,
-        patch_size: PatchSize | None,
-        ratio: Share | None,
-        sigma_div: Annotated[float, Interval(ge=0.001, le=10_000)] | None,
-        sigma_height: Pixels | None,
-        anchor: Literal["grid", "tracked"] | None,
-        cell_position: Literal["index", "centre"] | None,
-        pairing: Literal["comp", "rand_comp", "indiv"] | None,
-        pattern_probabilities: tuple[Share, Share, Share] | None,
-    ) -> None:
-        self.sampler = sampler
-        self.patch_size = patch_size
-        self.ratio = ratio
-        self.sigma_div = sigma_div
-        self.sigma_height = sigma_height
-        self.anchor = anchor
-        self.cell_position = cell_position
-        self.pairing = pairing
-        self.pattern_probabilities = pattern_probabilities
-        self._check_settings()
+    sampler: Sampler
+    patch_size: PatchSize | None
+    ratio: Share | None
+    sigma_div: Annotated[float, Interval(ge=0.001, le=10_000)] | None
+    sigma_height: Pixels | None
+    anchor: Literal["grid", "tracked"] | None
+    cell_position: Literal["index", "centre"] | None
+    pairing: Literal["comp", "rand_comp", "indiv"] | None
+    pattern_probabilities: tuple[Share, Share, Share] | None
 
     @property
     def record(self) -> Record:
@@ -179,7 +167,7 @@ class Masker:
         offset = 0.0 if by_index else 0.5
         return pattern.gaussian_log_weight(grid_hw, centre, rows / self.sigma_div, offset)
 
-    def _check_settings(self) -> None:
+    def __post_init__(self) -> None:
         needed = NEEDED[self.sampler]
         optional = {"sigma_height"} if "sigma_div" in needed else set()
         if self.pairing == "rand_comp":

@@ -35,9 +35,6 @@ class CmxTransform:
         padding_thermal: mean of every channel that the network takes thermal for, likewise.
         test_short_edge: short edge of evaluated images in pixels; None keeps their size.
         track_position: whether examples carry the map of source positions.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -67,12 +64,7 @@ class CmxTransform:
         return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example of `crop_hw`; what is padding is 255 in its label.
-
-        Args:
-            sample: as it lies on disk; without a label, all pixels are ignored.
-            rng: every draw comes from here.
-        """
+        """Augmented example of `crop_hw`; what is padding is 255 in its label."""
         source_hw = image_hw(sample)
         flipped = bool(rng.random() < self.flip_probability)
         factor = float(rng.choice(self.factors))

@@ -47,9 +47,6 @@ class CrmTransform:
         test_short_edge: short edge of evaluated images in pixels; labels keep the size of the
             file. None keeps the images as well.
         track_position: whether examples carry the map of source positions.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -86,12 +83,7 @@ class CrmTransform:
         )
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example.
-
-        Args:
-            sample: as it lies on disk; without a label, all pixels are ignored.
-            rng: every draw comes from here.
-        """
+        """Augmented example."""
         view, colours = self._draw(sample, rng)
         # Colours change pixel by pixel, so that it does not matter that the flip comes before.
         example = viewed(sample, view, self.dtype, track_position=self.track_position)
@@ -109,12 +101,7 @@ class CrmTransform:
         return Record(crop_hw=self.crop_hw, works_on_batches=self.dtype == np.uint8)
 
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Drawn:
-        """What `train` would read and do, not done yet; the same draws.
-
-        Args:
-            sample: as it lies on disk; without a label, all pixels are ignored.
-            rng: every draw comes from here.
-        """
+        """What `train` would read and do, not done yet; the same draws."""
         return Drawn.of(sample, *self._draw(sample, rng))
 
     def stack(self, drawn: Sequence[Drawn]) -> DrawnBatch:

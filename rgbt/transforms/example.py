@@ -1,4 +1,8 @@
-"""What a transform returns, and how it is made of a sample and a view."""
+"""What a transform returns, and how it is made of a sample and a view.
+
+Every transform has `train(sample, rng)`, for which all draws come from `rng`, and `test(sample)`;
+of a sample without a label, all pixels are ignored.
+"""
 
 from __future__ import annotations
 

@@ -14,8 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from rgbt.checks import InputError
-
 Indices = NDArray[np.int64]
 
 
@@ -196,21 +194,6 @@ def short_edge_hw(
         factor = min(factor, max_size / max(source_hw))
     height, width = source_hw
     return int(factor * height + 0.5), int(factor * width + 0.5)
-
-
-def check_lengths(**lengths: tuple[int | None, ...] | None) -> None:
-    """Raise InputError unless all lengths of a transform, by key, are at least 1 pixel.
-
-    Args:
-        lengths: None where the key is not set, and within a list where a length is not.
-    """
-    for key, values in lengths.items():
-        if values is None:
-            continue
-        if not values or any(value is not None and value < 1 for value in values):
-            raise InputError(
-                f"transform.{key} must hold lengths of at least 1 pixel, got {list(values)}."
-            )
 
 
 def nearest_source(source: int, resized: int) -> Indices:

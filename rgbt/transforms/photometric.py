@@ -46,9 +46,6 @@ class ColourJitter:
         hue_delta: added hue is a whole number uniform in -delta..delta, in OpenCV's units (2
             degrees for uint8 images).
         thermal_contrast_range: factor of thermal is uniform in [low, high].
-
-    Raises:
-        InputError: a value out of range.
     """
 
     probability: Share

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -14,6 +15,7 @@ from rgbt.transforms.joint import Part, View
 from rgbt.types import Sample
 
 
+@dataclass(frozen=True, kw_only=True)
 class RtfnetTransform:
     """Mirrors, cuts a drawn share off every side, stretches what is left to a fixed size.
 
@@ -23,31 +25,19 @@ class RtfnetTransform:
     bicubic in newer ones, where thermal, stored as the alpha channel, also weights the colours.
     Here RGB and thermal are resized for themselves, bilinearly, and labels by nearest.
 
-    Args:
+    Attributes:
         flip_probability: in [0, 1].
         cut_share: largest part of a side that is cut off at either end, in [0, 0.5].
         crop_hw: size of the result in pixels, always; the aspect is not kept.
         test_short_edge: short edge of evaluated images in pixels; None keeps their size.
         track_position: whether examples carry the map of source positions.
-
-    Raises:
-        InputError: a value out of range.
     """
 
-    def __init__(
-        self,
-        *,
-        flip_probability: Share,
-        cut_share: Annotated[float, Interval(ge=0, le=0.5)],
-        crop_hw: Size,
-        test_short_edge: Pixels | None,
-        track_position: bool,
-    ) -> None:
-        self.flip_probability = flip_probability
-        self.cut_share = cut_share
-        self.crop_hw = crop_hw
-        self.test_short_edge = test_short_edge
-        self.track_position = track_position
+    flip_probability: Share
+    cut_share: Annotated[float, Interval(ge=0, le=0.5)]
+    crop_hw: Size
+    test_short_edge: Pixels | None
+    track_position: bool
 
     @property
     def record(self) -> Record:
@@ -55,12 +45,7 @@ class RtfnetTransform:
         return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example of `crop_hw`.
-
-        Args:
-            sample: as it lies on disk; without a label, all pixels are ignored.
-            rng: every draw comes from here.
-        """
+        """Augmented example of `crop_hw`."""
         source_hw = image_hw(sample)
         flipped = bool(rng.random() < self.flip_probability)
         top, bottom = draw_ends(source_hw[0], self.cut_share, rng)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -24,6 +24,7 @@ OddPixels = Annotated[
 ]
 
 
+@dataclass(frozen=True, kw_only=True)
 class ThesisTransform:
     """Resizes the whole image to a fixed size, mirrors it, blurs RGB and thermal together.
 
@@ -37,7 +38,7 @@ class ThesisTransform:
     Confidences of labels are resized by nearest, and mirrored with the image, the label and the
     thermal image (the thesis' code forgets them).
 
-    Args:
+    Attributes:
         crop_hw: size of the result in pixels, always; the aspect is not kept, nothing is cut.
         flip_probability: in [0, 1].
         blur_probability: in [0, 1].
@@ -47,29 +48,15 @@ class ThesisTransform:
         test_short_edge: short edge of evaluated images in pixels; None keeps their size. Labels
             keep the size of the file.
         track_position: whether examples carry the map of source positions.
-
-    Raises:
-        InputError: a value out of range.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of the configuration
-        self,
-        *,
-        crop_hw: Size,
-        flip_probability: Share,
-        blur_probability: Share,
-        blur_kernel: OddPixels,
-        label_resize: Literal["nearest", "bilinear"],
-        test_short_edge: Pixels | None,
-        track_position: bool,
-    ) -> None:
-        self.crop_hw = crop_hw
-        self.flip_probability = flip_probability
-        self.blur_probability = blur_probability
-        self.blur_kernel = blur_kernel
-        self.of_label = View.nearest if label_resize == "nearest" else mixed
-        self.test_short_edge = test_short_edge
-        self.track_position = track_position
+    crop_hw: Size
+    flip_probability: Share
+    blur_probability: Share
+    blur_kernel: OddPixels
+    label_resize: Literal["nearest", "bilinear"]
+    test_short_edge: Pixels | None
+    track_position: bool
 
     @property
     def record(self) -> Record:
@@ -77,12 +64,7 @@ class ThesisTransform:
         return Record(crop_hw=self.crop_hw)
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example of `crop_hw`.
-
-        Args:
-            sample: as it lies on disk; without a label, all pixels are ignored.
-            rng: every draw comes from here.
-        """
+        """Augmented example of `crop_hw`."""
         flipped = bool(rng.random() < self.flip_probability)
         blurred = bool(rng.random() < self.blur_probability)
         view = View(image_hw(sample), self.crop_hw, (0, 0), self.crop_hw, flipped)
@@ -92,7 +74,7 @@ class ThesisTransform:
             np.uint8,
             track_position=self.track_position,
             of_image=area,
-            of_label=self.of_label,
+            of_label=View.nearest if self.label_resize == "nearest" else mixed,
         )
         if not blurred:
             return example

@@ -23,7 +23,7 @@ from rgbt.data.domains import Domain, Domains
 from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
-from rgbt.engine.confidence import probabilities
+from rgbt.engine.evaluate import probabilities
 from rgbt.evaluation import pseudo_labels as pseudo
 from rgbt.evaluation.pseudo_labels import (
     Labelling,
