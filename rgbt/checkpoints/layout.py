@@ -82,7 +82,7 @@ class Rule:
 
 
 class Layout(Protocol):
-    """A module of `rgbt.checkpoints.layouts`."""
+    """A module of `rgbt.checkpoints.layouts`; files of whole networks fit their own family only."""
 
     def recognise(self, contents: Contents) -> Facts | None:
         """What the file is, None where it is of another layout."""
@@ -93,6 +93,11 @@ class Layout(Protocol):
         ...
 
 
+def own_names(_family: str, _model: nn.Module, _facts: Facts) -> Rule:
+    """The rule of files whose names are the network's."""
+    return Rule()
+
+
 def reason(reasons: Reasons, name: str) -> str | None:
     """The first reason whose pattern fits the beginning of `name`."""
     return next((why for pattern, why in reasons if re.match(pattern, name)), None)
@@ -101,6 +106,11 @@ def reason(reasons: Reasons, name: str) -> str | None:
 def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     """Name -> shape."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
+def has_parts(names: Collection[str], *parts: str) -> bool:
+    """Whether there are names that begin with each of the parts."""
+    return all(any(name.startswith(part) for name in names) for part in parts)
 
 
 def size_at(shapes: Shapes, name: str, dimension: int = 0) -> int | None:

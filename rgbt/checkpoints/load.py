@@ -86,7 +86,8 @@ def _rule(model: nn.Module, contents: Contents, facts: Facts) -> Rule | None:
     """How the network takes the file; with exactly its own names, any network does."""
     family = family_of(type(model))
     found = None
-    if facts.layout in LAYOUTS and (family or facts.layout == "own"):
+    of_any = not facts.family or (facts.layout == "own" and not family)
+    if facts.layout in LAYOUTS and (of_any or facts.family == family):
         try:
             found = LAYOUTS[facts.layout].rule(family, model, facts)
         except InputError as error:

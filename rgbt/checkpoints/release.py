@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,27 +22,19 @@ Note = Mapping[str, str]
 """What an export says about itself: which network, how it is fed, which run."""
 
 
-def _lightning(state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
+Container = Callable[[Mapping[str, Tensor], Note], Any]
+RELEASED: Mapping[str, Container] = {
     # Without the configuration object of the release, which its test does not read from here.
-    return {
+    "mask2former": lambda state, note: {
         "epoch": 0,
         "global_step": int(note.get("step", 0)),
         "pytorch-lightning_version": "1.9.2",
         "state_dict": mask2former.released(state),
         NOTE: dict(note),
-    }
-
-
-def _under_model(state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
-    return {"model": cmx.released(state), NOTE: dict(note)}
-
-
-Container = Callable[[Mapping[str, Tensor], Note], Any]
-RELEASED: Mapping[str, Container] = {
-    "mask2former": _lightning,
-    "cmx": _under_model,
-    "rtfnet": lambda state, _: rtfnet.released(state),
-    "mfnet": lambda state, _: mfnet.released(state),
+    },
+    "cmx": lambda state, note: {"model": OrderedDict(state), NOTE: dict(note)},
+    "rtfnet": lambda state, _: OrderedDict(state),
+    "mfnet": lambda state, _: OrderedDict(state),
     "pspnet": lambda state, _: heatnet.released(state),
 }
 """Family -> what its release's torch.load gives."""

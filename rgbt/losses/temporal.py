@@ -59,8 +59,8 @@ class TemporalLoss:
             )
         if self.second != "none" and not self.beta:
             raise InputError(
-                f"loss.beta=0 leaves nothing of loss.second={self.second}; set loss.second=none, or "
-                "a loss.beta above 0."
+                f"loss.beta=0 leaves nothing of loss.second={self.second}; set loss.second=none, "
+                "or a loss.beta above 0."
             )
 
     @property

@@ -1,5 +1,16 @@
 """Networks: two images and an optional pair of masks in, `Output(logits, aux)` out.
 
 One folder per family. A network never computes a loss, reads no file and draws no random number
-except from the generator it is handed.
+except from the generator it is handed. All are called alike; each `forward` says what it adds:
+
+    rgb        (N, 3, H, W) float in [0, 1]
+    thermal    (N, 1, H, W) float in [0, 1]
+    masks      cells of the image padded to multiples of 32, (N, h, w) bool each, True = the pixels
+               are hidden; None: nothing is hidden
+    views      what is predicted from, one of the record's; () is its first
+    generator  of all that is dropped at random in training; where nothing is, it is not drawn from
+    -> logits  (N, K, H, W) class scores
+
+ValueError: shapes that do not fit each other, or no generator where one is needed. InputError:
+another view, or mask cells that do not divide the padded image.
 """

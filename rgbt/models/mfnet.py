@@ -134,24 +134,7 @@ class MFNet(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
     ) -> Output:
-        """Class scores from both images.
-
-        Args:
-            rgb: (N, 3, H, W) float in [0, 1].
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: hidden cells of the image padded to multiples of 32, (N, h, w) bool each; None:
-                nothing is hidden.
-            views: () or ("rgbt",).
-            generator: not drawn from.
-
-        Returns:
-            logits: (N, K, H, W).
-            aux: empty.
-
-        Raises:
-            ValueError: shapes that do not fit each other.
-            InputError: another view, or mask cells that do not divide the padded image.
-        """
+        """Class scores from both images, as `rgbt.models` says; `aux` is empty."""
         only_view(views, self.record.views, "MFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         encoded = (self._encode("rgb", images.rgb), self._encode("inf", images.thermal))

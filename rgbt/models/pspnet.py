@@ -104,14 +104,7 @@ class PSPNet(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Class scores at the size of the image.
-
-        Args:
-            rgb: (N, 3, H, W) float in [0, 1].
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: cells of the image padded to multiples of 32, True = the pixels are hidden.
-            views: () or the one of its record.
-            generator: draws the dropped channels; needed in training unless `dropout` is 0.
+        """Class scores at the size of the image, as `rgbt.models` says.
 
         Returns:
             logits: (N, K, H, W).
@@ -119,10 +112,6 @@ class PSPNet(nn.Module):
                 concatenated, sides H and W rounded up to multiples of 8 and then divided by s:
                 "layer4" (32 w, s = 8), "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8),
                 "layer1" (4 w per branch, s = 4), "stem" (w per branch, s = 4).
-
-        Raises:
-            ValueError: shapes that do not fit; no generator where one is needed.
-            InputError: another view; mask cells that do not divide the padded image.
         """
         only_view(views, self.record.views, "PSPNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)

@@ -170,22 +170,9 @@ class RTFNet(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
     ) -> Output:
-        """Class scores from both images.
+        """Class scores from both images, as `rgbt.models` says; `aux` is empty.
 
-        Args:
-            rgb: (N, 3, H, W) float in [0, 1].
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: hidden cells of the padded image, (N, h, w) bool each; None: nothing is hidden.
-            views: () or ("rgbt",).
-            generator: not drawn from.
-
-        Returns:
-            logits: (N, K, H, W), >= 0 where `final_relu`.
-            aux: empty.
-
-        Raises:
-            ValueError: shapes that do not fit each other.
-            InputError: another view, or mask cells that do not divide the padded image.
+        They are >= 0 where `final_relu`.
         """
         only_view(views, self.record.views, "RTFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.layout import Facts, Rule, shapes_of, size_at
+from rgbt.checkpoints.layout import Facts, Rule, has_parts, shapes_of, size_at
 from rgbt.checkpoints.layouts.mit import mit_size, mit_title
 from rgbt.checkpoints.read import Contents
 
@@ -23,8 +23,7 @@ TEMPORAL = ("model/inputs=temporal",)
 def recognise(contents: Contents) -> Facts | None:
     """A file with both streams under `backbone.`; `voting.` tells the releases apart."""
     shapes = shapes_of(contents.tensors)
-    parts = ("backbone.patch_embed", "backbone.extra_patch_embed", "backbone.F")
-    if not all(any(name.startswith(part) for name in shapes) for part in parts):
+    if not has_parts(shapes, "backbone.patch_embed", "backbone.extra_patch_embed", "backbone.F"):
         return None
     temporal = any(name.startswith(VOTING) for name in shapes)
     size = mit_size(shapes, "backbone.")
@@ -40,16 +39,9 @@ def recognise(contents: Contents) -> Facts | None:
     )
 
 
-def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
+def rule(_family: str, _model: nn.Module, _facts: Facts) -> Rule:
     """Names are ours."""
-    if family != "cmx":
-        return None
     return Rule(leftover=((r"voting\.", "never used by the temporal release"),))
-
-
-def released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """CMX's names, which are ours."""
-    return OrderedDict(state)
 
 
 def released_temporal(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

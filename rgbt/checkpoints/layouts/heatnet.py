@@ -11,7 +11,6 @@ from rgbt.checkpoints.layout import Facts, Rule, shapes_of, size_at
 from rgbt.checkpoints.read import Contents
 
 PREFIX = "trgb_segnet."
-CRITICS = "critics."
 WRAPPED = "module."
 """What the released files carry before every name."""
 
@@ -42,10 +41,8 @@ def recognise(contents: Contents) -> Facts | None:
     )
 
 
-def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
+def rule(_family: str, _model: nn.Module, _facts: Facts) -> Rule:
     """Names are ours; discriminators are networks of their own here."""
-    if family != "pspnet":
-        return None
     return Rule(leftover=((r"critics\.", "a discriminator, which is a network of its own here"),))
 
 

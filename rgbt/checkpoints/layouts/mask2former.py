@@ -15,6 +15,7 @@ from rgbt.checkpoints.layout import (
     Rule,
     Shapes,
     count_blocks,
+    has_parts,
     shapes_of,
     size_at,
 )
@@ -34,8 +35,7 @@ def recognise(contents: Contents) -> Facts | None:
     """A file with the two branches and the head."""
     names = contents.tensors.keys()
     prefix = PREFIX if any(name.startswith(PREFIX) for name in names) else ""
-    parts = (f"{prefix}{RGB}", f"{prefix}sem_seg_head.")
-    if not all(any(name.startswith(part) for name in names) for part in parts):
+    if not has_parts(names, f"{prefix}{RGB}", f"{prefix}sem_seg_head."):
         return None
     shapes = {name.removeprefix(prefix): s for name, s in shapes_of(contents.tensors).items()}
     rows = size_at(shapes, CLASS_WEIGHT)
@@ -94,10 +94,8 @@ def share_start(contents: Contents) -> int:
     return 4
 
 
-def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
+def rule(_family: str, _model: nn.Module, _facts: Facts) -> Rule:
     """Names are ours, but for constants that are rebuilt here."""
-    if family != "mask2former":
-        return None
     return Rule(
         leftover=(
             (r".*\.relative_position_index$", DERIVED),

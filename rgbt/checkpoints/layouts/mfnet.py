@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Mapping
-
-from torch import Tensor, nn
-
-from rgbt.checkpoints.layout import Facts, Rule, shapes_of, size_at
+from rgbt.checkpoints.layout import Facts, has_parts, own_names, shapes_of, size_at
 from rgbt.checkpoints.read import Contents
 
 WIDTHS = {"conv1_rgb": 16, "conv5_rgb.conv1_left": 48, "conv5_inf.conv1_left": 18}
@@ -20,8 +15,7 @@ CONVENTION = ("model/inputs=unit", "model.final_activation=true")
 def recognise(contents: Contents) -> Facts | None:
     """A file with both encoders ("inf" is thermal) and the decoder."""
     shapes = shapes_of(contents.tensors)
-    parts = ("conv1_rgb.conv.", "conv1_inf.conv.", "decode")
-    if not all(any(name.startswith(part) for name in shapes) for part in parts):
+    if not has_parts(shapes, "conv1_rgb.conv.", "conv1_inf.conv.", "decode"):
         return None
     published = all(
         size_at(shapes, f"{unit}.conv.weight") == width for unit, width in WIDTHS.items()
@@ -36,11 +30,4 @@ def recognise(contents: Contents) -> Facts | None:
     )
 
 
-def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
-    """Names are ours."""
-    return Rule() if family == "mfnet" else None
-
-
-def released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """MFNet's names, which are ours."""
-    return OrderedDict(state)
+rule = own_names

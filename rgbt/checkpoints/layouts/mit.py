@@ -10,6 +10,7 @@ from rgbt.checkpoints.layout import (
     Rule,
     Shapes,
     count_blocks,
+    has_parts,
     shapes_of,
     size_at,
 )
@@ -29,9 +30,7 @@ SIZES: dict[tuple[int, tuple[int, ...]], str] = {
 def recognise(contents: Contents) -> Facts | None:
     """A file with one stream at the top."""
     shapes = shapes_of(contents.tensors)
-    if not any(name.startswith("patch_embed1.") for name in shapes):
-        return None
-    if not any(name.startswith("block1.0.attn.") for name in shapes):
+    if not has_parts(shapes, "patch_embed1.", "block1.0.attn."):
         return None
     size = mit_size(shapes, "")
     return Facts(

@@ -6,7 +6,7 @@ import re
 
 from torch import nn
 
-from rgbt.checkpoints.layout import NOT_IN_FILE, Facts, Rule, count_blocks, shapes_of
+from rgbt.checkpoints.layout import NOT_IN_FILE, Facts, Rule, count_blocks, has_parts, shapes_of
 from rgbt.checkpoints.read import Contents
 from rgbt.requirements import record_of
 
@@ -31,8 +31,7 @@ def recognise(contents: Contents) -> Facts | None:
     names = contents.tensors.keys()
     prefix = SCALE if names and all(name.startswith(SCALE) for name in names) else ""
     shapes = {name.removeprefix(prefix): s for name, s in shapes_of(contents.tensors).items()}
-    parts = ("bn1.", "layer1.0.conv1.", "layer4.0.conv1.")
-    if not all(any(name.startswith(part) for name in shapes) for part in parts):
+    if not has_parts(shapes, "bn1.", "layer1.0.conv1.", "layer4.0.conv1."):
         return None
     bottlenecks = any(re.match(r"layer\d\.\d+\.conv3\.", name) for name in shapes)
     blocks = tuple(count_blocks(shapes, rf"layer{stage}\.(\d+)\.") for stage in range(1, 5))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Mapping
-
-from torch import Tensor, nn
-
-from rgbt.checkpoints.layout import Facts, Rule, count_blocks, shapes_of, size_at
+from rgbt.checkpoints.layout import (
+    Facts,
+    count_blocks,
+    has_parts,
+    own_names,
+    shapes_of,
+    size_at,
+)
 from rgbt.checkpoints.layouts.resnet import DEPTHS
 from rgbt.checkpoints.read import Contents
 
@@ -17,8 +19,7 @@ CONVENTION = ("model/inputs=unit", "model.final_relu=true")
 def recognise(contents: Contents) -> Facts | None:
     """A file with both encoders and the decoder."""
     shapes = shapes_of(contents.tensors)
-    parts = ("encoder_rgb_", "encoder_thermal_", "deconv")
-    if not all(any(name.startswith(part) for name in shapes) for part in parts):
+    if not has_parts(shapes, "encoder_rgb_", "encoder_thermal_", "deconv"):
         return None
     bottlenecks = any(name.startswith("encoder_rgb_layer1.0.conv3.") for name in shapes)
     blocks = tuple(
@@ -36,11 +37,4 @@ def recognise(contents: Contents) -> Facts | None:
     )
 
 
-def rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
-    """Names are ours."""
-    return Rule() if family == "rtfnet" else None
-
-
-def released(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """RTFNet's names, which are ours."""
-    return OrderedDict(state)
+rule = own_names

@@ -12,6 +12,7 @@ from rgbt.checkpoints.layout import (
     Facts,
     Rule,
     count_blocks,
+    has_parts,
     shapes_of,
     size_at,
 )
@@ -35,9 +36,7 @@ BRANCHES = ("backbone.RGB_branch.", "backbone.THR_branch.")
 def recognise(contents: Contents) -> Facts | None:
     """A file with Swin's names at the top."""
     shapes = shapes_of(contents.tensors)
-    if not any(name.startswith("patch_embed.proj.") for name in shapes):
-        return None
-    if not any(name.startswith("layers.0.blocks.0.attn.qkv.") for name in shapes):
+    if not has_parts(shapes, "patch_embed.proj.", "layers.0.blocks.0.attn.qkv."):
         return None
     depths = tuple(count_blocks(shapes, rf"layers\.{n}\.blocks\.(\d+)\.") for n in range(4))
     size = SIZES.get((size_at(shapes, "patch_embed.norm.weight") or 0, depths), "")

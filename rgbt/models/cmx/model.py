@@ -179,26 +179,13 @@ class CMX(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Class scores of every pixel.
+        """Class scores of every pixel, as `rgbt.models` says; float32, `aux` is empty.
 
-        Args:
-            rgb: (N, 3, H, W) float in [0, 1], sides of any length from 29 (with the released
-                `sr_ratios`).
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: cells of the image padded to multiples of 32, (N, h, w) bool each, True = the
-                pixels are hidden. None: nothing is hidden.
-            views: only ("rgbt",), or nothing for the same.
-            generator: draws stochastic depth per sample, block and stream, then the decoder's
-                dropped channels; needed in training mode unless both rates are 0.
-
-        Returns:
-            logits: (N, K, H, W) float32, in training and evaluation.
-            aux: empty.
+        Sides may have any length from 29 (with the released `sr_ratios`). Stochastic depth is drawn
+        per sample, block and stream, then the decoder's dropped channels.
 
         Raises:
-            ValueError: shapes that do not fit; no generator where one is needed.
-            InputError: another view; mask cells that do not divide the padded image; images
-                smaller than the deepest reduction of attention takes.
+            InputError: images smaller than the deepest reduction of attention takes.
         """
         images = self.inputs(rgb, thermal, masks, multiple=1)
         only_view(views, self.record.views, "CMX")

@@ -119,23 +119,19 @@ class DeepLabV2(nn.Module):
         head: str | None = None,
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Class scores at the size of the image, from one image by one head.
+        """Class scores from one image by one head, as `rgbt.models` says.
 
         Args:
-            rgb: (N, 3, H, W) float in [0, 1].
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: cells of the image padded to multiples of 32, True = the pixels are hidden.
-            views: the image that is seen, ("rgb",) or ("thermal",); () is RGB.
-            head: its name; None: the first.
-            generator: draws the dropped channels; needed in training unless `dropout` is 0.
+            rgb: seen where `views` is () or ("rgb",).
+            thermal: seen where `views` is ("thermal",).
+            masks: see there.
+            views: see there.
+            head: its name; None: the first. InputError: there is no such head.
+            generator: see there.
 
         Returns:
             logits: (N, K, H, W).
             aux: "aux_logits" (N, K, H, W) of the auxiliary head, where there is one.
-
-        Raises:
-            ValueError: shapes that do not fit; no generator where one is needed.
-            InputError: another view or head; mask cells that do not divide the padded image.
         """
         view = only_view(views, self.record.views, "DeepLabV2")
         name = next(iter(self.heads)) if head is None else head

@@ -138,10 +138,9 @@ class Mask2Former(nn.Module):
         """Predictions of every view and pass, as one batch through the head.
 
         Args:
-            rgb: (N, 3, H, W) float in [0, 1], N = passes * B, pass by pass.
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: cells of the padded image, (N, h, w) bool each, True = tokens are hidden;
-                a cell is a square of a multiple of 4 pixels. None: nothing is hidden.
+            rgb: as `rgbt.models` says, N = passes * B, pass by pass.
+            thermal: likewise.
+            masks: likewise; a cell is a square of a multiple of 4 pixels, whose tokens are hidden.
             passes: stacked copies of one batch. The fusion's batch normalisation sees them one
                 after the other, as successive calls would show them.
             views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
