@@ -84,13 +84,12 @@ def _sentence(
 def _candidates(
     groups: Iterable[str], components: Mapping[str, Any], plain: Mapping[str, Any]
 ) -> Iterator[Candidate]:
-    for group in groups:
-        # A data set is no choice: to build one may write its images.
-        if group in plain and group != "dataset":
-            for name, node in choices(plain, group):
-                record = _record_of_file(node, group, components)
-                if record is not None:
-                    yield Candidate(group, name, record)
+    # A data set is no choice: to build one may write its images.
+    for group in (each for each in groups if each in plain and each != "dataset"):
+        for name, node in choices(plain, group):
+            record = _record_of_file(node, group, components)
+            if record is not None:
+                yield Candidate(group, name, record)
 
 
 def _options(

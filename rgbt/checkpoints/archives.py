@@ -81,14 +81,10 @@ def verified(
     # torch writes no checksums where they are disabled (set_crc32_options).
     if not _check_digest(buffer) and any(entry.CRC for entry in listed.values()):
         for name, entry in listed.items():
-            _check_sum(buffer, found[name], entry.CRC)
+            with memoryview(buffer) as content, content[slice(*found[name])] as part:
+                if zlib.crc32(part) != entry.CRC:
+                    raise DamagedError("an entry is not what its checksum says")
     return found
-
-
-def _check_sum(buffer: mmap.mmap, place: tuple[int, int], expected: int) -> None:
-    with memoryview(buffer) as content, content[slice(*place)] as part:
-        if zlib.crc32(part) != expected:
-            raise DamagedError("an entry is not what its checksum says")
 
 
 def _check_digest(buffer: mmap.mmap) -> bool:

@@ -202,11 +202,7 @@ def _pop(machine: Machine, _: object) -> None:
         machine.since_mark()
 
 
-Step = Callable[[Machine, Any], None]
-
-
-def _pop_mark(machine: Machine, _: object) -> None:
-    machine.since_mark()
+Step = Callable[[Machine, Any], object]
 
 
 def _makes(make: Callable[[], object]) -> Step:
@@ -221,16 +217,8 @@ def _tuple_of(count: int) -> Step:
     return lambda machine, _: machine.push(tuple(machine.take(count)))
 
 
-def _get(machine: Machine, index: int) -> None:
-    machine.push(machine.memo[index])
-
-
 def _put(machine: Machine, index: int) -> None:
     machine.memo[index] = machine.stack[-1]
-
-
-def _nothing(_machine: Machine, _argument: object) -> None:
-    """What matters to Python's own unpickler only."""
 
 
 LITERALS = (
@@ -253,13 +241,14 @@ STEPS: dict[str, Step] = {
     "DICT": _collects(_pairs),
     "FROZENSET": _collects(lambda items: frozenset(map(check_key, items))),
     **{f"TUPLE{count}": _tuple_of(count) for count in (1, 2, 3)},
-    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _get),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, i: m.push(m.memo[i])),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _put),
-    **dict.fromkeys(("PROTO", "FRAME", "STOP"), _nothing),
+    # These matter to Python's own unpickler only.
+    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda *_: None),
     "MEMOIZE": lambda m, _: _put(m, len(m.memo)),
     "MARK": Machine.mark,
     "POP": _pop,
-    "POP_MARK": _pop_mark,
+    "POP_MARK": lambda m, _: m.since_mark(),
     "DUP": lambda m, _: m.push(m.stack[-1]),
     "APPEND": lambda m, _: m.extend(m.take(1)),
     "APPENDS": lambda m, _: m.extend(m.since_mark()),

@@ -102,6 +102,8 @@ class Recipe:
 class Scale:
     """How big an experiment is run: the sizes that other groups refer to as ``${scale.*}``.
 
+    What is not listed is what `Recipe` says.
+
     Attributes:
         name: of its file.
         pixel_factor: size of a scale's images relative to the paper's, for ``${px:...}``.
@@ -110,17 +112,9 @@ class Scale:
         test_short_edge: shortest edge of the images in evaluation; null keeps the files' size.
             Counts are always taken at the resolution of the label file.
         num_points: points per mask at which the set criterion compares masks.
-        batch_size: samples per training batch.
         eval_batch_size: images per evaluation batch.
         num_workers: loader processes.
-        max_steps: optimiser steps.
-        eval_every: steps between evaluations.
-        lr: base learning rate.
-        backbone_multiplier: factor of `lr` for the backbone.
         critic_width: channels of a discriminator's first convolution, where there is one.
-        critic_lr: learning rate of a discriminator, where the scheme has one.
-        clip_norm: largest gradient norm; null for none.
-        warmup_steps: linear warm-up.
         precision: see `TrainerSettings`.
         pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
         few_scenes: whether embedded data sets have a handful of scenes, for ``${scenes:...}``.

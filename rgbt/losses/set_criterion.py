@@ -7,6 +7,7 @@ targets of the batch: one per class present in an image, by image, then by class
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -25,6 +26,7 @@ from rgbt.requirements import Record, Requirement
 from rgbt.types import Batch, Output
 
 
+@dataclass(kw_only=True, eq=False)
 class SetCriterion:
     """Class, mask and dice loss of queries matched to classes.
 
@@ -39,7 +41,7 @@ class SetCriterion:
     Paper: CRM gives 2.0 and 0.1 as two class coefficients.   Released: 0.1 is a class weight inside
     the term that 2.0 multiplies, as here.
 
-    Args:
+    Attributes:
         num_classes: K.
         num_points: N, for matching and for the losses.
         oversample_ratio: >= 1.
@@ -52,34 +54,25 @@ class SetCriterion:
         spatial: weights of the pixels in BCE and dice.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of the configuration
-        self,
-        *,
-        num_classes: NumClasses,
-        num_points: NumPoints,
-        oversample_ratio: Annotated[float, Interval(ge=1, le=100)],
-        importance_ratio: Share,
-        class_weight: NonNegative,
-        mask_weight: NonNegative,
-        dice_weight: NonNegative,
-        no_object_weight: NonNegative,
-        deep_supervision: bool,
-        spatial: SpatialWeight = PLAIN,
-    ) -> None:
-        self.num_classes = num_classes
-        kept = int(num_points * importance_ratio)
-        candidates = int(num_points * oversample_ratio)
-        self.sampling = Sampling(candidates=candidates, kept=kept, fresh=num_points - kept)
-        self.part_weights = {"class": class_weight, "mask": mask_weight, "dice": dice_weight}
-        self.no_object_weight = no_object_weight
-        self.deep_supervision = deep_supervision
-        self.spatial = spatial
-        self.matcher = Matcher(
-            num_points=num_points,
-            class_weight=class_weight,
-            mask_weight=mask_weight,
-            dice_weight=dice_weight,
-        )
+    num_classes: NumClasses
+    num_points: NumPoints
+    oversample_ratio: Annotated[float, Interval(ge=1, le=100)]
+    importance_ratio: Share
+    class_weight: NonNegative
+    mask_weight: NonNegative
+    dice_weight: NonNegative
+    no_object_weight: NonNegative
+    deep_supervision: bool
+    spatial: SpatialWeight = PLAIN
+
+    def __post_init__(self) -> None:
+        kept = int(self.num_points * self.importance_ratio)
+        candidates = int(self.num_points * self.oversample_ratio)
+        self.sampling = Sampling(candidates=candidates, kept=kept, fresh=self.num_points - kept)
+        costs = {"class": self.class_weight, "mask": self.mask_weight, "dice": self.dice_weight}
+        self.part_weights = costs
+        named = {f"{name}_weight": weight for name, weight in costs.items()}
+        self.matcher = Matcher(num_points=self.num_points, **named)
 
     @property
     def record(self) -> Record:

@@ -124,24 +124,13 @@ class RTFNet(nn.Module):
         self.num_classes = num_classes
         self.record = self.record_from(thermal_stem=thermal_stem)
         self.thermal_stem = thermal_stem
-        self.encoder_rgb_conv1 = _stem(3, base_width)
-        self.encoder_rgb_bn1 = nn.BatchNorm2d(base_width)
-        self.encoder_rgb_maxpool = nn.MaxPool2d(3, stride=2, padding=1)
-        (
-            self.encoder_rgb_layer1,
-            self.encoder_rgb_layer2,
-            self.encoder_rgb_layer3,
-            self.encoder_rgb_layer4,
-        ) = _stages(depth, base_width)
-        self.encoder_thermal_conv1 = _stem(inputs.thermal_channels, base_width)
-        self.encoder_thermal_bn1 = nn.BatchNorm2d(base_width)
-        self.encoder_thermal_maxpool = nn.MaxPool2d(3, stride=2, padding=1)
-        (
-            self.encoder_thermal_layer1,
-            self.encoder_thermal_layer2,
-            self.encoder_thermal_layer3,
-            self.encoder_thermal_layer4,
-        ) = _stages(depth, base_width)
+        for part, channels in (("rgb", 3), ("thermal", inputs.thermal_channels)):
+            stem = nn.Conv2d(channels, base_width, 7, stride=2, padding=3, bias=False)
+            self.add_module(f"encoder_{part}_conv1", stem)
+            self.add_module(f"encoder_{part}_bn1", nn.BatchNorm2d(base_width))
+            self.add_module(f"encoder_{part}_maxpool", nn.MaxPool2d(3, stride=2, padding=1))
+            for number, stage in enumerate(_stages(depth, base_width), start=1):
+                self.add_module(f"encoder_{part}_layer{number}", stage)
         channels = 8 * base_width * (1 if depth in BASIC else 4)
         self.deconv1 = _upception(channels, channels // 2)
         self.deconv2 = _upception(channels // 2, channels // 4)
@@ -177,24 +166,20 @@ class RTFNet(nn.Module):
         only_view(views, self.record.views, "RTFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
 
-        x = F.relu(self.encoder_rgb_bn1(self.encoder_rgb_conv1(images.rgb)))
-        y = F.relu(self.encoder_thermal_bn1(self.encoder_thermal_conv1(images.thermal)))
-        x, y = self.encoder_rgb_maxpool(x + y), self.encoder_thermal_maxpool(y)
-        for rgb_stage, thermal_stage in self._stage_pairs():
-            y = thermal_stage(y)
-            x = rgb_stage(x) + y
+        def unit(name: str, x: Tensor) -> Tensor:
+            result: Tensor = self.get_submodule(f"encoder_{name}")(x)
+            return result
+
+        x = F.relu(unit("rgb_bn1", unit("rgb_conv1", images.rgb)))
+        y = F.relu(unit("thermal_bn1", unit("thermal_conv1", images.thermal)))
+        x, y = unit("rgb_maxpool", x + y), unit("thermal_maxpool", y)
+        for number in range(1, 5):
+            y = unit(f"thermal_layer{number}", y)
+            x = unit(f"rgb_layer{number}", x) + y
 
         for block in (self.deconv1, self.deconv2, self.deconv3, self.deconv4, self.deconv5):
             x = block(x)
         return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
-
-    def _stage_pairs(self) -> tuple[tuple[nn.Sequential, nn.Sequential], ...]:
-        return (
-            (self.encoder_rgb_layer1, self.encoder_thermal_layer1),
-            (self.encoder_rgb_layer2, self.encoder_thermal_layer2),
-            (self.encoder_rgb_layer3, self.encoder_thermal_layer3),
-            (self.encoder_rgb_layer4, self.encoder_thermal_layer4),
-        )
 
     def _start(self) -> None:
         """Initial weights: torchvision's in the encoders, Xavier's (uniform) in the decoder."""
@@ -205,17 +190,13 @@ class RTFNet(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
             else:
                 nn.init.xavier_uniform_(module.weight)
-        stem = self.encoder_thermal_conv1.weight
+        stem = self.get_parameter("encoder_thermal_conv1.weight")
         if self.thermal_stem == "xavier":
             nn.init.xavier_uniform_(stem)
             return
         with torch.no_grad():
-            rgb = self.encoder_rgb_conv1.weight
+            rgb = self.get_parameter("encoder_rgb_conv1.weight")
             stem.copy_(rgb if rgb.shape == stem.shape else rgb.mean(1, keepdim=True))
-
-
-def _stem(in_channels: int, base_width: int) -> nn.Conv2d:
-    return nn.Conv2d(in_channels, base_width, 7, stride=2, padding=3, bias=False)
 
 
 def _stages(depth: int, base_width: int) -> tuple[nn.Sequential, ...]:

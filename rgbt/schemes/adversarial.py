@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -23,6 +24,7 @@ DomainValue = Annotated[float, Interval(ge=-10, le=10)]
 CRITIC = "critic"
 
 
+@dataclass(kw_only=True, eq=False)
 class Adversarial:
     """A segmentation phase and a discriminator phase, in every step or in alternating steps.
 
@@ -37,7 +39,7 @@ class Adversarial:
 
     Source: thesis (J. Sun), Eqs. 4 to 6; HeatNet, Sec. III; AdaptSegNet, Eqs. 1 to 3; ADVENT.
 
-    Args:
+    Attributes:
         model: the network.
         loss: L_s, of one domain.
         domains: source and target.
@@ -64,29 +66,28 @@ class Adversarial:
         InputError: equal numbers for both domains, or one that its verdict loss does not take.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a way in which the releases differ
-        self,
-        *,
-        model: nn.Module,
-        loss: Loss,
-        domains: SourceAndTarget,
-        critic: nn.Module,
-        critic_optimizer: Callable[..., torch.optim.Optimizer],
-        judged: Judged,
-        verdict_loss: Literal["least_squares", "cross_entropy"],
-        source_value: DomainValue,
-        target_value: DomainValue,
-        weight: NonNegative,
-        both_ways: bool,
-        weighed_by_confidence: bool,
-        halved: bool,
-        supervise_target: bool,
-        alternates: bool,
-        gradients: Gradients,
-    ) -> None:
-        check_choice("scheme.verdict_loss", verdict_loss, VERDICT_LOSSES)
+    model: nn.Module
+    loss: Loss
+    domains: SourceAndTarget
+    critic: nn.Module
+    critic_optimizer: Callable[..., torch.optim.Optimizer]
+    judged: Judged
+    verdict_loss: Literal["least_squares", "cross_entropy"]
+    source_value: DomainValue
+    target_value: DomainValue
+    weight: NonNegative
+    both_ways: bool
+    weighed_by_confidence: bool
+    halved: bool
+    supervise_target: bool
+    alternates: bool
+    gradients: Gradients
+
+    def __post_init__(self) -> None:
+        check_choice("scheme.verdict_loss", self.verdict_loss, VERDICT_LOSSES)
+        source_value, target_value = self.source_value, self.target_value
         outside = not 0 <= min(source_value, target_value) <= max(source_value, target_value) <= 1
-        if verdict_loss == "cross_entropy" and outside:
+        if self.verdict_loss == "cross_entropy" and outside:
             raise InputError(
                 "scheme.source_value and scheme.target_value must lie in [0, 1] with "
                 f"scheme.verdict_loss=cross_entropy, got {source_value:g} and {target_value:g}."
@@ -96,18 +97,13 @@ class Adversarial:
                 f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "
                 "the discriminator has nothing to distinguish; choose two numbers, such as 0 and 1."
             )
-        self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
-        self.others: dict[str, nn.Module] = {CRITIC: critic}
-        self.builders = {CRITIC: critic_optimizer}
-        self.judged = judged
-        self.verdict_loss = VERDICT_LOSSES[verdict_loss]
+        self.passes = Passes(
+            model=self.model, loss=self.loss, domains=self.domains, gradients=self.gradients
+        )
+        # Fabric's wrapper takes the place of the network here.
+        self.others: dict[str, nn.Module] = {CRITIC: self.critic}
+        self.cost_of = VERDICT_LOSSES[self.verdict_loss]
         self.values = {"source": source_value, "target": target_value}
-        self.weight = weight
-        self.both_ways = both_ways
-        self.weighed_by_confidence = weighed_by_confidence
-        self.halved = halved
-        self.supervise_target = supervise_target
-        self.alternates = alternates
 
     @property
     def record(self) -> Record:
@@ -123,7 +119,7 @@ class Adversarial:
             *((confidence,) if weighed else ()),
             *record_of(self.others[CRITIC]).requires,
             networks=self.others,
-            builders=self.builders,
+            builders={CRITIC: self.critic_optimizer},
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
@@ -173,7 +169,7 @@ class Adversarial:
     def _adversarial(self, name: str, batch: TwoDomains, seen: Mapping[str, Tensor]) -> Tensor:
         """Weighted loss of a domain that the discriminator recognises."""
         other = {"source": "target", "target": "source"}[name]
-        cost = self.verdict_loss(self.others[CRITIC](seen[name]), self.values[other])
+        cost = self.cost_of(self.others[CRITIC](seen[name]), self.values[other])
         if self.weighed_by_confidence:
             confidence = batch.target.confidence
             assert confidence is not None, "the record requires it"
@@ -186,7 +182,7 @@ class Adversarial:
         return Phase(
             (CRITIC,),
             {
-                f"{CRITIC}/{name}": share * self.verdict_loss(critic(each), self.values[name])
+                f"{CRITIC}/{name}": share * self.cost_of(critic(each), self.values[name])
                 for name, each in seen.items()
             },
         )

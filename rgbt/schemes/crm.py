@@ -7,6 +7,7 @@ release; SpatialSeg trains with the same scheme and other masks.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,7 @@ from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
 
+@dataclass(kw_only=True, eq=False)
 class CRM:
     """Total loss ``L(F) + w_m (L(R) + L(T)) + L(F') + w_c SDC + w_n SDN``.
 
@@ -27,7 +29,7 @@ class CRM:
     With a masker that hides nothing there is no masked pass (the rows without masking of CRM
     Table 3a, which the release cannot run); the distillation weights must then be 0.
 
-    Args:
+    Attributes:
         model: network with the argument `passes` and `views` of `rgbt.models.mask2former`.
         loss: criterion that returns one value per stacked pass.
         masker: draws the masks of the masked pass.
@@ -36,25 +38,17 @@ class CRM:
         nonlocal_weight: w_n. 1 in the release.
     """
 
-    def __init__(  # noqa: PLR0913 - three collaborators, three published weights
-        self,
-        *,
-        model: nn.Module,
-        loss: Loss,
-        masker: AnyMasker,
-        modality_weight: NonNegative,
-        complementary_weight: NonNegative,
-        nonlocal_weight: NonNegative,
-    ) -> None:
-        self.model = model
-        self.loss = loss
-        self.masker = masker
-        self.hides_cells = record_of(masker).hides_cells
-        self.modality_weight = modality_weight
-        self.complementary_weight = complementary_weight
-        self.nonlocal_weight = nonlocal_weight
+    model: nn.Module
+    loss: Loss
+    masker: AnyMasker
+    modality_weight: NonNegative
+    complementary_weight: NonNegative
+    nonlocal_weight: NonNegative
+
+    def __post_init__(self) -> None:
+        self.hides_cells = record_of(self.masker).hides_cells
         # Single-modality predictions cost two thirds of the head: only where they are read.
-        self.views = VIEWS if modality_weight or nonlocal_weight else VIEWS[:1]
+        self.views = VIEWS if self.modality_weight or self.nonlocal_weight else VIEWS[:1]
 
     @property
     def record(self) -> Record:

@@ -7,6 +7,7 @@ Understanding", Fig. 2 and Eq. 4, and its release.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol, cast
 
 import torch
@@ -41,6 +42,7 @@ class VirtualViews(Protocol):
         ...
 
 
+@dataclass(kw_only=True, eq=False)
 class Temporal:
     """Losses of a frame, of its virtual successor, and of how their predictions agree.
 
@@ -51,7 +53,7 @@ class Temporal:
         said of stopping its gradient.
     Released: scores are brought there and normalised afterwards, and no gradient passes.
 
-    Args:
+    Attributes:
         model: any network; one that returns masks of queries needs `dense_logits`.
         loss: loss of two frames (see `rgbt.losses.temporal.TemporalLoss`).
         view: draws virtual views and applies them.
@@ -59,23 +61,16 @@ class Temporal:
         detach: whether the first prediction is a fixed teacher of the second.
     """
 
-    def __init__(  # noqa: PLR0913 - three collaborators, two choices of the paper
-        self,
-        *,
-        model: nn.Module,
-        loss: Any,
-        view: VirtualViews,
-        warps: Literal["logits", "probabilities"],
-        detach: bool,
-    ) -> None:
-        self.model = model
-        self.loss = loss
-        self.view = view
-        self.warps = warps
-        self.detach = detach
-        self.stacks = record_of(model).stacks_passes
-        self.reads_warped = record_of(loss).reads_warped
-        self.apart = any(isinstance(module, _BatchNorm) for module in model.modules())
+    model: nn.Module
+    loss: Any
+    view: VirtualViews
+    warps: Literal["logits", "probabilities"]
+    detach: bool
+
+    def __post_init__(self) -> None:
+        self.stacks = record_of(self.model).stacks_passes
+        self.reads_warped = record_of(self.loss).reads_warped
+        self.apart = any(isinstance(module, _BatchNorm) for module in self.model.modules())
 
     @property
     def record(self) -> Record:

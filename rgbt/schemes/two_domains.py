@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -53,12 +54,13 @@ class LabelledDomains:
         )
 
 
+@dataclass(kw_only=True, eq=False)
 class UnlabelledTarget:
     """Segmentation of the source, and a loss without labels on the target.
 
     Source: MaxSquareLoss; ADVENT (direct entropy minimisation); thesis (J. Sun), Sec. III-A.
 
-    Args:
+    Attributes:
         model: the network.
         loss: of the source.
         domains: a labelled source and a target whose labels are "none".
@@ -68,20 +70,17 @@ class UnlabelledTarget:
         guidance_threshold: probability above which a head is sure. Released: 0.95.
     """
 
-    def __init__(  # noqa: PLR0913 - collaborators, and one setting with its threshold
-        self,
-        *,
-        model: nn.Module,
-        loss: Loss,
-        domains: SourceAndTarget,
-        unlabelled: UnlabelledLoss,
-        guidance_weight: NonNegative,
-        guidance_threshold: Share,
-    ) -> None:
-        self.passes = Passes(model=model, loss=loss, domains=domains, gradients="apart")
-        self.unlabelled = unlabelled
-        self.guidance_weight = guidance_weight
-        self.guidance_threshold = guidance_threshold
+    model: nn.Module
+    loss: Loss
+    domains: SourceAndTarget
+    unlabelled: UnlabelledLoss
+    guidance_weight: NonNegative
+    guidance_threshold: Share
+
+    def __post_init__(self) -> None:
+        self.passes = Passes(
+            model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
+        )
 
     @property
     def record(self) -> Record:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from rgbt.types import IGNORE, Sample
 SizeFactor = Annotated[float, Interval(ge=0.01, le=16)]
 
 
+@dataclass(kw_only=True, eq=False)
 class CmxTransform:
     """Mirrors, resizes by a drawn factor, crops; what the image does not fill is padding.
 
@@ -26,7 +27,7 @@ class CmxTransform:
     colour: 0 for them but for rounding to whole grey levels, and, where thermal is repeated for
     three channels of different means, but for the distance of each mean from the three's mean.
 
-    Args:
+    Attributes:
         flip_probability: in [0, 1].
         factors: of the size of the file, one is drawn with equal odds.
         crop_hw: size of the result in pixels, always.
@@ -37,26 +38,21 @@ class CmxTransform:
         track_position: whether examples carry the map of source positions.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of the configuration
-        self,
-        *,
-        flip_probability: Share,
-        factors: Annotated[tuple[SizeFactor, ...], Len(1, 1000)],
-        crop_hw: Size,
-        padding_rgb: tuple[GreyLevel, GreyLevel, GreyLevel],
-        padding_order: Literal["rgb", "bgr"],
-        padding_thermal: Annotated[tuple[GreyLevel, ...], Len(1, 3)],
-        test_short_edge: Pixels | None,
-        track_position: bool,
-    ) -> None:
-        self.flip_probability = flip_probability
-        self.factors = factors
-        self.crop_hw = crop_hw
-        step = 1 if padding_order == "rgb" else -1
-        self.padding_rgb = np.rint(padding_rgb[::step]).astype(np.uint8)
-        self.padding_thermal = np.rint(np.mean(padding_thermal)).astype(np.uint8)
-        self.test_short_edge = test_short_edge
-        self.track_position = track_position
+    flip_probability: Share
+    factors: Annotated[tuple[SizeFactor, ...], Len(1, 1000)]
+    crop_hw: Size
+    padding_rgb: tuple[GreyLevel, GreyLevel, GreyLevel]
+    padding_order: Literal["rgb", "bgr"]
+    padding_thermal: Annotated[tuple[GreyLevel, ...], Len(1, 3)]
+    test_short_edge: Pixels | None
+    track_position: bool
+
+    def __post_init__(self) -> None:
+        colour = self.padding_rgb[:: 1 if self.padding_order == "rgb" else -1]
+        self.padding = (
+            np.rint(colour).astype(np.uint8),
+            np.rint(np.mean(self.padding_thermal)).astype(np.uint8),
+        )
 
     @property
     def record(self) -> Record:
@@ -75,7 +71,7 @@ class CmxTransform:
         corner_yx = (top, resized_hw[1] - left - width if flipped else left)
         view = View(source_hw, resized_hw, corner_yx, (height, width), flipped)
         example = viewed(sample, view, np.uint8, track_position=self.track_position)
-        return padded(example, self.crop_hw, self.padding_rgb, self.padding_thermal)
+        return padded(example, self.crop_hw, *self.padding)
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""

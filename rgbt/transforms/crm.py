@@ -7,7 +7,7 @@ their mean colour, and losses pad labels with "ignore" (`rgbt.geometry.padding`)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from rgbt.transforms.photometric import ColourJitter, Colours, FactorRange, HueD
 from rgbt.types import Sample
 
 
+@dataclass(kw_only=True, eq=False)
 class CrmTransform:
     """Resizes the short edge to a drawn length, crops, jitters colours, flips.
 
@@ -32,7 +33,7 @@ class CrmTransform:
         (`Colours.rgb`): ``colour="released"``. Values between steps are not rounded.
     Both resize bilinearly with half-pixel centres and without antialiasing, and labels by nearest.
 
-    Args:
+    Attributes:
         sizes: short edges in pixels, one is drawn with equal odds; None keeps the size of the file.
         max_size: limit of the long edge in pixels, which wins over `sizes`; None for no limit.
         crop_hw: size of the crop, clipped to the resized image; None takes all of it.
@@ -49,37 +50,29 @@ class CrmTransform:
         track_position: whether examples carry the map of source positions.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of the configuration
-        self,
-        *,
-        sizes: Lengths | None,
-        max_size: Pixels | None,
-        crop_hw: Size | None,
-        flip_probability: Share,
-        colour: Literal["intended", "released"],
-        colour_probability: Share,
-        brightness_delta: GreyLevel,
-        contrast_range: FactorRange,
-        saturation_range: FactorRange,
-        hue_delta: HueDelta,
-        thermal_contrast_range: FactorRange,
-        test_short_edge: Pixels | None,
-        track_position: bool,
-    ) -> None:
-        self.sizes = sizes
-        self.max_size = max_size
-        self.crop_hw = crop_hw
-        self.flip_probability = flip_probability
-        self.dtype = np.uint8 if colour == "intended" else np.float32
-        self.test_short_edge = test_short_edge
-        self.track_position = track_position
+    sizes: Lengths | None
+    max_size: Pixels | None
+    crop_hw: Size | None
+    flip_probability: Share
+    colour: Literal["intended", "released"]
+    colour_probability: Share
+    brightness_delta: GreyLevel
+    contrast_range: FactorRange
+    saturation_range: FactorRange
+    hue_delta: HueDelta
+    thermal_contrast_range: FactorRange
+    test_short_edge: Pixels | None
+    track_position: bool
+
+    def __post_init__(self) -> None:
+        self.dtype = np.uint8 if self.colour == "intended" else np.float32
         self.jitter = ColourJitter(
-            probability=colour_probability,
-            brightness_delta=brightness_delta,
-            contrast_range=contrast_range,
-            saturation_range=saturation_range,
-            hue_delta=hue_delta,
-            thermal_contrast_range=thermal_contrast_range,
+            probability=self.colour_probability,
+            brightness_delta=self.brightness_delta,
+            contrast_range=self.contrast_range,
+            saturation_range=self.saturation_range,
+            hue_delta=self.hue_delta,
+            thermal_contrast_range=self.thermal_contrast_range,
         )
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:

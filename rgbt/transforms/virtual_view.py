@@ -7,7 +7,7 @@ pixels and enlarging it again stands for the way forward. Where pixels come from
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Annotated, Any, Literal
 
@@ -35,6 +35,7 @@ LEAST = 0.1
 BYTE = 255
 
 
+@dataclass(kw_only=True, eq=False)
 class VirtualView:
     """Draws turns of the camera and brings images, labels and predictions into the new view.
 
@@ -45,7 +46,7 @@ class VirtualView:
         rounded to bytes each time, empty pixels are background. Its intrinsics are those of
         another camera (see ``conf/camera``).
 
-    Args:
+    Attributes:
         camera: intrinsics, scaled to the size of the images.
         order: of the rotations: "zyx" as in the paper, "zxy" as released.
         yaw: (low, high) degrees about the vertical axis; positive moves what is seen to the right.
@@ -63,28 +64,20 @@ class VirtualView:
         InputError: angles out of range, or so large that no rectangle is left.
     """
 
-    def __init__(  # noqa: PLR0913 - each is a key of the configuration
-        self,
-        *,
-        camera: Camera,
-        order: Order,
-        yaw: Degrees,
-        pitch: Degrees,
-        roll: Degrees,
-        angles: Literal["uniform", "integer"],
-        mode: Literal["both", "rotation", "translation"],
-        rectangle: Rule,
-        resampling: Resampling,
-        outside: Literal["ignore", "background"],
-    ) -> None:
-        self.camera = camera
-        self.order: Order = order
-        self.angles = angles
-        self.mode = mode
-        self.rectangle: Rule = rectangle
-        self.resampling: Resampling = resampling
-        self.outside_label = IGNORE if outside == "ignore" else 0
-        self.ranges = {"yaw": yaw, "pitch": pitch, "roll": roll}
+    camera: Camera
+    order: Order
+    yaw: Degrees
+    pitch: Degrees
+    roll: Degrees
+    angles: Literal["uniform", "integer"]
+    mode: Literal["both", "rotation", "translation"]
+    rectangle: Rule
+    resampling: Resampling
+    outside: Literal["ignore", "background"]
+
+    def __post_init__(self) -> None:
+        self.outside_label = IGNORE if self.outside == "ignore" else 0
+        self.ranges = {"yaw": self.yaw, "pitch": self.pitch, "roll": self.roll}
         self._check_ranges()
 
     @property

@@ -121,13 +121,7 @@ class DeepLabV2(nn.Module):
     ) -> Output:
         """Class scores from one image by one head, as `rgbt.models` says.
 
-        Args:
-            rgb: seen where `views` is () or ("rgb",).
-            thermal: seen where `views` is ("thermal",).
-            masks: see there.
-            views: see there.
-            head: its name; None: the first. InputError: there is no such head.
-            generator: see there.
+        Of several heads, `head` names the one (InputError: there is none); None: the first.
 
         Returns:
             logits: (N, K, H, W).
