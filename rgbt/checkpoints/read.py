@@ -98,8 +98,9 @@ def _read_safetensors(path: Path) -> Contents:
 def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     """The tensors in what a file holds: they lie at the top, or under one known key."""
     if not isinstance(value, dict):
+        kind = "one tensor" if _is_tensor(value) else f"a {type(value).__name__}"
         raise RefusedError(
-            f"holds {_kind(value)}, not tensors by name; give a file that holds a state_dict()."
+            f"holds {kind}, not tensors by name; give a file that holds a state_dict()."
         )
     inner = [key for key in WRAPPERS if _is_state(value.get(key))]
     if len(inner) > 1:
@@ -114,7 +115,9 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     tensors = {name: found.tensor() for name, found in state.items() if _is_tensor(found)}
     outside = [key for key in value if key != where] if inner else []
     inside = [key for key, found in state.items() if not _is_tensor(found)]
-    note = value.get(NOTE) if inner else None
+    # Texts by name; anything else that a stranger's file may hold there is left alone.
+    said = value.get(NOTE) if inner else None
+    items = said.items() if isinstance(said, dict) else ()
     contents = Contents(
         path,
         container,
@@ -123,15 +126,9 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
         others=tuple(printable(str(key), 40) for key in [*outside, *inside]),
         settings=_settings(value) if inner else {},
         ours=value.keys() in OURS,
-        note=_texts(note),
+        note={key: text for key, text in items if type(key) is str and type(text) is str},
     )
     return _without_prefixes(contents, tensors)
-
-
-def _texts(note: object) -> dict[str, str]:
-    """Texts by name; anything else a stranger's file may hold there is left alone."""
-    items = note.items() if isinstance(note, dict) else ()
-    return {k: v for k, v in items if type(k) is str and type(v) is str}
 
 
 def _is_tensor(value: object) -> bool:
@@ -145,10 +142,6 @@ def _is_state(value: object) -> bool:
         and any(map(_is_tensor, value.values()))
         and all(type(key) is str for key in value)
     )
-
-
-def _kind(value: object) -> str:
-    return "one tensor" if _is_tensor(value) else f"a {type(value).__name__}"
 
 
 def _without_prefixes(contents: Contents, tensors: dict[str, Tensor]) -> Contents:

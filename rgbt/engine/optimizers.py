@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -50,11 +50,8 @@ class AdamW:
         undecayed = UNDECAYED_NAMES if self.decay_biases else (*UNDECAYED_NAMES, *BIASES)
         groups = parameter_groups(model, undecayed, without)
         settings = [
-            {
-                **_rates(self.lr, self.backbone_multiplier if pretrained else 1.0),
-                "params": parameters,
-                "weight_decay": self.weight_decay * decayed,
-            }
+            _group(parameters, self.lr * (self.backbone_multiplier if pretrained else 1.0))
+            | {"weight_decay": self.weight_decay * decayed}
             for (pretrained, decayed), parameters in groups.items()
         ]
         return torch.optim.AdamW(settings, betas=self.betas, eps=self.eps, fused=True)
@@ -85,10 +82,7 @@ class SGD:
         for (pretrained, _), parameters in parameter_groups(model, (), without).items():
             by_part.setdefault(pretrained, []).extend(parameters)
         settings = [
-            {
-                **_rates(self.lr, self.backbone_multiplier if pretrained else 1.0),
-                "params": parameters,
-            }
+            _group(parameters, self.lr * (self.backbone_multiplier if pretrained else 1.0))
             for pretrained, parameters in by_part.items()
         ]
         return torch.optim.SGD(
@@ -114,7 +108,7 @@ class RMSprop:
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
-        settings = [{**_rates(self.lr, 1.0), "params": trainable(model, without)}]
+        settings = [_group(trainable(model, without), self.lr)]
         return torch.optim.RMSprop(settings, lr=self.lr, alpha=self.alpha, eps=self.eps)
 
 
@@ -139,15 +133,15 @@ class Adam:
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
-        settings = [{**_rates(self.lr, 1.0), "params": trainable(model, without)}]
+        settings = [_group(trainable(model, without), self.lr)]
         return torch.optim.Adam(
             settings, betas=self.betas, weight_decay=self.weight_decay, eps=self.eps, fused=True
         )
 
 
-def _rates(lr: float, factor: float) -> dict[str, float]:
-    """What a schedule reads (`base_lr`) and what it writes."""
-    return {"lr": lr * factor, "base_lr": lr * factor}
+def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
+    """Parameters with what a schedule reads (`base_lr`) and what it writes."""
+    return {"params": parameters, "lr": lr, "base_lr": lr}
 
 
 def parameter_groups(

@@ -49,7 +49,9 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
         ValueError: shapes that do not fit.
     """
     _check(warped, second, "valid", valid)
-    overlap, size = _pair_sums(single(warped), single(second), valid)
+    pairs = single(warped), single(second), valid
+    sums: tuple[Tensor, Tensor] = _PairSums.apply(*pairs)  # type: ignore[no-untyped-call]
+    overlap, size = sums
     if form == "paper":
         size = size + SIGMA * valid.sum()
     # With sigma inside, no sum over at least one pixel lies below this.
@@ -95,11 +97,6 @@ def _check(warped: Tensor, second: Tensor, name: str, map_BHW: Tensor) -> int:
     check_shape("warped", warped, "B K H W", **sizes)
     check_shape(name, map_BHW, "B H W", **{letter: sizes[letter] for letter in "BHW"})
     return sizes["K"]
-
-
-def _pair_sums(first: Tensor, second: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
-    overlap, size = _PairSums.apply(first, second, counted)  # type: ignore[no-untyped-call]
-    return overlap, size
 
 
 class _PairSums(torch.autograd.Function):

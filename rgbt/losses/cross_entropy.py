@@ -57,22 +57,18 @@ class CrossEntropy:
         assert output.logits is not None, "the record requires scores"
         sizes = check_shape("logits", output.logits, "B K H W")
         check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
-        weights = self._weights(sizes["K"], output.logits.device)
-        logits = output.logits.float()
-        total = _total(logits, batch, weights)
+        given = self.class_weights or (1.0,) * sizes["K"]
+        if len(given) != sizes["K"]:
+            raise InputError(
+                f"loss.class_weights holds {len(given)} numbers, the network has {sizes['K']} "
+                "classes; give one per class."
+            )
+        weights = torch.tensor(given, device=output.logits.device)
+        total = _total(output.logits.float(), batch, weights)
         kept = batch.label[batch.label != IGNORE]
         # The smallest float only matters where nothing is labelled and the sum is 0.
         normaliser = weights[kept].sum().clamp(min=torch.finfo(torch.float32).tiny)
         return {"cross_entropy": (total / normaliser).reshape(1)}
-
-    def _weights(self, num_classes: int, device: torch.device) -> Tensor:
-        weights = self.class_weights or (1.0,) * num_classes
-        if len(weights) != num_classes:
-            raise InputError(
-                f"loss.class_weights holds {len(weights)} numbers, the network has {num_classes} "
-                "classes; give one per class."
-            )
-        return torch.tensor(weights, device=device)
 
 
 def _total(logits: Tensor, batch: Batch, weights: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.maskers import pairing as pairings
 from rgbt.maskers import pattern
 from rgbt.ranges import Pixels, Share
 from rgbt.requirements import Record
@@ -117,9 +116,9 @@ class Masker:
         if self.pairing == "indiv":
             return MaskPair(taken, self._draw(grid_hw, centre_yx, generator))
         if self.pairing == "comp":
-            return pairings.complementary(taken)
+            return pattern.complementary(taken)
         shares = self.pattern_probabilities or THIRDS
-        return pairings.random_complementary(taken, shares, generator)
+        return pattern.random_complementary(taken, shares, generator)
 
     def grid_hw(self, image_hw: tuple[int, int]) -> tuple[int, int]:
         """(h, w) cells of a crop of `image_hw` pixels; cheap, to ask before a training starts.

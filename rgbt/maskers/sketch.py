@@ -136,16 +136,14 @@ def _draw_frequency(
     axes.set_axis_off()
 
 
-def _picture_path(out: str | None) -> Path:
-    if out is None or Path(out).suffix != ".png":
-        raise InputError(f"out must name the PNG to write, for example out=masks.png, got {out}.")
-    return Path(out)
-
-
 @command()
 def main(config: DictConfig) -> int:
     """Write the picture of the configured masker to `out`."""
-    path = _picture_path(config.out)
+    path = Path(config.out or "")
+    if path.suffix != ".png":
+        raise InputError(
+            f"out must name the PNG to write, for example out=masks.png, got {config.out}."
+        )
     masker: AnyMasker = build(config.masker)
     dataset, transform = build(config.dataset), build(config.transform)
     names = dataset.names("train")[:SAMPLES]

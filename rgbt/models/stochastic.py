@@ -42,6 +42,8 @@ def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> 
 
     Source: Tompson et al., Efficient Object Localization (spatial dropout; torch's Dropout2d).
     """
+    if rate == 0:
+        return x
     n, channels = x.shape[:2]
     factor = keep_factors(torch.tensor([rate]), (n, channels, 1, 1), generator, x.device)
     return x * factor[0].to(x.dtype)

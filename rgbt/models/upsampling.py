@@ -57,11 +57,7 @@ def enlarge(
         ValueError: a rate above 0 without a generator.
     """
     first, later = rates
-    x = _drop(x, first, generator)
+    x = drop_channels(x, first, generator)
     for block in blocks:
-        x = _drop(block(x), later, generator)
+        x = drop_channels(block(x), later, generator)
     return x
-
-
-def _drop(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
-    return drop_channels(x, rate, generator) if rate > 0 else x

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.losses.guidance import guidance
+from rgbt.losses.unlabelled import guidance
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
@@ -66,7 +66,7 @@ class UnlabelledTarget:
         domains: a labelled source and a target whose labels are "none".
         unlabelled: loss of the target's probabilities (`rgbt.losses.unlabelled`).
         guidance_weight: of the cross-entropy of the auxiliary head with the guidance of both heads
-            (`rgbt.losses.guidance`); 0 for none. Released: 0.01, the product of 0.1 and 0.1.
+            (`rgbt.losses.unlabelled.guidance`); 0 for none. Released: 0.01, the product of 0.1 and 0.1.
         guidance_threshold: probability above which a head is sure. Released: 0.95.
     """
 

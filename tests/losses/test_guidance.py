@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError
-from rgbt.losses.guidance import guidance
+from rgbt.losses.unlabelled import guidance
 
 
 def maps(*pixels: tuple[float, ...]) -> Tensor:

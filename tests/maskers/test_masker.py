@@ -14,7 +14,7 @@ from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import conf_dir, register_resolvers
 from rgbt.maskers.masker import Masker
-from rgbt.maskers.pairing import complementary, random_complementary
+from rgbt.maskers.pattern import complementary, random_complementary
 from rgbt.randomness import torch_generator
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import torch
@@ -139,11 +138,10 @@ class PixelDecoder(nn.Module):
         Returns:
             mask features and tokens.
         """
-        with self._precision(features[0].device.type):
-            return self._decode([f.float() for f in features] if self.fp32 else features)
-
-    def _precision(self, device_type: str) -> AbstractContextManager[object]:
-        return torch.autocast(device_type, enabled=False) if self.fp32 else nullcontext()
+        if not self.fp32:
+            return self._decode(features)
+        with torch.autocast(features[0].device.type, enabled=False):
+            return self._decode([each.float() for each in features])
 
     def _decode(self, features: list[Tensor]) -> PixelPyramid:
         fine, *coarse = features
