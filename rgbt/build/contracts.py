@@ -42,7 +42,7 @@ def check_dataset(dataset: Any) -> None:
     """Refuse a data set without the members of `rgbt.dataset.LabelledDataset`.
 
     Raises:
-        InputError: naming the member, or the property that is of another type.
+        InputError: naming the member.
     """
     check_members("dataset", dataset, DATASET, DATASET_CALLS)
     for attribute in ("classes", "palette", "unscored"):
@@ -228,7 +228,8 @@ class CheckedLoss:
         """As the loss; InputError where it returns something else than named parts."""
         found = self._loss(output, batch, generator)
         if not self._is_checked:
-            _check_parts(f"loss: {_called(self._loss)} returned", found, dims=1)
+            name = getattr(self._loss, "__name__", f"{type(self._loss).__name__}.__call__")
+            _check_parts(f"loss: {name} returned", found, dims=1)
             self._is_checked = True
         return found
 
@@ -288,7 +289,3 @@ def _check_parts(returned: str, parts: object, *, dims: int) -> None:
             raise InputError(f"{returned} '{name}': {described(part)}; {expected}.")
     if not any(part.requires_grad for part in parts.values()):
         raise InputError(f"{returned} {described(parts)}, of which no part depends on the network.")
-
-
-def _called(part: Any) -> str:
-    return getattr(part, "__name__", None) or f"{type(part).__name__}.__call__"

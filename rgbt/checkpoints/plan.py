@@ -132,7 +132,8 @@ def _under(entry: str, parts: tuple[str, ...]) -> bool:
 def _difference(tensor: Tensor, value: Tensor, *, is_stem: bool) -> str:
     """How a file's tensor does not fit an entry, "" where it does."""
     if tensor.is_floating_point() != value.is_floating_point():
-        return f"file {_kind(tensor)}, network {_kind(value)}"
+        kinds = [str(each.dtype).removeprefix("torch.") for each in (tensor, value)]
+        return f"file {kinds[0]}, network {kinds[1]}"
     found, own = tuple(tensor.shape), tuple(value.shape)
     if found == own:
         return ""
@@ -141,10 +142,6 @@ def _difference(tensor: Tensor, value: Tensor, *, is_stem: bool) -> str:
         if found == own:
             return ""
     return f"file {_shape(tensor)}, network {_shape(value)}"
-
-
-def _kind(tensor: Tensor) -> str:
-    return str(tensor.dtype).removeprefix("torch.")
 
 
 def _shape(tensor: Tensor) -> str:

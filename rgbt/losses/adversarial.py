@@ -39,12 +39,8 @@ def cross_entropy(verdicts: Tensor, value: float) -> Tensor:
 
     Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
 
-    Args:
-        verdicts: of the discriminator, not squashed; any shape and float dtype.
-        value: that s(D) should have, in [0, 1].
-
-    Returns:
-        () float32 for half precision too; finite for every finite verdict.
+    Arguments as in `least_squares`, verdicts not squashed and `value` in [0, 1]; finite for every
+    finite verdict.
     """
     verdicts = single(verdicts)
     return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))

@@ -40,12 +40,6 @@ def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
 
     Source: CRM, Eq. (3); release as in `sdc`.
 
-    Args:
-        teacher: (B, Q, K+1) class logits of the clean RGB-T pass, final layer.
-        rgb: (B, Q, K+1), the masked pass predicted from RGB alone.
-        thermal: (B, Q, K+1), the masked pass predicted from thermal alone.
-
-    Returns:
-        () float32.
+    `rgb` and `thermal` are the masked pass predicted from one image alone; shapes as in `sdc`.
     """
     return sdc(teacher, rgb) + sdc(teacher, thermal)

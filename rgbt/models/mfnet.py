@@ -37,8 +37,6 @@ class ConvUnit(nn.Module):
     """3x3 convolution, batch normalisation, leaky ReLU.
 
     Args:
-        in_channels: of the input.
-        out_channels: of the output.
         dilation: of the convolution; its padding too.
         activation: whether there is a leaky ReLU.
     """

@@ -188,11 +188,6 @@ class PyramidPooling(nn.Module):
     There is neither normalisation nor activation inside the four branches.
 
     Source: PSPNet, Fig. 3.   Released: HeatNet, whose branches keep all channels.
-
-    Args:
-        channels: of the map.
-        out_channels: of the result.
-        align_corners: of the enlargement.
     """
 
     def __init__(self, channels: int, out_channels: int, *, align_corners: bool) -> None:

@@ -42,7 +42,6 @@ class Bottleneck(nn.Module):
     Source: He et al., Deep Residual Learning, Fig. 5 right.
 
     Args:
-        in_channels: of the input.
         width: of the 3x3 convolution; four times as many leave the block.
         stride: of the block.
         dilation: of the 3x3 convolution; its padding too.

@@ -62,8 +62,6 @@ class UpceptionB(nn.Module):
     Source: RTFNet, Upception block B.
 
     Args:
-        in_channels: of the input.
-        out_channels: of the output.
         relu: whether the sum passes a ReLU.
     """
 

@@ -19,11 +19,6 @@ class UpBlock(nn.Module):
     """Twice the size (bilinear), 3x3 convolution, normalisation, PReLU with one slope.
 
     Source: HeatNet release, PSPNet decoder; thesis, Fig. 5.
-
-    Args:
-        in_channels: of the input.
-        out_channels: of the output.
-        align_corners: of the interpolation.
     """
 
     def __init__(self, in_channels: int, out_channels: int, *, align_corners: bool) -> None:

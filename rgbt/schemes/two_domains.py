@@ -66,7 +66,8 @@ class UnlabelledTarget:
         domains: a labelled source and a target whose labels are "none".
         unlabelled: loss of the target's probabilities (`rgbt.losses.unlabelled`).
         guidance_weight: of the cross-entropy of the auxiliary head with the guidance of both heads
-            (`rgbt.losses.unlabelled.guidance`); 0 for none. Released: 0.01, the product of 0.1 and 0.1.
+            (`rgbt.losses.unlabelled.guidance`); 0 for none. Released: 0.01, the product of 0.1 and
+            0.1.
         guidance_threshold: probability above which a head is sure. Released: 0.95.
     """
 

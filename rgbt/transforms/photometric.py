@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rgbt.ranges import GreyLevel, Share, rising
 
 Image = NDArray[Any]
+"""(H, W, 3) RGB, or (H, W) of thermal; uint8 or float32, 0..255."""
 
 LEVELS = np.arange(256, dtype=np.uint8)
 """Every value of an 8-bit image."""
@@ -111,12 +112,6 @@ class Colours:
         meets a float image, where OpenCV's saturation lies in 0..1 and its hue in 0..360. The
         scaled saturation is then truncated to 0 or 1, and the hue, in whole degrees, is folded
         modulo 180. This is what the release does, whose images are float32.
-
-        Args:
-            image: (H, W, 3), uint8 or float32, RGB, 0..255.
-
-        Returns:
-            (H, W, 3), uint8 or float32, 0..255.
         """
         if self.brightness is not None:
             image = scale_and_truncate(image, offset=self.brightness)
@@ -129,11 +124,7 @@ class Colours:
         return image if self.contrast_first else _contrast(image, self.contrast)
 
     def thermal(self, image: Image) -> Image:
-        """Contrast alone.
-
-        Args:
-            image: (H, W), uint8 or float32, 0..255.
-        """
+        """Contrast alone."""
         return _contrast(image, self.thermal_contrast)
 
 
@@ -151,15 +142,7 @@ def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -
 
 
 def scale_saturation(image: Image, factor: float) -> Image:
-    """HSV saturation times `factor`, truncated to whole numbers of OpenCV's unit (see the module).
-
-    Args:
-        image: (H, W, 3), uint8 or float32, RGB, 0..255.
-        factor: >= 0.
-
-    Returns:
-        Same shape and dtype.
-    """
+    """HSV saturation times `factor`, truncated to whole numbers of OpenCV's unit."""
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
     if hsv.dtype == np.uint8:
         return _rgb_of(_mapped(hsv, 1, scale_and_truncate(LEVELS, factor)))
@@ -168,14 +151,9 @@ def scale_saturation(image: Image, factor: float) -> Image:
 
 
 def shift_hue(image: Image, shift: int) -> Image:
-    """Hue, truncated to whole numbers, plus `shift`, modulo 180 (see the module).
+    """Hue, truncated to whole numbers, plus `shift`, modulo 180.
 
-    Args:
-        image: (H, W, 3), uint8 or float32, RGB, 0..255.
-        shift: in OpenCV's unit, 2 degrees for uint8 and 1 for float32.
-
-    Returns:
-        Same shape and dtype.
+    The unit is OpenCV's: 2 degrees for uint8 and 1 for float32.
     """
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
     if hsv.dtype == np.uint8:

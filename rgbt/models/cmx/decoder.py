@@ -56,13 +56,7 @@ class MlpDecoder(nn.Module):
 
     Source: SegFormer, Sec. 3.2, Eq. (4); CMX, Sec. III-A.
 
-    Args:
-        dims: channels of the four maps, the largest map first.
-        num_classes: K.
-        dim: E.
-        dropout: share of channels dropped in front of the classifier while training.
-        norm_eps: of the batch normalisation while training.
-        norm_eps_eval: of the same while evaluating.
+    `dims` are channels of the four maps, the largest first; `dim` is E, the rest as in `CMX`.
     """
 
     def __init__(

@@ -124,15 +124,7 @@ class MitBlock(nn.Module):
         self.mlp = MixFfn(dim, hidden)
 
     def forward(self, x: Tensor, keep: Tensor | None = None) -> Tensor:
-        """One block.
-
-        Args:
-            x: (N, H, W, C).
-            keep: (2, N, 1, 1, 1) factors of the two residuals (stochastic depth); None for ones.
-
-        Returns:
-            (N, H, W, C).
-        """
+        """(N, H, W, C) -> the same; `keep`: (2, N, 1, 1, 1) factors of both residuals, or None."""
         first, second = (None, None) if keep is None else keep.unbind()
         x = add_residual(x, self.attn(self.norm1(x)), first)
         return add_residual(x, self.mlp(self.norm2(x)), second)

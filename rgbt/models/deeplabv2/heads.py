@@ -76,8 +76,6 @@ class AtrousPyramid(nn.Module):
     the others still belong to the parameters; ADVENT sums all.
 
     Args:
-        in_channels: of the features.
-        out_channels: of the sum.
         rates: dilations, one convolution each.
         summed_rates: those that count.
     """

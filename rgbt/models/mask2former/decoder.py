@@ -41,16 +41,9 @@ class QueryAttention(nn.Module):
         nn.init.zeros_(self.out_proj.bias)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None) -> Tensor:
-        """Scaled dot-product attention.
+        """(B, Q, C), (B, S, C) and (B, S, C) -> (B, Q, C).
 
-        Args:
-            query: (B, Q, C).
-            key: (B, S, C).
-            value: (B, S, C).
-            allowed: (B, Q, S) bool, True = may be read, the same for all heads; None: all.
-
-        Returns:
-            (B, Q, C).
+        `allowed` (B, Q, S) bool says what may be read, the same for all heads; None: everything.
         """
         weights, biases = self.in_proj_weight.chunk(3), self.in_proj_bias.chunk(3)
         q, k, v = (
@@ -135,13 +128,7 @@ class Predictor(nn.Module):
 
     Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).
 
-    Args:
-        num_classes: K, without the no-object class.
-        hidden_dim: C.
-        num_queries: Q.
-        num_layers: decoder layers; layer i reads level i mod 3 (strides 32, 16, 8).
-        heads: attention heads.
-        ffn_dim: width of the feed-forward networks.
+    Layer i reads level i mod 3 (strides 32, 16, 8). Sizes: see `Mask2Former`.
     """
 
     def __init__(
@@ -171,14 +158,7 @@ class Predictor(nn.Module):
         self.mask_embed = MaskEmbed(dim)
 
     def forward(self, pyramid: PixelPyramid) -> Predictions:
-        """Predict classes and masks.
-
-        Args:
-            pyramid: what the pixel decoder returned.
-
-        Returns:
-            L = number of layers + 1 predictions, the last one final.
-        """
+        """L = number of layers + 1 predictions, the last one final."""
         memories = self._memories(pyramid)
         reduced = _reduce(pyramid)
         position = self.query_embed.weight

@@ -52,14 +52,7 @@ class ConvNorm(nn.Conv2d):
 
 
 class LevelEncoder(nn.Module):
-    """Encoder layers over the tokens of all levels.
-
-    Args:
-        dim: channels.
-        num_layers: encoder layers.
-        heads: attention heads.
-        ffn_dim: width of the feed-forward networks.
-    """
+    """Encoder layers over the tokens of all levels."""
 
     def __init__(self, dim: int, *, num_layers: int, heads: int, ffn_dim: int) -> None:
         super().__init__()
@@ -89,10 +82,6 @@ class PixelDecoder(nn.Module):
 
     Args:
         widths: channels of the features at strides 4, 8, 16, 32.
-        hidden_dim: channels of the result, a multiple of 32 and of `heads`.
-        encoder_layers: deformable layers.
-        heads: heads of their attention.
-        ffn_dim: width of their feed-forward networks.
         fp32: run in single precision under autocast too.   Released: true.
     """
 
@@ -130,14 +119,7 @@ class PixelDecoder(nn.Module):
             nn.init.zeros_(conv.bias)
 
     def forward(self, features: list[Tensor]) -> PixelPyramid:
-        """Decode.
-
-        Args:
-            features: (B, C_s, H/s, W/s), s = 4, 8, 16, 32.
-
-        Returns:
-            mask features and tokens.
-        """
+        """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens."""
         if not self.fp32:
             return self._decode(features)
         with torch.autocast(features[0].device.type, enabled=False):
