@@ -72,11 +72,11 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
 
 def _has_other_inputs(node: Mapping[str, Any], report: Report, source: Path) -> bool:
     """Whether a file of this project, or the run beside it, notes other inputs."""
-    said: Any = report.facts.inputs
+    noted: Any = report.facts.inputs
     beside = source.parent / "config.yaml"
-    if said is None and report.facts.layout == "own" and beside.is_file():
-        said = read_settings(beside).get("model", {}).get("inputs")
-    return said is not None and "inputs" in node and _plain(said) != _plain(node["inputs"])
+    if noted is None and report.facts.layout == "own" and beside.is_file():
+        noted = read_settings(beside).get("model", {}).get("inputs")
+    return noted is not None and "inputs" in node and _plain(noted) != _plain(node["inputs"])
 
 
 def _plain(inputs: Any) -> Any:

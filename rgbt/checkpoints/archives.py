@@ -75,7 +75,7 @@ def verified(
         RefusedError: compressed, encrypted, or made to take far more time than it has bytes.
         DamagedError: digest, checksum or layout are not what was written.
     """
-    found = {name: _place(buffer, entry) for name, entry in listed.items()}
+    found = {name: _span(buffer, entry) for name, entry in listed.items()}
     if sum(end - start for start, end in found.values()) > len(buffer):
         raise RefusedError.greedy()
     # torch writes no checksums where they are disabled (set_crc32_options).
@@ -106,7 +106,7 @@ def _check_digest(buffer: mmap.mmap) -> bool:
     return True
 
 
-def _place(buffer: mmap.mmap, entry: zipfile.ZipInfo) -> tuple[int, int]:
+def _span(buffer: mmap.mmap, entry: zipfile.ZipInfo) -> tuple[int, int]:
     """Where the content of a zip entry lies."""
     if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & ENCRYPTED:
         raise RefusedError(

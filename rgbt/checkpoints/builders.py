@@ -176,4 +176,4 @@ STAND_INS = frozenset(
         *("pathlib.PureWindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"),
     }
 )
-"""Classes of settings, known by name; an `Inert` stands for their objects."""
+"""Classes of settings, known by name; an `Inert` takes the place of their objects."""

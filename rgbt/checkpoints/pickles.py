@@ -41,7 +41,7 @@ def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Per
     """The value of the next pickle in `stream`; the stream is left right behind it.
 
     Args:
-        stream: bytes, from where it stands.
+        stream: bytes, read from its position.
         builders: full name in the file -> what makes a value of the arguments.
         persistent: makes a value of what the file refers to outside the pickle.
 

@@ -116,8 +116,8 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     outside = [key for key in value if key != where] if inner else []
     inside = [key for key, found in state.items() if not _is_tensor(found)]
     # Texts by name; anything else that a stranger's file may hold there is left alone.
-    said = value.get(NOTE) if inner else None
-    items = said.items() if isinstance(said, dict) else ()
+    own = value.get(NOTE) if inner else None
+    items = own.items() if isinstance(own, dict) else ()
     contents = Contents(
         path,
         container,

@@ -45,15 +45,15 @@ def recognise(contents: Contents) -> Facts:
     found = (layout.recognise(contents) for layout in LAYOUTS.values())
     facts = next((each for each in found if each is not None), UNKNOWN)
     if contents.note:
-        # How it is fed is in the note and cannot be told from the layout.
+        # How it is fed is in the note and does not follow from the layout.
         origin = " ".join(filter(None, map(contents.note.get, ("run", "checkpoint"))))
-        said = f"exported from {printable(origin or 'this project')}, fed as its note says"
+        noted = f"exported from {printable(origin or 'this project')}, fed as its note says"
         return replace(
             facts,
             fits=tuple(each[:1] for each in facts.fits),
             convention=(),
             inputs=_inputs(contents.note.get("inputs", "")),
-            remarks=(said,),
+            remarks=(noted,),
         )
     return facts
 
@@ -61,7 +61,7 @@ def recognise(contents: Contents) -> Facts:
 def _inputs(text: str) -> Mapping[str, object] | None:
     """`model.inputs` as an export notes it, None where it does not."""
     try:
-        said = json.loads(text)
+        noted = json.loads(text)
     except json.JSONDecodeError:
         return None
-    return said if isinstance(said, dict) else None
+    return noted if isinstance(noted, dict) else None

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class RefusedError(Exception):
-    """A file wants what it does not get; the message goes on after the file's name."""
+    """A file wants what it does not get; the message continues the file's name."""
 
     @classmethod
     def code(cls, name: str) -> RefusedError:
@@ -161,7 +161,7 @@ class Array:
 
 
 class Inert:
-    """What stands for an object of a configuration class: keeps what it is given, does nothing.
+    """Placeholder for an object of a configuration class: keeps what it is given, does nothing.
 
     Attributes:
         name: of the class in the file.

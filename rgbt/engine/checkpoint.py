@@ -22,7 +22,7 @@ from rgbt.checks import InputError
 
 @dataclass
 class State:
-    """Where a run stands. Generators need no entry: they are derived from seed and step.
+    """Progress of a run. Generators need no entry: they are derived from seed and step.
 
     Attributes:
         step: optimiser steps done.

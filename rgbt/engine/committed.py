@@ -51,16 +51,16 @@ class Checkpoints:
 
     def begin_evaluation(self, step: int) -> Path:
         """The empty folder for the files of the evaluation at `step`."""
-        place = self._by_step / str(step)
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir(parents=True)
-        return place
+        folder = self._by_step / str(step)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
 
     def save_best(self, step: int, weights: dict[str, Any]) -> None:
         """Write the weights of an evaluation whose score is the highest, or the one that counts."""
-        place = self._by_step / str(step)
-        place.mkdir(parents=True, exist_ok=True)
-        save(place / BEST, {"model": weights, "step": step})
+        folder = self._by_step / str(step)
+        folder.mkdir(parents=True, exist_ok=True)
+        save(folder / BEST, {"model": weights, "step": step})
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
         """Write the state of a run, unless it is the one that is committed."""
@@ -73,9 +73,9 @@ class Checkpoints:
         _sync(self.folder)
         self._publish(state.best_step)
         kept = {str(self._best_step), str(state.best_step)}
-        for place in self._by_step.glob("*"):
-            if place.name not in kept:
-                shutil.rmtree(place)
+        for folder in self._by_step.glob("*"):
+            if folder.name not in kept:
+                shutil.rmtree(folder)
         self._committed = state.step, state.evaluated_step
         self._best_step = state.best_step
 

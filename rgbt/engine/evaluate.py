@@ -141,16 +141,16 @@ def class_scores(
     model: nn.Module, batch: Batch, view: View | None = None, heads: Sequence[str | None] = ()
 ) -> Tensor:
     """(B, K, H, W) scores at the size of the images; arguments as in `class_maps`."""
-    asked: dict[str, Any] = {} if view is None else {"views": (view,)}
+    options: dict[str, Any] = {} if view is None else {"views": (view,)}
     distinct = tuple(dict.fromkeys(heads))
     if len(distinct) < 2:
-        asked |= {} if distinct in ((), (None,)) else {"head": distinct[0]}
-        scores: Tensor = model(batch.rgb, batch.thermal, **asked).logits
+        options |= {} if distinct in ((), (None,)) else {"head": distinct[0]}
+        scores: Tensor = model(batch.rgb, batch.thermal, **options).logits
         return scores
     # One pass per head over the images that are its own; normalisations do not look at the batch.
     found: dict[str | None, Tensor] = {}
     for head in distinct:
         own = torch.tensor([each == head for each in heads], device=batch.rgb.device)
-        found[head] = model(batch.rgb[own], batch.thermal[own], head=head, **asked).logits
+        found[head] = model(batch.rgb[own], batch.thermal[own], head=head, **options).logits
     taken = {head: iter(scores) for head, scores in found.items()}
     return torch.stack([next(taken[head]) for head in heads])

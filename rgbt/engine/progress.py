@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: one line with the loss, the speed and the time left."""
+"""What a person sees while a run trains: one line with the loss, the speed and the time left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the loop is told by the configuration."""
+"""Settings of the training loop, and of the recipes and scales that they come from."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Scale:
         num_workers: loader processes.
         critic_width: channels of a discriminator's first convolution, where there is one.
         precision: see `TrainerSettings`.
-        pretrained: whether the recipe starts from weights of ImageNet; a run that does not is told.
+        pretrained: whether the recipe starts from weights of ImageNet; a run that does not says so.
         few_scenes: whether embedded data sets have a handful of scenes, for ``${scenes:...}``.
     """
 

@@ -128,7 +128,7 @@ class Trainer:
 
         Args:
             batches: training batches, starting at that step.
-            state: where the run stands; changed in place.
+            state: progress of the run; changed in place.
 
         Raises:
             RunError: a loss part, the gradient or a weight is not finite.

@@ -77,5 +77,5 @@ def judged(logits: Tensor, how: Judged) -> Tensor:
         return logits
     if how == "probabilities":
         return logits.softmax(1)
-    log_p = logits.log_softmax(1)  # finite where p is too small to be told from 0
+    log_p = logits.log_softmax(1)  # finite where p is too small to differ from 0
     return -log_p.exp() * log_p / math.log(max(sizes["K"], 2))  # of one class: 0

@@ -34,8 +34,8 @@ class Points(Protocol):
 class PointSource:
     """Independent uniform points from one generator.
 
-    Draws are made set by set in the order in which they are asked for, so that the numbers do not
-    depend on how many sets are asked for at once. The criterion asks for the matcher's points of
+    Draws are made set by set in the order of the requests, so that the numbers do not
+    depend on how many sets are requested at once. The criterion requests the matcher's points of
     all (layer, pass) pairs, then for the loss points of all pairs; within a loss set, the points of
     one mask are its candidates followed by its random remainder.
 
@@ -103,7 +103,7 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
     """
     height, width = label.shape[1:]
     sets, images, count = points.shape[:3]
-    # A frame of ignored pixels stands for the outside, so that no index needs a check.
+    # A frame of ignored pixels represents the outside, so that no index needs a check.
     framed = F.pad(label, (1, 1, 1, 1), value=IGNORE).clamp(max=num_classes).flatten(1)
     x = (points[..., 0] + 1) * (width / 2) + 0.5
     y = (points[..., 1] + 1) * (height / 2) + 0.5

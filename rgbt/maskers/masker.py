@@ -152,8 +152,8 @@ class Masker:
         return pattern.fixed_count(log_weight, pattern.num_taken(grid_hw, self.ratio), generator)
 
     def _log_weight(self, grid_hw: tuple[int, int], centre_yx: Tensor) -> Tensor:
-        assert self.patch_size, "the constructor asked for it"
-        assert self.sigma_div, "the constructor asked for it"
+        assert self.patch_size, "the constructor requires it"
+        assert self.sigma_div, "the constructor requires it"
         rows = grid_hw[0] if self.sigma_height is None else self.sigma_height // self.patch_size
         by_index = self.cell_position == "index"
         if self.anchor == "grid":

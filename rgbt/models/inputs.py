@@ -165,7 +165,7 @@ def _expand(name: str, mask: Tensor, size: tuple[int, int, int], unit: int) -> T
 
 
 def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
-    """The one view that a network without stacked views is asked for.
+    """The one view that is requested of a network without stacked views.
 
     Args:
         views: as a network's `forward` got them; empty takes the first of `known`.
@@ -175,11 +175,11 @@ def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) ->
     Raises:
         InputError: more than one view, or one that the network does not have.
     """
-    asked = views or known[:1]
-    if len(asked) > 1 or asked[0] not in known:
+    requested = views or known[:1]
+    if len(requested) > 1 or requested[0] not in known:
         raise InputError(
-            f"{network} predicts from {' or '.join(known)}, one at a time, but was asked for "
-            f"{', '.join(asked)}; choose modality={known[0]}, or a network with several views "
+            f"{network} predicts from {' or '.join(known)}, one at a time, but got "
+            f"{', '.join(requested)}; choose modality={known[0]}, or a network with several views "
             "(model=mask2former_tiny)."
         )
-    return asked[0]
+    return requested[0]

@@ -97,7 +97,7 @@ class RTFNet(nn.Module):
 
     Args:
         num_classes: K.
-        depth: of both ResNets; the release edits a constant, 152 where nothing is said.
+        depth: of both ResNets; the release edits a constant, 152 by default.
         base_width: channels of the stem, a positive even number; everything scales with it. 64 is
             ResNet's own.
         final_relu: whether the logits are the output of the last block's ReLU, hence never

@@ -106,10 +106,10 @@ class Passes:
         """What the network returns for a batch of the domain "source" or "target"."""
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
-        asked: dict[str, Any] = {} if domain.view is None else {"views": (domain.view,)}
-        asked |= {} if domain.head is None else {"head": domain.head}
+        options: dict[str, Any] = {} if domain.view is None else {"views": (domain.view,)}
+        options |= {} if domain.head is None else {"head": domain.head}
         generator = generator_of(f"{name} network")
-        output: Output = self.model(batch.rgb, batch.thermal, generator=generator, **asked)
+        output: Output = self.model(batch.rgb, batch.thermal, generator=generator, **options)
         return output
 
     def supervised(

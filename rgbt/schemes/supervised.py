@@ -32,8 +32,8 @@ class Supervised:
         self.masker = masker
         self.hides_cells = record_of(masker).hides_cells
         source = domains.source
-        self.asked: dict[str, Any] = {} if source.view is None else {"views": (source.view,)}
-        self.asked |= {} if source.head is None else {"head": source.head}
+        self.options: dict[str, Any] = {} if source.view is None else {"views": (source.view,)}
+        self.options |= {} if source.head is None else {"head": source.head}
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of the loss.
@@ -47,6 +47,6 @@ class Supervised:
         if self.hides_cells:
             masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
         generator = generator_of("stochastic depth")
-        output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.asked)
+        output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.options)
         parts = self.loss(output, batch, generator_of("loss"))
         yield Phase(("main",), {name: values.sum() for name, values in parts.items()})

@@ -49,8 +49,8 @@ class Temporal:
     Both frames go through the same weights. Where the network normalises over the batch they go
     one after the other, as released; else as one batch, which is the same function and faster.
 
-    Paper: the first prediction ("segmentation map") is brought into the second frame; nothing is
-        said of stopping its gradient.
+    Paper: the first prediction ("segmentation map") is brought into the second frame; whether
+        its gradient stops is left open.
     Released: scores are brought there and normalised afterwards, and no gradient passes.
 
     Attributes:

@@ -93,7 +93,7 @@ def evaluated(
     track_position: bool,
     of_image: ImageResize = View.bilinear,
 ) -> Example:
-    """The whole images of a sample, resized where that is asked for; the label as it is.
+    """The whole images of a sample, resized on request; the label as it is.
 
     Args:
         sample: as it lies on disk.

@@ -1,7 +1,7 @@
 """Virtual views: a labelled frame as it looks after a small turn of the camera (VVIG).
 
 A turn moves every pixel by a homography; cutting the result to the largest rectangle without empty
-pixels and enlarging it again stands for the way forward. Where pixels come from is arithmetic in
+pixels and enlarging it again imitates moving forward. Where pixels come from is arithmetic in
 `rgbt.geometry`; here it is drawn and applied to batches.
 """
 

@@ -77,8 +77,8 @@ def _configuration(contents: Contents) -> dict[str, Any]:
 
 def _fusion(contents: Contents) -> tuple[str, ...]:
     """How the file's configuration joins the branches; nothing where it holds none."""
-    said = _configuration(contents).get("FUSION.AGGREGATION")
-    return () if said is None else (f"model.fusion={str(said).lower()}",)
+    fusion = _configuration(contents).get("FUSION.AGGREGATION")
+    return () if fusion is None else (f"model.fusion={str(fusion).lower()}",)
 
 
 def share_start(contents: Contents) -> int:

@@ -8,7 +8,7 @@ from rgbt.checkpoints.read import Contents
 
 
 def recognise(contents: Contents) -> Facts | None:
-    """A file that says of itself that it is ours; the network is told by its names."""
+    """A file that says of itself that it is ours; the network is recognised by its names."""
     if not contents.ours:
         return None
     family = contents.note.get("family", "")

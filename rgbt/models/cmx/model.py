@@ -27,8 +27,8 @@ STREAMS = ("", "extra_")
 class CmxEncoder(nn.Module):
     """Two Mix Transformers with weights of their own that meet after every stage.
 
-    What the rectification returns goes on to the next stage; what the fusion returns, only to the
-    decoder.   Source: CMX, Sec. III-A.
+    The next stage continues with what the rectification returns; the decoder reads what the fusion
+    returns.   Source: CMX, Sec. III-A.
 
     Args:
         shape: sizes of a stream.

@@ -144,7 +144,7 @@ class Mask2Former(nn.Module):
             passes: stacked copies of one batch. The fusion's batch normalisation sees them one
                 after the other, as successive calls would show them.
             views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
-                "thermal". None named: "rgbt". A branch that no view needs is not computed.
+                "thermal". () is "rgbt". A branch that no view needs is not computed.
             generator: draws stochastic depth, per sample and branch; needed in training mode
                 unless `drop_path_rate` is 0.
 

@@ -238,13 +238,15 @@ class Swin(nn.Module):
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
         keeps: list[Tensor | None] = [None] * 4
         if self.training and self.shape.drop_path_rate > 0:
-            # Factors of every residual, (blocks, 2, N, 1, 1, 1); rates rise from 0.
-            rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
-            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)
-            keeps = list(torch.split(drawn, list(self.shape.depths)))
+            keeps = list(torch.split(self._draw_keep(x, generator), list(self.shape.depths)))
         maps = []
         for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):
             x = stage(x, keep)
             maps.append(self.get_submodule(f"norm{index}")(x).permute(0, 3, 1, 2))
             x = stage.get_submodule("downsample")(x)
         return maps
+
+    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Factors of every residual of every sample, (blocks, 2, N, 1, 1, 1); rates rise from 0."""
+        rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
+        return keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)
