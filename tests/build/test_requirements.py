@@ -157,6 +157,14 @@ class Settable:
     def record(self) -> Record:
         return Record(others={"shift": self.shift})
 
+class Slow:
+    def __init__(self, *, shift: bool) -> None:
+        raise RuntimeError
+
+    @staticmethod
+    def record_from(*, shift: bool) -> Record:
+        return Record(others={"shift": shift})
+
 class Broken:
     def __init__(self) -> None:
         raise RuntimeError
@@ -172,10 +180,12 @@ def test_users_component_with_record_is_a_choice(
     (folder / "shifted.yaml").write_text("_target_: own_masks.Shifted\n")
     (folder / "set.yaml").write_text("_target_: own_masks.Settable\nshift: true\n")
     (folder / "unset.yaml").write_text("_target_: own_masks.Settable\nshift: false\n")
+    (folder / "slow.yaml").write_text("_target_: own_masks.Slow\nshift: true\n")
+    (folder / "slow_unset.yaml").write_text("_target_: own_masks.Slow\nshift: false\n")
     (folder / "broken.yaml").write_text("_target_: own_masks.Broken\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     asking = Asking(Requirement("masker", "shift", True))
     with searching([f"hydra.searchpath=[file://{tmp_path / 'conf'}]"]):
         found = sentence({"asking": asking, "masker": Nothing()})
-    assert found.endswith("choose masker=set, shifted.")
+    assert found.endswith("choose masker=set, shifted, slow.")
     sys.modules.pop("own_masks", None)
