@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.build.training_setup import _tell_what_is_not_as_published
+from rgbt.build.training_setup import _report_unpublished_settings
 from rgbt.config.compose import conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
@@ -155,7 +155,7 @@ class Told:
 @pytest.fixture
 def lines(capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
     def of(**changes: Any) -> list[str]:
-        _tell_what_is_not_as_published(Told(**changes).session())
+        _report_unpublished_settings(Told(**changes).session())
         return capsys.readouterr().err.splitlines()
 
     return of

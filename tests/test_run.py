@@ -122,7 +122,7 @@ def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_p
 
     code, _, err = train(call, data, tmp_path / "killed", *overrides)
     assert code == 0, err
-    assert "continues at step" in err
+    assert "resumes at step" in err
     train(call, data, tmp_path / "straight", *overrides)
 
     resumed, straight = only_run(tmp_path / "killed"), only_run(tmp_path / "straight")
