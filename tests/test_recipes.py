@@ -139,11 +139,9 @@ class Told:
     def session(self) -> Any:
         splits = {"train": ("t",), "val": self.val, "test": ("x", "y")}
         return SimpleNamespace(
-            config=OmegaConf.create(
-                {
-                    "scale": {"name": self.scale, "pretrained": self.scale == "paper"},
-                    "recipe": {"dataset": self.recipe},
-                }
+            spec=SimpleNamespace(
+                scale=SimpleNamespace(name=self.scale, pretrained=self.scale == "paper"),
+                recipe=SimpleNamespace(dataset=self.recipe),
             ),
             dataset=SimpleNamespace(name=self.data, names=splits.__getitem__),
             trainer=SimpleNamespace(selection_split=self.picked, tested=self.tested),
