@@ -374,7 +374,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
     (folder / "best.pt").rename(folder / "kept.pt")
     code, _, err = call(entry, f"run={folder}")
     assert code == 2
-    assert_one_sentence(err, "has no best.pt: the run has not come to its first evaluation")
+    assert_one_sentence(err, "has no best.pt: the run has not reached its first evaluation")
 
 
 def test_a_checkpoint_of_another_model_is_refused(
