@@ -7,16 +7,7 @@ from numpy.typing import NDArray
 
 from rgbt.data.freiburg import CLASSES
 from rgbt.data.synth.classes import class_table, ids_in
-from rgbt.data.synth.shapes import (
-    BIKE,
-    BUMP,
-    CAR,
-    CAR_STOP,
-    COLOR_CONE,
-    CURVE,
-    GUARDRAIL,
-    PERSON,
-)
+from rgbt.data.synth.shapes import BIKE, BUMP, CAR, CAR_STOP, COLOR_CONE, CURVE, GUARDRAIL, PERSON
 
 BY_LABEL = {
     CAR: "car",

@@ -13,16 +13,7 @@ from rgbt.data.kp import CLASSES
 from rgbt.data.synth import people
 from rgbt.data.synth.classes import class_table, ids_in
 from rgbt.data.synth.scene import Scene
-from rgbt.data.synth.shapes import (
-    BIKE,
-    BUMP,
-    CAR,
-    CAR_STOP,
-    COLOR_CONE,
-    CURVE,
-    GUARDRAIL,
-    PERSON,
-)
+from rgbt.data.synth.shapes import BIKE, BUMP, CAR, CAR_STOP, COLOR_CONE, CURVE, GUARDRAIL, PERSON
 
 VOID = "void"
 """What has no class: the id after the last one, ignored in training and in every score."""
