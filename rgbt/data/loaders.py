@@ -20,7 +20,7 @@ from annotated_types import Interval
 from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, RunError
-from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
+from rgbt.data.batches import BatchTransform, Transform, collate
 from rgbt.data.cache.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
@@ -31,6 +31,7 @@ from rgbt.data.reader import (
     no_shared_memory,
     start_worker,
 )
+from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import BatchSize, Text, Workers
 from rgbt.requirements import Record, Requirement
@@ -175,7 +176,7 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
 
 
 def train_batches(
-    dataset: Dataset,
+    dataset: LabelledDataset,
     split: str,
     transform: Transform,
     settings: LoaderSettings,
@@ -214,7 +215,7 @@ def train_batches(
 
 
 def eval_batches(
-    dataset: Dataset, split: str, transform: Transform, settings: LoaderSettings
+    dataset: LabelledDataset, split: str, transform: Transform, settings: LoaderSettings
 ) -> Batches[Batch]:
     """Every sample of the split once, in the order of its list.
 
@@ -234,7 +235,9 @@ def eval_batches(
     )
 
 
-def steps_per_epoch(dataset: Dataset, settings: LoaderSettings, split: str = "train") -> int:
+def steps_per_epoch(
+    dataset: LabelledDataset, settings: LoaderSettings, split: str = "train"
+) -> int:
     """Whole batches of one epoch, at least 1.
 
     Raises:
