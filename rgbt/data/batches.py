@@ -43,9 +43,7 @@ class BatchTransform(Protocol):
 def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
 
-    Args:
-        examples: at least one, images all (H, W, 3) and labels all (H', W').
-        advice: end of the message if sizes differ; names the key to change.
+    `advice` ends the message if sizes differ; it names the key to change.
 
     Raises:
         InputError: images or labels differ in size, naming the first two that do; labels of some

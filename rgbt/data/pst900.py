@@ -109,11 +109,7 @@ class PST900(FileDataset):
         return made_of
 
     def part_of(self, split: str) -> str:
-        """The part of the archive, or the list, that `split` is taken from.
-
-        Raises:
-            InputError: unknown split.
-        """
+        """The part of the archive, or the list, of `split`; InputError if that is unknown."""
         if split not in SPLITS:
             raise InputError(f"dataset: there is no split '{split}'; {nearest(split, SPLITS)}.")
         if split != "val":

@@ -201,11 +201,7 @@ def _shared(tensor: Tensor) -> Tensor:
 
 
 def no_shared_memory(reason: str) -> str:
-    """The message about missing shared memory.
-
-    Args:
-        reason: what the system reported.
-    """
+    """The message about missing shared memory; `reason` is what the system reported."""
     return (
         f"The loader processes cannot get shared memory in /dev/shm ({reason}). Enlarge it "
         "(docker run --shm-size=8g, or mount -o remount,size=8g /dev/shm), or load in the main "

@@ -140,11 +140,7 @@ class Folder(FileDataset):
         return self._rule.has(split)
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split: in the order of its list, or by their text and numbers.
-
-        Raises:
-            InputError: unknown split, no frame of it, no list.
-        """
+        """Names of a split: in the order of its list, or by their text and numbers."""
         self._check_split(split)
         if split not in self._names:
             self._names[split] = self._rule.names(split)
@@ -193,11 +189,7 @@ class Folder(FileDataset):
         return tuple(fnmatchcase(name, self.night) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
-
-        It includes the meaning of label values, but not the root, so that equal copies have equal
-        fingerprints. Nothing is decoded; missing files have size -1.
-        """
+        """SHA-256 in hexadecimal over `hash_of_files` and the meaning of label values."""
         listed = {
             split: tuple(name for name in self.names(split) if name in self.frames)
             if self.has(split)

@@ -90,12 +90,10 @@ Table = NDArray[np.uint8]
 def class_table(
     classes: Sequence[str], by_label: Mapping[int, str], of_scenery: Mapping[str, Sequence[str]]
 ) -> Table:
-    """The class of every pair of label and material.
+    """The class of every pair of label and material; ids follow the order of `classes`.
 
-    Args:
-        classes: names in the order of their ids.
-        by_label: class of each label of MFNet but the unlabelled.
-        of_scenery: materials of what MFNet leaves unlabelled, by class.
+    `by_label` has the class of each label of MFNet but the unlabelled, `of_scenery` the materials
+    of what MFNet leaves unlabelled, by class.
     """
     table = np.full((len(by_label) + 1, len(INDEX)), ELSEWHERE, np.uint8)
     for name, materials in of_scenery.items():

@@ -69,21 +69,12 @@ def _facet_degrees(surface: Surface, light: Light) -> Floats:
 def develop(
     heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
 ) -> Floats:
-    """Contrast, lens, drift and noise.
+    """Contrast, lens, drift and noise of `heat` (H, W): grey levels, some below 0 or above 1.
 
     The noise has three parts of the same strength factor: per pixel, per column, and smeared over
     neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
-    belong to the scene, so two frames of one scene share them.
-
-    Args:
-        heat: (H, W) float32 of `render_thermal`.
-        factors: contrast, drift, noise.
-        seed: of the data set.
-        index: of the scene.
-        generator: of the noise of this frame.
-
-    Returns:
-        (H, W) float32 grey levels, 1 = full scale; some lie below 0 or above 1.
+    belong to the scene (`seed`, `index`), so two frames of one scene share them; `generator` is
+    that of the noise of this frame.
     """
     height, width = heat.shape
     drift = numpy_generator(seed, "synth/drift", index)
