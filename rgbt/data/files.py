@@ -18,7 +18,6 @@ from PIL import Image
 
 from rgbt.checks import InputError, one_line
 from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
-from rgbt.data.integrity import within as within
 from rgbt.files.budgets import check_array
 from rgbt.types import IGNORE
 

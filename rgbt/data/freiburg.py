@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.file_dataset import FileDataset
-from rgbt.data.files import read_counts, read_label, read_label_array, within
+from rgbt.data.files import read_counts, read_label, read_label_array
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
+from rgbt.data.integrity import within
 from rgbt.data.named_files import check_split, existing_file, existing_root, size_of
 from rgbt.data.prepare.freiburg import PREPARATION
 from rgbt.data.report.freiburg import FreiburgChecks
@@ -195,11 +196,7 @@ class Freiburg(FileDataset):
         return tuple(self.frame(name).night for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
-
-        It includes the settings of labels (crop, `ignored_test`), but not the root, so that equal
-        copies have equal fingerprints. Nothing is decoded; missing files have size -1.
-        """
+        """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(self.splits):
             names = [frame.name for frame in self._of(split)]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
@@ -117,7 +117,6 @@ class KP(FileDataset):
     ) -> None:
         folder = existing_root(root, "that holds images and labels of KP")
         super().__init__(folder, name, num_classes, classes, palette)
-        check_choice("dataset.lists", lists, ("auto", "files", "sets"))
         _check_root(self.root)
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)

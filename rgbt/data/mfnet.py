@@ -112,11 +112,7 @@ class MFNet(FileDataset):
         return letter == "N"
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """`is_night` of every name; None if no name contains the time of day.
-
-        Raises:
-            InputError: some names contain it and others do not.
-        """
+        """`is_night` of every name; None if none states the time of day, InputError if some do."""
         if not any(base_name(name)[-1:] in ("D", "N") for name in names):
             return None
         return tuple(self.is_night(name) for name in names)

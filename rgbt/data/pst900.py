@@ -62,8 +62,8 @@ class PST900(FileDataset):
             described above.
 
     Raises:
-        InputError: no such root, neither layout in it, a bag that is not a whole number, or numbers
-            of classes, names and colours differ.
+        InputError: no such root, neither layout in it, or numbers of classes, names and colours
+            differ.
     """
 
     images = GreyImages(
@@ -89,12 +89,6 @@ class PST900(FileDataset):
         folder = existing_root(root, "that holds train and test of PST900")
         super().__init__(folder, name, num_classes, classes, palette)
         self.val_bags = val_bags
-        for bag in val_bags:
-            if not isinstance(bag, int):
-                raise InputError(
-                    f"dataset.val_bags: {bag!r} is not a whole number; give numbers of bags, "
-                    "such as [3,7]."
-                )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
 

@@ -149,8 +149,6 @@ def _code(value: int | Colour, *, of_colours: bool) -> int:
         )
     if isinstance(value, int):
         return value
-    if not all(0 <= level <= 255 for level in value):
-        raise InputError(f"dataset.colours: expected levels from 0 to 255, got {_plain(value)}.")
     red, green, blue = value
     return 65536 * red + 256 * green + blue
 

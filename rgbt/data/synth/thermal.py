@@ -28,15 +28,9 @@ _TEXTURES = materials.column("heat_texture")
 
 
 def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
-    """Temperature of each pixel.
+    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy.
 
-    Args:
-        surface: what each pixel shows.
-        light: day or night, and the sun.
-        strength: factor on texture.
-
-    Returns:
-        (H, W) float32, degrees above the air, without blur, drift and noise.
+    `strength` is a factor on texture.
     """
     table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
     degrees = np.concatenate([[-34.0], _facet_degrees(surface, light)])
