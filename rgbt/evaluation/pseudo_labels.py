@@ -26,7 +26,6 @@ from rgbt.checks import InputError, RunError, check_range
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.batches import Dataset
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import eval_batches
 from rgbt.data.pseudo_labels import (
@@ -38,6 +37,7 @@ from rgbt.data.pseudo_labels import (
     label_path,
     read_pair,
 )
+from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.engine.confidence import probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
@@ -47,7 +47,7 @@ from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.tables import TextTable, percent
 from rgbt.tracking.terminal import info
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE
 
 BEGUN = "pseudo_labels.begun.json"
 """What a folder that is not finished was begun with."""
@@ -181,20 +181,16 @@ def _percent(fraction: float | None) -> str:
     return percent(float("nan") if fraction is None else fraction)
 
 
-@dataclass
-class _Subset:
+class _Subset(DatasetWrapper):
     """A data set of which only some names are read."""
 
-    name: str
-    dataset: Dataset
-    chosen: tuple[str, ...]
+    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
+        super().__init__(source)
+        self.chosen = chosen
 
     def names(self, split: str) -> tuple[str, ...]:
         del split
         return self.chosen
-
-    def read(self, name: str) -> Sample:
-        return self.dataset.read(name)
 
 
 def _settings(
@@ -298,7 +294,7 @@ def _predict(
     if not missing:
         return {}
     decode_ahead(session, request.split)
-    subset = _Subset(session.dataset.name, session.dataset, missing)
+    subset = _Subset(session.dataset, missing)
     batches = eval_batches(subset, request.split, session.transform, session.loading)
     model, fabric = session.model.eval(), session.fabric
     view = view_of(session, request.view)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rgbt.data.mfnet_layout import MIRRORED, base_name
 from rgbt.data.report.lists import other_times, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport
+from rgbt.data.report.values import DatasetChecks, DayNight, SplitNames, SplitReport
 
 if TYPE_CHECKING:
     from rgbt.data.mfnet import MFNet
@@ -25,11 +25,10 @@ OFFICIAL_COUNTS = {
 NAME = re.compile(rf"\d{{5}}[DN]({MIRRORED})?")
 
 
-class MFNetChecks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
+class MFNetChecks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    def __init__(self, dataset: MFNet) -> None:
-        self.dataset = dataset
+    dataset: MFNet
 
     @property
     def title(self) -> str:
@@ -44,9 +43,6 @@ class MFNetChecks:
         """By the letters of the names."""
         letters = Counter(name[-1:] for name in names if not name.endswith(MIRRORED))
         return DayNight(letters["D"], letters["N"], sum(name.endswith(MIRRORED) for name in names))
-
-    def thermal(self, name: str) -> None:
-        """None: thermal images are grey levels."""
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Wrong names, names in two splits, files in no list."""
