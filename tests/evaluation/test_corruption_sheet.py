@@ -10,8 +10,7 @@ import pytest
 
 from rgbt.corruptions.__main__ import entry
 from rgbt.corruptions.late import Delayed
-from rgbt.corruptions.noise import Noise
-from rgbt.corruptions.removed import Removed
+from rgbt.corruptions.pixels import Noise, Removed
 from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
 from tests.commands import Call
 from tests.conftest import WriteMFNet

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.corruptions.noise import Noise
+from rgbt.corruptions.pixels import Noise
 from rgbt.data.cache.dataset import Decoded
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
