@@ -9,17 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rgbt.config.common_options import Checkpoint, Modality, RunsDir, Split, Trained, Trust
+from rgbt.config.common_options import Modality, NetworkOptions, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(NetworkOptions):
     """What is measured, and on which pairs of frames."""
 
-    run: Trained = ""
-    runs_dir: RunsDir = Path("runs")
     frames: Annotated[
         Literal["virtual", "next"],
         Help(
@@ -31,8 +29,6 @@ class Options:
     ] = "virtual"
     split: Split = "test"
     modality: Modality = "default"
-    checkpoint: Checkpoint = "best"
-    trust: Trust = ""
     out: Annotated[
         Path | None,
         Help(
@@ -66,9 +62,9 @@ def main(options: Options, overrides: list[str]) -> int:
     split, frames, out = options.split, options.frames, options.out
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
-    network = NetworkRequest.from_options(options, overrides)
+    network = NetworkRequest(options, overrides)
     network.check_comparable(out)
-    request = EvaluationRequest.from_options(options, split)
+    request = EvaluationRequest.from_options(split, options.modality)
     opened = network.open()
     session = opened.session
     files = pair_files(opened, network, request, frames, out)
@@ -78,7 +74,7 @@ def main(options: Options, overrides: list[str]) -> int:
     title = consistency_title(pairs, opened.label, session.dataset.name)
     print_rich(rich_table(consistency_grid(table, title)))
     print_rich(path_lines(files.write(pairs)))
-    if frames == "virtual" and network.run and not (out or files.suffixes):
+    if frames == "virtual" and options.run and not (out or files.suffixes):
         add_to_result(RunFolder(opened.folder.parent), session, split, table)
     return 0
 

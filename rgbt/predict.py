@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Checkpoint, Head, Modality, RunsDir, Trained, Trust
+from rgbt.config.common_options import Head, Modality, NetworkOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
@@ -22,12 +22,11 @@ if TYPE_CHECKING:
     from rgbt.evaluation.request import EvaluationRequest
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(NetworkOptions):
     """What is predicted, and how it is written."""
 
     out: Annotated[Path, Help("folder, created if it is missing")]
-    run: Trained = ""
     input: Annotated[
         str,
         Help(
@@ -38,11 +37,8 @@ class Options:
     ] = ""
     rgb: Annotated[str, Help("instead of input, with thermal: the RGB file of one pair")] = ""
     thermal: Annotated[str, Help("the thermal file of that pair")] = ""
-    runs_dir: RunsDir = Path("runs")
     modality: Modality = "default"
     head: Head = "as trained"
-    checkpoint: Checkpoint = "best"
-    trust: Trust = ""
     label_map: Annotated[
         str,
         Help(
@@ -79,8 +75,8 @@ def main(options: Options, overrides: list[str]) -> int:
             "show every pixel."
         )
     labelling = Labelling(options.threshold, label_map_of(options.label_map))
-    network = NetworkRequest.from_options(options, overrides)
-    request = EvaluationRequest.from_options(options, options.input, options.head)
+    network = NetworkRequest(options, overrides)
+    request = EvaluationRequest.from_options(options.input, options.modality, options.head)
     opened = network.open(labelling.label_map)
     announce_network(opened)
     if options.pseudo_labels:

@@ -6,7 +6,7 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Literal, NamedTuple
 
@@ -20,9 +20,8 @@ from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
-from rgbt.engine.evaluate import class_maps
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
@@ -61,17 +60,8 @@ class Compared(NamedTuple):
     valid: Tensor | None
 
 
-@dataclass
-class Collected:
-    """Counts of one protocol: name -> number of the set of views -> (K + 1, K, K)."""
-
-    by_name: dict[str, dict[int, NDArray[np.int64]]] = field(default_factory=dict)
-
-    def add(self, scenes: Scenes, compared: Compared, num_classes: int) -> None:
-        """Count the scenes of a batch; a name that a list holds twice counts once."""
-        for name, each in zip(scenes.names, _each(compared), strict=True):
-            counts = pair_counts(each.first, each.second, each.label, num_classes, each.valid)
-            self.by_name.setdefault(name, {})[scenes.number] = counts
+CountsBySet = dict[int, NDArray[np.int64]]
+"""Number of the set of views -> (K + 1, K, K) of one scene."""
 
 
 class Scenes(NamedTuple):
@@ -126,28 +116,39 @@ def count_pairs(
     split = request.split
     _check_second_frames(session, frames)
     decode_ahead(session, split)
-    model.eval()
-    found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
+    predictor = Predictor(session, model, request)
+    found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
-    view = view_of(session, request.view)
-    heads = heads_of(session, view, request.head)
-
-    def predict(batch: Batch) -> Tensor:
-        return class_maps(model, batch, session.fabric, view, heads(batch.name))
-
     scenes_of = _virtual if frames == "virtual" else _next
-    num_classes = len(session.dataset.classes)
     with progress() as display:
         total = len(session.dataset.names(split))
         task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(session, predict, split):
+        for scenes in scenes_of(session, predictor.classes, split):
             for protocol, maps in scenes.compared.items():
-                found[protocol].add(scenes, maps, num_classes)
+                _count(scenes, maps, len(session.dataset.classes), found[protocol])
             wanted = [name for name in scenes.names if name in request.keep and name not in kept]
             kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
-            display.update(task, completed=len(next(iter(found.values())).by_name))
-    counts = {protocol: _counts(session, split, protocol, each) for protocol, each in found.items()}
+            display.update(task, completed=len(found[PROTOCOLS[frames][0]]))
+    counts = {}
+    for protocol, by_name in found.items():
+        joined = {
+            name: np.concatenate([by_set[number] for number in sorted(by_set)])
+            for name, by_set in by_name.items()
+        }
+        sets = max(map(len, by_name.values()), default=0)
+        partition = partition_name(protocol, sets, frames_mark(session, protocol))
+        counts[protocol] = counts_of(session, split, joined, partition)
     return Pairs(counts, tuple(kept.values()))
+
+
+def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, CountsBySet]) -> None:
+    """Add the scenes of a batch; a name that a list holds twice counts once."""
+    first, second, label = (each.cpu() for each in maps[:3])
+    valid = None if maps.valid is None else maps.valid.cpu()
+    for index, name in enumerate(scenes.names):
+        seen = None if valid is None else valid[index]
+        counts = pair_counts(first[index], second[index], label[index], num_classes, seen)
+        found.setdefault(name, {})[scenes.number] = counts
 
 
 def _check_second_frames(session: Session, frames: Frames) -> None:
@@ -163,7 +164,6 @@ def _check_second_frames(session: Session, frames: Frames) -> None:
 
 def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
-    sets = session.consistency
     names = session.dataset.names(split)
     # A name that the list holds twice has the views of its first position.
     position = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
@@ -171,7 +171,7 @@ def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]
         moved = batch.to(session.fabric.device)
         first = predict(moved)
         indices = [position[name] for name in batch.name]
-        for number in range(len(sets.sets)):
+        for number in range(len(session.consistency.sets)):
             yield _turned(session, predict, moved, first, (number, indices))
 
 
@@ -240,15 +240,6 @@ def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[T
     return first.flatten(1).gather(1, flat).view_as(first), seen
 
 
-def _each(maps: Compared) -> Iterator[Compared]:
-    """The scenes of a batch, on the CPU."""
-    first, second, label = (each.cpu() for each in maps[:3])
-    valid = None if maps.valid is None else maps.valid.cpu()
-    for number in range(len(first)):
-        shown = None if valid is None else valid[number]
-        yield Compared(first[number], second[number], label[number], shown)
-
-
 def _example(scenes: Scenes, name: str, protocol: Protocol) -> PairExample:
     maps, number = scenes.compared[protocol], scenes.names.index(name)
     label_hw = (scenes.first.shape[1], scenes.first.shape[2])
@@ -273,29 +264,6 @@ def _picture(image: Tensor) -> NDArray[np.uint8]:
     return (255 * image).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
-def _counts(session: Session, split: str, protocol: Protocol, collected: Collected) -> Counts:
-    dataset = session.dataset
-    if not collected.by_name:
-        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
-    names = tuple(collected.by_name)
-    arrays = [
-        np.concatenate([by_set[number] for number in sorted(by_set)])
-        for by_set in collected.by_name.values()
-    ]
-    sets = len(collected.by_name[names[0]])
-    return Counts(
-        counts=np.stack(arrays).astype(np.int32),
-        names=names,
-        night=dataset.nights(names),
-        classes=dataset.classes,
-        partition=partition_name(protocol, sets, frames_mark(session, protocol)),
-        dataset=dataset.fingerprint(),
-        split=split,
-        unscored=dataset.unscored,
-        absent=session.regions.absent,
-    )
-
-
 def frames_mark(session: Session, protocol: Protocol) -> str:
     """Which second frames counts are of: "" for the published views, else six digits of others.
 
@@ -313,31 +281,30 @@ def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> Consi
         found: counts by protocol, see `count_pairs`.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
     """
-    scores, right = (
+    like = next(iter(found.values()))
+    tc, ca = (
         {
             protocol: OF_PAIRS[HEADLINES[protocol][place]](counts.by_region(), absent)
             for protocol, counts in found.items()
         }
         for place in (0, 1)
     )
-    like = next(iter(found.values()))
     return ConsistencyTable(
         names=like.classes,
-        tc={protocol: tuple(map(float, values)) for protocol, values in scores.items()},
-        ca={protocol: tuple(map(float, values)) for protocol, values in right.items()},
-        mean_tc={each: float(class_mean(values, like.scored)) for each, values in scores.items()},
-        mean_ca={each: float(class_mean(values, like.scored)) for each, values in right.items()},
+        tc={protocol: tuple(map(float, values)) for protocol, values in tc.items()},
+        ca={protocol: tuple(map(float, values)) for protocol, values in ca.items()},
+        mean_tc={each: float(class_mean(values, like.scored)) for each, values in tc.items()},
+        mean_ca={each: float(class_mean(values, like.scored)) for each, values in ca.items()},
         unscored=like.unscored,
     )
 
 
 def consistency_values(table: ConsistencyTable) -> dict[str, float]:
     """The means as metrics of a run, as fractions: "TC/aligned", "CA/aligned", ..."""
-    means = {TC: table.mean_tc, CA: table.mean_ca}
     return {
-        consistency(score, protocol): by_protocol[protocol]
+        consistency(score, protocol): means[protocol]
         for protocol in table.tc
-        for score, by_protocol in means.items()
+        for score, means in ((TC, table.mean_tc), (CA, table.mean_ca))
     }
 
 
