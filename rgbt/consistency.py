@@ -47,7 +47,7 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from dataclasses import replace
 
-    from rgbt.evaluation.consistency_files import add_to_result, pair_files
+    from rgbt.evaluation.consistency_files import PairFiles, add_to_result
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.evaluation.segmentation import panel_names
     from rgbt.evaluation.temporal_consistency import (
@@ -67,7 +67,7 @@ def main(options: Options, overrides: list[str]) -> int:
     request = EvaluationRequest.from_options(split, options.modality)
     opened = network.open()
     session = opened.session
-    files = pair_files(opened, network, request, frames, out)
+    files = PairFiles(opened, network, request, frames, out)
     request = replace(request, keep=panel_names(session.dataset, split))
     pairs = count_pairs(session, session.model, request, frames)
     table = consistency_table(pairs.counts, session.regions.absent)

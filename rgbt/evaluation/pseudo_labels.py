@@ -10,12 +10,11 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ from rgbt.checks import InputError, RunError, check_range
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.batches import Dataset
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import eval_batches
 from rgbt.data.pseudo_labels import (
@@ -38,16 +36,17 @@ from rgbt.data.pseudo_labels import (
     label_path,
     read_pair,
 )
-from rgbt.engine.confidence import probabilities
+from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.images import write_png
+from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.tables import TextTable, percent
 from rgbt.tracking.terminal import info
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE
 
 BEGUN = "pseudo_labels.begun.json"
 """What a folder that is not finished was begun with."""
@@ -153,8 +152,7 @@ def write_pseudo_labels(
             # First the one, then the other: a killed process leaves a folder that is known.
             write_atomic(out / BEGUN, _text(settings))
             (out / MANIFEST).unlink(missing_ok=True)
-            written = _Writer(out, labelling)
-            skipped = _predict(session, request, written, missing, len(names))
+            skipped = _predict(session, request, labelling, out, missing, len(names))
             _finish(out, settings, [name for name in names if name not in skipped], skipped)
     return PseudoLabels(out)
 
@@ -181,20 +179,16 @@ def _percent(fraction: float | None) -> str:
     return percent(float("nan") if fraction is None else fraction)
 
 
-@dataclass
-class _Subset:
+class _Subset(DatasetWrapper):
     """A data set of which only some names are read."""
 
-    name: str
-    dataset: Dataset
-    chosen: tuple[str, ...]
+    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
+        super().__init__(source)
+        self._chosen = chosen
 
     def names(self, split: str) -> tuple[str, ...]:
         del split
-        return self.chosen
-
-    def read(self, name: str) -> Sample:
-        return self.dataset.read(name)
+        return self._chosen
 
 
 def _settings(
@@ -245,35 +239,26 @@ def _refuse_other_content(out: Path) -> None:
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
     """No other process writes to the folder meanwhile; leftovers of killed ones are removed."""
-    with holding(out / LOCK) as holder:
-        if holder is None:
-            yield from _tidied(out)
-            return
-    info(f"{out} is being written by {holder}; waiting for it.")
-    with holding(out / LOCK, wait_s=math.inf):
-        yield from _tidied(out)
-
-
-def _tidied(out: Path) -> Iterator[None]:
-    for folder in ("labels", "confidence"):
-        for leftover in (out / folder).rglob(".*.png.*"):
-            leftover.unlink()
-    yield
+    with ExitStack() as locks:
+        holder = locks.enter_context(holding(out / LOCK))
+        if holder is not None:
+            info(f"{out} is being written by {holder}; waiting for it.")
+            locks.enter_context(holding(out / LOCK, wait_s=math.inf))
+        for folder in ("labels", "confidence"):
+            for leftover in (out / folder).rglob(".*.png.*"):
+                leftover.unlink()
+        yield
 
 
 def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     """Whether all was written before; InputError where it was begun with other settings."""
     finished = (out / MANIFEST).exists()
     if finished:
-        _refuse_others(out, PseudoLabels(out).manifest, settings)
+        begun = PseudoLabels(out).manifest
     elif (out / BEGUN).exists():
-        _refuse_others(
-            out, read_json(out / BEGUN, dict[str, Any], "remove it and predict again"), settings
-        )
-    return finished
-
-
-def _refuse_others(out: Path, begun: dict[str, Any], settings: dict[str, Any]) -> None:
+        begun = read_json(out / BEGUN, dict[str, Any], "remove it and predict again")
+    else:
+        return False
     for key, value in settings.items():
         if key != "teacher" and begun.get(key) != value:
             before, now = (str(each)[:60] for each in (begun.get(key), value))
@@ -281,6 +266,7 @@ def _refuse_others(out: Path, begun: dict[str, Any], settings: dict[str, Any]) -
                 f"{out} was begun with pseudo-labels of another {key} ({before}, now {now}); name "
                 "another folder, or remove this one."
             )
+    return finished
 
 
 def _is_written(out: Path, name: str) -> bool:
@@ -290,7 +276,8 @@ def _is_written(out: Path, name: str) -> bool:
 def _predict(
     session: Session,
     request: EvaluationRequest,
-    writer: _Writer,
+    labelling: Labelling,
+    out: Path,
     missing: tuple[str, ...],
     total: int,
 ) -> dict[str, str]:
@@ -298,47 +285,35 @@ def _predict(
     if not missing:
         return {}
     decode_ahead(session, request.split)
-    subset = _Subset(session.dataset.name, session.dataset, missing)
+    subset = _Subset(session.dataset, missing)
     batches = eval_batches(subset, request.split, session.transform, session.loading)
-    model, fabric = session.model.eval(), session.fabric
-    view = view_of(session, request.view)
-    heads_by = heads_of(session, view, request.head)
+    predictor = Predictor(session, session.model, request)
     with progress() as display:
         done = total - len(missing)
         task = display.add_task("predicting", total=total, completed=done, note="images")
         for batch in batches:
-            heads = heads_by(batch.name)
-            found = probabilities(model, batch.to(fabric.device), fabric, view, heads)
+            found = predictor.probabilities(batch.to(session.fabric.device))
             confidence, classes = (each.cpu().numpy() for each in found.max(1))
             for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
-                writer.write(name, sure, ids.astype(np.uint8))
+                _write(out, name, labelling, sure, ids.astype(np.uint8))
             display.advance(task, len(batch.name))
     return batches.skipped
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Writes labels and confidences of images to the folder `out`."""
-
-    out: Path
-    labelling: Labelling
-
-    def write(self, name: str, confidence: NDArray[np.float32], classes: NDArray[np.uint8]) -> None:
-        if not np.isfinite(confidence).all():
-            raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
-        label_map, threshold = self.labelling.label_map, self.labelling.threshold
-        mapped = classes if label_map is None else label_map(classes)
-        label = np.where(confidence < threshold, np.uint8(IGNORE), mapped)
-        scaled = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
-        _write_png(confidence_path(self.out, name), scaled)
-        _write_png(label_path(self.out, name), label)
-
-
-def _write_png(path: Path, image: NDArray[Any]) -> None:
-    encoded, content = cv2.imencode(".png", image)
-    assert encoded, "an 8-bit or 16-bit image of one channel"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, content.tobytes())
+def _write(
+    out: Path,
+    name: str,
+    labelling: Labelling,
+    confidence: NDArray[np.float32],
+    classes: NDArray[np.uint8],
+) -> None:
+    if not np.isfinite(confidence).all():
+        raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
+    mapped = classes if labelling.label_map is None else labelling.label_map(classes)
+    label = np.where(confidence < labelling.threshold, np.uint8(IGNORE), mapped)
+    scaled = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+    write_png(confidence_path(out, name), scaled)
+    write_png(label_path(out, name), label)
 
 
 def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict[str, str]) -> None:

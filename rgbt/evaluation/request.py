@@ -82,9 +82,10 @@ def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> 
         dataset: that is evaluated.
         marker: what the run knows of its own (``dataset.json``); None: nothing.
     """
-    found = dataset.fingerprint()
-    is_own = marker is None or marker.get("files", found) == found
-    return () if is_own else (f"{dataset.name}-{found[:8]}",)
+    trained_on = (marker or {}).get("files")
+    if trained_on in (None, found := dataset.fingerprint()):
+        return ()
+    return (f"{dataset.name}-{found[:8]}",)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.mfnet import CLASSES
 from rgbt.data.pseudo_labels import PseudoLabels
 from rgbt.engine.confidence import probabilities
+from rgbt.evaluation import images
 from rgbt.evaluation import pseudo_labels as pseudo
 from rgbt.evaluation.pseudo_labels import (
     Labelling,
@@ -336,12 +337,14 @@ def test_killed_in_between_it_goes_on(
         real(path, content)
 
     real = pseudo.write_atomic
-    monkeypatch.setattr(pseudo, "write_atomic", dies)
+    for module in (pseudo, images):
+        monkeypatch.setattr(module, "write_atomic", dies)
     with pytest.raises(KeyboardInterrupt):
         written(session, out)
     with pytest.raises(InputError, match="is not complete"):
         PseudoLabels(out)
-    monkeypatch.setattr(pseudo, "write_atomic", real)
+    for module in (pseudo, images):
+        monkeypatch.setattr(module, "write_atomic", real)
 
     session.model.calls = 0
     found = written(session, out)
