@@ -90,7 +90,7 @@ def main(options: Options, overrides: list[str]) -> int:
 def _pseudo_labels(
     options: Options, opened: TrainedNetwork, request: EvaluationRequest, labelling: Labelling
 ) -> None:
-    from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
+    from rgbt.evaluation.pseudo_labels import summary, write_pseudo_labels
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     session, splits = opened.session, opened.session.dataset.splits
@@ -99,8 +99,7 @@ def _pseudo_labels(
             f"input={request.split}: pseudo-labels are written of a split of "
             f"{session.dataset.name}; name one of {', '.join(splits)}."
         )
-    key_or_file = opened.folder.parent.name if options.run else opened.label
-    teacher = teacher_of(key_or_file, session.model)
+    teacher = opened.folder.parent.name if options.run else opened.label
     labels = write_pseudo_labels(session, teacher, request, labelling, options.out)
     print_rich(rich_table(summary(labels)))
     print_rich(path_lines([("pseudo-labels", str(labels.folder.resolve()))]))

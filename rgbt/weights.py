@@ -72,7 +72,7 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
 def _network(
     contents: Contents, facts: Facts, overrides: list[str], trust: tuple[str, ...]
 ) -> tuple[DictConfig, str] | None:
-    """The network that is asked about and its name; None where nothing says which."""
+    """The network of the file and its name; None where nothing says which."""
     beside = contents.path.parent / "config.yaml"
     if not overrides and contents.ours and beside.is_file():
         model = read_settings(beside).get("model")
@@ -81,18 +81,14 @@ def _network(
         check_targets({"model": model}, trust, str(beside), group="model")
         return OmegaConf.create({"model": model}).model, str(beside)
     if not any(word.startswith("model=") for word in overrides):
-        usual = next((each for each in facts.fits if _is_there(each)), ())
+        known = {f"model={name}" for name in available("model")}
+        usual = next((each for each in facts.fits if each[0] in known), ())
         if not usual:
             return None
         overrides = [*usual, *overrides]
     if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
         overrides = [*overrides, f"model.num_classes={facts.classes}"]
     return compose(overrides).model, " ".join(overrides)
-
-
-def _is_there(overrides: tuple[str, ...]) -> bool:
-    model = overrides[0].removeprefix("model=")
-    return model in available("model")
 
 
 def _built(node: DictConfig) -> Any:

@@ -101,12 +101,6 @@ def check_ladder(kind: Kind) -> None:
         kind.check(severity)
 
 
-def check_whole(severity: float) -> None:
-    """Refuse what is no whole number of frames of at least 1."""
-    if not (math.isfinite(severity) and severity >= 1 and severity == math.floor(severity)):
-        raise InputError(f"severity counts frames: expected 1, 2, 3, ..., got {severity:g}.")
-
-
 def at_height(pixels: float, height: int) -> float:
     """A length of the reference height as a length of an image of `height` rows."""
     return pixels * height / REFERENCE_HEIGHT

@@ -25,6 +25,8 @@ from rgbt.corruptions.corruption import (
 )
 from rgbt.types import Sample
 
+Pixels = NDArray[np.uint8]
+
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 """(rows, columns): up, down, left, right."""
 
@@ -64,9 +66,7 @@ class OneOrBoth:
         }
         return replace(sample, **changed)
 
-    def _changed(
-        self, pixels: NDArray[np.uint8], severity: float, rng_of: RngOf, image: Image
-    ) -> NDArray[np.uint8]:
+    def _changed(self, pixels: Pixels, severity: float, rng_of: RngOf, image: Image) -> Pixels:
         raise NotImplementedError
 
 
@@ -97,9 +97,7 @@ class Occluded(OneOrBoth):
         super().__init__(image=image, severities=severities)
         self.block = block
 
-    def _changed(
-        self, pixels: NDArray[np.uint8], severity: float, rng_of: RngOf, image: Image
-    ) -> NDArray[np.uint8]:
+    def _changed(self, pixels: Pixels, severity: float, rng_of: RngOf, image: Image) -> Pixels:
         del image  # the same generator for both, so that the same blocks are hidden
         hidden = self.hidden(pixels.shape[:2], severity, rng_of("occluded"))
         pixels = pixels.copy()
@@ -139,9 +137,7 @@ class Noise(OneOrBoth):
     name, unit = "noise", "grey levels (std)"
     measure, highest = "standard deviation in grey levels", 255
 
-    def _changed(
-        self, pixels: NDArray[np.uint8], severity: float, rng_of: RngOf, image: Image
-    ) -> NDArray[np.uint8]:
+    def _changed(self, pixels: Pixels, severity: float, rng_of: RngOf, image: Image) -> Pixels:
         noise = rng_of(f"noise {image}").standard_normal(pixels.shape, dtype=np.float32)
         return np.rint(pixels + np.float32(severity) * noise).clip(0, 255).astype(np.uint8)
 
@@ -155,9 +151,7 @@ class Blur(OneOrBoth):
     name, unit = "blur", "pixels at 480 rows (sigma)"
     measure, highest = "sigma in pixels", REFERENCE_HEIGHT / 4
 
-    def _changed(
-        self, pixels: NDArray[np.uint8], severity: float, rng_of: RngOf, image: Image
-    ) -> NDArray[np.uint8]:
+    def _changed(self, pixels: Pixels, severity: float, rng_of: RngOf, image: Image) -> Pixels:
         del rng_of, image  # nothing is drawn
         sigma = at_height(severity, pixels.shape[0])
         return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma), np.uint8)
@@ -242,7 +236,7 @@ class Misregistered:
         return replace(sample, thermal=moved(sample.thermal, rows * distance, columns * distance))
 
 
-def moved(image: NDArray[np.uint8], down: int, right: int) -> NDArray[np.uint8]:
+def moved(image: Pixels, down: int, right: int) -> Pixels:
     """(H, W) `image` moved by whole pixels (negative: up, left); the edge is repeated."""
     rows, columns = (
         np.arange(size) - by for size, by in zip(image.shape, (down, right), strict=True)

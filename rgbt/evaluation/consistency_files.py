@@ -26,12 +26,7 @@ from rgbt.tracking.terminal import info
 class PairFiles:
     """The files of counts of pairs of one split.
 
-    Args:
-        opened: the network.
-        network: how it was requested.
-        request: split and view.
-        frames: what the second frames are.
-        out: folder; None: that of the network.
+    They are written to the folder `out`, or to that of the network.
 
     Attributes:
         suffixes: words that end their names; (): they are the run's own measurement.

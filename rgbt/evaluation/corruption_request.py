@@ -161,6 +161,9 @@ def choose_corruption(
     for key, value in pairs:
         if key != SEED:
             OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
+    seed = dict(pairs).get(SEED, "0")
+    if not seed.isdecimal():
+        raise InputError(f"{NODE}.{SEED}={seed}: expected a whole number of at least 0.")
     corruption = build(node)
     if is_own(corruption) and not isinstance(corruption, OfTime):
         check_corruption(corruption)
@@ -170,7 +173,7 @@ def choose_corruption(
         name=path.stem if is_file else row_name(f"{stem}:{node.get('image', '')}"),
         corruption=corruption,
         changes=tuple(f"{key}={value}" for key, value in pairs if key not in unnamed),
-        seed=_seed([value for key, value in pairs if key == SEED]),
+        seed=int(seed),
     )
 
 
@@ -234,10 +237,3 @@ def _node(path: Path, trust: Collection[str]) -> DictConfig:
     node = OmegaConf.create({NODE: load_config(path, trust)})[NODE]
     assert isinstance(node, DictConfig), "load_config returns a mapping"
     return node
-
-
-def _seed(typed: Sequence[str]) -> int:
-    text = typed[-1] if typed else "0"
-    if not text.isdecimal():
-        raise InputError(f"{NODE}.{SEED}={text}: expected a whole number of at least 0.")
-    return int(text)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,41 +17,19 @@ CELL = 2.4
 """Width in inches of a pair: RGB left, thermal right."""
 
 
-@dataclass(frozen=True)
-class Line:
-    """One corruption.
-
-    Attributes:
-        title: its title.
-        unit: of its severities.
-        pairs: (severity, sample), the clean one (0) first.
-    """
-
-    title: str
-    unit: str
-    pairs: tuple[tuple[float, Sample], ...]
-
-
 def sheet(
-    source: LabelledDataset, kinds: Iterable[Corruption], name: str, split: str, seed: int = 0
-) -> tuple[Line, ...]:
-    """One sample under every severity of every corruption.
-
-    Args:
-        source: the data set.
-        kinds: corruptions.
-        name: of the sample.
-        split: that it is of.
-        seed: of what is drawn.
-    """
+    source: LabelledDataset, kinds: Sequence[Corruption], name: str, split: str, seed: int = 0
+) -> list[list[tuple[str, Sample]]]:
+    """The sample `name` with captions for every corruption: clean, then under every severity."""
     lines = []
     for kind in kinds:
-        pairs = []
-        for severity in (0.0, *kind.severities):
+        pairs = [(kind.title, source.read(name))]
+        for severity in kind.severities:
+            caption = f"{severity:g} {kind.unit}" if kind.unit else ""
             seen = CorruptedDataset(source, kind, severity, split=split, seed=seed)
-            pairs.append((severity, seen.read(name)))
-        lines.append(Line(kind.title, kind.unit, tuple(pairs)))
-    return tuple(lines)
+            pairs.append((caption, seen.read(name)))
+        lines.append(pairs)
+    return lines
 
 
 def side_by_side(sample: Sample) -> NDArray[np.uint8]:
@@ -60,10 +37,10 @@ def side_by_side(sample: Sample) -> NDArray[np.uint8]:
     return np.hstack([sample.rgb, np.repeat(sample.thermal[..., None], 3, axis=2)])
 
 
-def draw(lines: tuple[Line, ...]) -> Figure:
+def draw(lines: Sequence[list[tuple[str, Sample]]]) -> Figure:
     """The picture, drawn without a display."""
-    columns = max(len(line.pairs) for line in lines)
-    height, width = lines[0].pairs[0][1].thermal.shape
+    columns = max(map(len, lines))
+    height, width = lines[0][0][1].thermal.shape
     cell_height = CELL * height / (2 * width) + 0.2
     figure = Figure(figsize=(CELL * columns, cell_height * len(lines)))
     figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.03, wspace=0.01, hspace=0.01)
@@ -71,13 +48,7 @@ def draw(lines: tuple[Line, ...]) -> Figure:
     for axes in grid.flat:
         axes.set_axis_off()
     for row, line in zip(grid, lines, strict=True):
-        for axes, (severity, sample) in zip(row, line.pairs, strict=False):
+        for axes, (caption, sample) in zip(row, line, strict=False):
             axes.imshow(side_by_side(sample))
-            axes.set_title(_caption(line, severity), fontsize=7, loc="left", pad=2)
+            axes.set_title(caption, fontsize=7, loc="left", pad=2)
     return figure
-
-
-def _caption(line: Line, severity: float) -> str:
-    if severity == 0:
-        return line.title
-    return f"{severity:g} {line.unit}" if line.unit else ""

@@ -50,15 +50,7 @@ def write_images(
     out: Path,
     label_map: LabelMap | None,
 ) -> str:
-    """Write NAME_overlay.png and NAME.png of every image, with a progress bar.
-
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        images: see `chosen_images`.
-        request: view and head.
-        out: folder, made where it is missing.
-        label_map: from the classes of the network to those of the data set; None: they are the
-            same.
+    """Write NAME_overlay.png and NAME.png of every image to `out`, with a progress bar.
 
     Returns:
         how many images were written, and where.

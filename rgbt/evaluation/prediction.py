@@ -54,11 +54,9 @@ class Predictor:
 
 
 def view_of(session: Session, view: View | None = None) -> View:
-    """What the network of a session predicts from.
+    """What the network of a session predicts from: `view`.
 
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        view: None: what its source domain is seen as; where that does not say, its first view.
+    None: what its source domain is seen as; where that does not say, the network's first view.
 
     Raises:
         InputError: the network does not predict from `view`.
@@ -75,10 +73,7 @@ def heads_of(
 ) -> Callable[[tuple[str, ...]], tuple[str | None, ...]]:
     """Names of images -> the head that predicts each; None: the network's only one.
 
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        view: what is predicted from.
-        head: None: as the run's configuration says (`domains.tested_head`).
+    Where `head` is None the run's configuration says which (`domains.tested_head`).
     """
     requested = session.domains.tested_head if head is None else head
 

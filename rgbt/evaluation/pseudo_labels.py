@@ -55,19 +55,6 @@ LOCK = ".lock"
 
 
 @dataclass(frozen=True)
-class Teacher:
-    """The network whose predictions become labels.
-
-    Attributes:
-        name: key of its run, or file of its weights; for people.
-        weights: SHA-256 over its parameters and statistics, in hexadecimal.
-    """
-
-    name: str
-    weights: str
-
-
-@dataclass(frozen=True)
 class Labelling:
     """How a prediction becomes labels.
 
@@ -87,14 +74,14 @@ class Labelling:
         check_range("threshold", self.threshold, 0, 1)
 
 
-def teacher_of(name: str, model: nn.Module) -> Teacher:
-    """The teacher that `model` is, with the weights it holds now."""
+def teacher_digest(model: nn.Module) -> str:
+    """SHA-256 over the parameters and statistics of a network, in hexadecimal."""
     digest = hashlib.sha256()
     for key, tensor in model.state_dict().items():
         digest.update(f"{key} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().cpu().contiguous().reshape(-1)
         digest.update(flat.view(torch.uint8).numpy().tobytes())
-    return Teacher(name, digest.hexdigest())
+    return digest.hexdigest()
 
 
 def label_map_of(name: str) -> LabelMap | None:
@@ -112,7 +99,7 @@ def label_map_of(name: str) -> LabelMap | None:
 
 
 def write_pseudo_labels(
-    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling, out: Path
+    session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling, out: Path
 ) -> PseudoLabels:
     """Predict a split with the network of `session` and write its sure pixels as labels.
 
@@ -126,7 +113,7 @@ def write_pseudo_labels(
 
     Args:
         session: see `rgbt.build.session.open_session`; its network is the teacher.
-        teacher: who that is.
+        teacher: key of its run, or file of its weights; for people.
         request: split, view and head; a head of None: as the teacher's configuration says.
         labelling: how predictions become labels.
         out: folder, made where it is missing.
@@ -192,13 +179,13 @@ class _Subset(DatasetWrapper):
 
 
 def _settings(
-    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling
+    session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling
 ) -> dict[str, Any]:
     """The first part of the manifest: all that the files follow from."""
     settings = {
         "format": FORMAT,
-        "teacher": teacher.name,
-        "weights": teacher.weights,
+        "teacher": teacher,
+        "weights": teacher_digest(session.model),
         "network": _network(session.spec),
         "view": request.view,
         "head": request.head or session.domains.tested_head,

@@ -97,11 +97,8 @@ def measure(
 ) -> tuple[Measured, ...]:
     """Evaluate what is missing of a run's robustness; the clean images are first.
 
-    Args:
-        session: with the trained network.
-        split: of its data set.
-        corruptions: each is evaluated at all severities of its ladder.
-        folder: of the counts; NAME.npz has a NAME.json, written after it, that says what made it.
+    Each corruption is evaluated at all severities of its ladder. In the folder of the counts
+    NAME.npz has a NAME.json, written after it, that says what made it.
 
     Raises:
         InputError: a severity that does not fit the images, or a file that cannot be read.
@@ -199,12 +196,7 @@ def robustness_title(opened: TrainedNetwork, split: str) -> str:
 
 
 def robustness_grid(measured: Sequence[Measured], title: str) -> TextTable:
-    """One line per corruption; level 0 is the clean image, level n the n-th severity.
-
-    Args:
-        measured: the clean images first.
-        title: shown above.
-    """
+    """One line per corruption; level 0 is the clean image, level n the n-th severity."""
     clean, *others = measured
     rows: dict[str, list[Measured]] = {}
     for each in others:

@@ -33,11 +33,9 @@ NUM_PANELS = 6
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Counts of one split.
+    """Counts of one split per image and region, predicted from `view`.
 
     Attributes:
-        counts: per image and region.
-        view: what was predicted from.
         kept: examples for pictures.
         skipped: names of unreadable files that were left out.
     """
@@ -49,12 +47,7 @@ class EvaluationResult:
 
 
 def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> EvaluationResult:
-    """Predict a split and count, with a progress bar.
-
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        model: the network to evaluate; left in evaluation mode.
-        request: split, view, head, corruption, and the images to return for pictures.
+    """Predict a split with `model`, left in evaluation mode, and count, with a progress bar.
 
     Raises:
         InputError: a file cannot be read (data.on_error=raise), or none could be; the network
@@ -90,14 +83,7 @@ def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelEx
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
-    """The tables of one evaluation, from its counts alone.
-
-    Args:
-        counts: of the split.
-        regions: partition of the counts and the rule for absent classes.
-        label: what the row stands for, e.g. "grbm".
-        step: optimiser steps done.
-    """
+    """The tables of one evaluation, from its counts alone; `label` names its row."""
     absent, scored = regions.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
     region_ious = scores.miou(by_region, absent, scored)

@@ -45,12 +45,9 @@ PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
 
 
 class Compared(NamedTuple):
-    """Class maps (H', W') of one scene, as one protocol compares them.
+    """Class maps (B, H', W') of scenes as one protocol compares them, and labels of the second.
 
     Attributes:
-        first: prediction of the first frame.
-        second: prediction of the second frame.
-        label: label of the second frame.
         valid: pixels that count; None: all.
     """
 
@@ -79,17 +76,12 @@ class Scenes(NamedTuple):
     compared: dict[Protocol, Compared]
     images: tuple[Tensor, Tensor]
     first: Tensor
-    number: int
+    number: int = 0
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """What `count_pairs` found.
-
-    Attributes:
-        counts: by protocol, see `rgbt.metrics.pairs`.
-        kept: scenes for pictures.
-    """
+    """Counts of pairs by protocol (`rgbt.metrics.pairs`), and scenes for pictures."""
 
     counts: dict[Protocol, Counts]
     kept: tuple[PairExample, ...]
@@ -104,8 +96,8 @@ def count_pairs(
     its release (released: it is not). On true frames points are followed by their exact flow.
 
     Args:
-        session: see `rgbt.build.session.open_session`; its `consistency` says which virtual views.
-        model: the network to evaluate; left in evaluation mode.
+        session: its `consistency` says which virtual views.
+        model: left in evaluation mode.
         request: split, view, head, and the scenes to return for pictures.
         frames: what the second frames are.
 
@@ -172,30 +164,29 @@ def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]
         first = predict(moved)
         indices = [position[name] for name in batch.name]
         for number in range(len(session.consistency.sets)):
-            yield _turned(session, predict, moved, first, (number, indices))
+            angles = session.consistency.angles(number, indices).to(first.device)
+            yield _turned(session, predict, moved, first, angles)._replace(number=number)
 
 
 def _turned(
-    session: Session, predict: Predict, batch: Batch, first: Tensor, turn: tuple[int, list[int]]
+    session: Session, predict: Predict, batch: Batch, first: Tensor, angles: Tensor
 ) -> Scenes:
-    views, angles = session.consistency.view, session.consistency.angles(*turn)
+    """The scenes of a batch with virtual second frames; `first` is the prediction of the first."""
+    views = session.consistency.view
     try:
-        warp = views.warp(angles.to(first.device), (batch.rgb.shape[2], batch.rgb.shape[3]))
+        warp = views.warp(angles, (batch.rgb.shape[2], batch.rgb.shape[3]))
     except InputError as error:
         raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
     turned = views.batch(batch, warp)
     second = predict(turned)
     at_label = warp.resized((first.shape[1], first.shape[2]))
-    aligned = Compared(
-        at_label.nearest(first, 0),
-        second,
-        turned.label,
-        at_label.inside() & (turned.label != IGNORE),
-    )
-    # As released: the first prediction stays where it is, and every pixel counts.
-    released = Compared(first, second, turned.label, None)
-    compared: dict[Protocol, Compared] = {"aligned": aligned, "released": released}
-    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first, turn[0])
+    valid = at_label.inside() & (turned.label != IGNORE)
+    compared: dict[Protocol, Compared] = {
+        "aligned": Compared(at_label.nearest(first, 0), second, turned.label, valid),
+        # As released: the first prediction stays where it is, and every pixel counts.
+        "released": Compared(first, second, turned.label, None),
+    }
+    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
 
 
 def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
@@ -223,11 +214,8 @@ def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
         moved = [each.to(session.fabric.device) for each in (batch, later)]
         first, second = (predict(each).cpu() for each in moved)
         followed, seen = _followed(after, batch.name, first)
-        valid = seen & (later.label != IGNORE)
-        compared: dict[Protocol, Compared] = {
-            "next": Compared(followed, second, later.label, valid)
-        }
-        yield Scenes(batch.name, compared, (moved[0].rgb, moved[1].rgb), first, 0)
+        maps = Compared(followed, second, later.label, seen & (later.label != IGNORE))
+        yield Scenes(batch.name, {"next": maps}, (moved[0].rgb, moved[1].rgb), first)
 
 
 def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[Tensor, Tensor]:
@@ -275,12 +263,7 @@ def frames_mark(session: Session, protocol: Protocol) -> str:
 
 
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
-    """TC and CA of every class and protocol; means over the scored classes.
-
-    Args:
-        found: counts by protocol, see `count_pairs`.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-    """
+    """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
     tc, ca = (
         {
