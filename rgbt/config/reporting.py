@@ -29,8 +29,8 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         return say(str(error), 2)
     except RunError as error:
         return say(str(error), 1)
-    except OSError as error:
-        return say(_of_file(error), 2)
+    except OSError as error:  # Hydra's error of a missing configuration file is one, too
+        return say(_of_hydra(error) or _of_file(error), 2)
     except Stopped as stop:
         if not catch_interrupt:
             raise

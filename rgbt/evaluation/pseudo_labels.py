@@ -11,17 +11,16 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from rgbt.build.session import Session
-from rgbt.checks import InputError, RunError, check_range
+from rgbt.checks import InputError, check_range
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
@@ -60,8 +59,7 @@ class Labelling:
 
     Attributes:
         threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
-        label_map: from the classes of the network to those of the data set; None: they are the
-            same.
+        label_map: from the classes of the network to those of the data set, where they differ.
 
     Raises:
         InputError: a threshold out of range.
@@ -112,9 +110,9 @@ def write_pseudo_labels(
     keeps every pixel: threshold 0.
 
     Args:
-        session: see `rgbt.build.session.open_session`; its network is the teacher.
+        session: its network is the teacher.
         teacher: key of its run, or file of its weights; for people.
-        request: split, view and head; a head of None: as the teacher's configuration says.
+        request: split, view and head.
         labelling: how predictions become labels.
         out: folder, made where it is missing.
 
@@ -124,17 +122,17 @@ def write_pseudo_labels(
         RunError: the network's predictions are not finite.
     """
     assert request.corruption is None, "labels are predicted from clean images"
-    if (label_map := labelling.label_map) is not None:
-        num_classes = session.spec.model.values.get("num_classes", label_map.num_source)
-        label_map.check(num_classes, tuple(session.dataset.classes), session.dataset.name)
-    request = replace(request, view=view_of(session, request.view))
     settings = _settings(session, teacher, request, labelling)
     names = tuple(dict.fromkeys(session.dataset.names(request.split)))
     _refuse_other_content(out)
     out.mkdir(parents=True, exist_ok=True)
     with _alone(out):
         finished = _is_finished(out, settings)
-        missing = tuple(name for name in names if not _is_written(out, name))
+        missing = tuple(
+            name
+            for name in names
+            if not (label_path(out, name).is_file() and confidence_path(out, name).is_file())
+        )
         if not finished or set(missing) - set(PseudoLabels(out).manifest["skipped"]):
             # First the one, then the other: a killed process leaves a folder that is known.
             write_atomic(out / BEGUN, _text(settings))
@@ -187,7 +185,7 @@ def _settings(
         "teacher": teacher,
         "weights": teacher_digest(session.model),
         "network": _network(session.spec),
-        "view": request.view,
+        "view": view_of(session, request.view),
         "head": request.head or session.domains.tested_head,
         "label_map": None if labelling.label_map is None else asdict(labelling.label_map),
         "threshold": float(labelling.threshold),
@@ -256,10 +254,6 @@ def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     return finished
 
 
-def _is_written(out: Path, name: str) -> bool:
-    return label_path(out, name).is_file() and confidence_path(out, name).is_file()
-
-
 def _predict(
     session: Session,
     request: EvaluationRequest,
@@ -271,6 +265,7 @@ def _predict(
     """Predict and write the missing images; why others could not be read, by name."""
     if not missing:
         return {}
+    label_map = labelling.label_map
     decode_ahead(session, request.split)
     subset = _Subset(session.dataset, missing)
     batches = eval_batches(subset, request.split, session.transform, session.loading)
@@ -282,25 +277,13 @@ def _predict(
             found = predictor.probabilities(batch.to(session.fabric.device))
             confidence, classes = (each.cpu().numpy() for each in found.max(1))
             for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
-                _write(out, name, labelling, sure, ids.astype(np.uint8))
+                ids = ids.astype(np.uint8) if label_map is None else label_map(ids.astype(np.uint8))
+                label = np.where(sure < labelling.threshold, np.uint8(IGNORE), ids)
+                scaled = np.rint(FULL * sure.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+                write_png(confidence_path(out, name), scaled)
+                write_png(label_path(out, name), label)
             display.advance(task, len(batch.name))
     return batches.skipped
-
-
-def _write(
-    out: Path,
-    name: str,
-    labelling: Labelling,
-    confidence: NDArray[np.float32],
-    classes: NDArray[np.uint8],
-) -> None:
-    if not np.isfinite(confidence).all():
-        raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
-    mapped = classes if labelling.label_map is None else labelling.label_map(classes)
-    label = np.where(confidence < labelling.threshold, np.uint8(IGNORE), mapped)
-    scaled = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
-    write_png(confidence_path(out, name), scaled)
-    write_png(label_path(out, name), label)
 
 
 def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict[str, str]) -> None:
