@@ -144,7 +144,7 @@ def choose_corruption(
     Args:
         name: a file of ``conf/corruption/`` without extension, alone or as NAME:IMAGE, or a path
             that ends in .yaml.
-        words: ``corruption.KEY=VALUE``, as `split_overrides` returns them.
+        words: ``corruption.KEY=VALUE``.
         trust: modules that the file may name (`rgbt.config.stored_config`).
 
     Raises:
@@ -197,12 +197,9 @@ def requested_corruption(
 def choose_corruptions(
     text: str, words: Sequence[str], trust: Collection[str] = ()
 ) -> list[CorruptionRequest]:
-    """The corruptions of ``corruptions=``.
+    """The corruptions of ``corruptions=``: names with commas, or "all".
 
-    Args:
-        text: names with commas, or "all".
-        words: ``corruption.KEY=VALUE``; any key of a single corruption, the seed of several.
-        trust: see `choose_corruption`.
+    `words` are any key of a single corruption, the seed of several.
 
     Raises:
         InputError: an unknown name, one given twice, or keys of several corruptions at once.

@@ -69,8 +69,8 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
             predicted = predictor.classes(batch.to(session.fabric.device)).cpu()
             for name, label, classes in zip(batch.name, batch.label, predicted, strict=True):
                 counted[name] = counter(label, classes)
-                if name in request.keep:
-                    kept.append(_example(session, name, classes.numpy()))
+                is_kept = name in request.keep
+                kept += [_example(session, name, classes.numpy())] if is_kept else []
             display.advance(task, len(batch.name))
     counts = counts_of(session, request.split, counted, session.regions.name)
     return EvaluationResult(counts, predictor.view, tuple(kept), tuple(batches.skipped))

@@ -5,7 +5,7 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Literal, NamedTuple
@@ -32,9 +32,6 @@ from rgbt.metrics.scores import class_mean
 from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
 from rgbt.types import IGNORE, Batch
-
-Predict = Callable[[Batch], Tensor]
-"""A batch on the device -> its class maps (B, H', W') uint8."""
 
 Frames = Literal["virtual", "next"]
 PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
@@ -115,7 +112,7 @@ def count_pairs(
     with progress() as display:
         total = len(session.dataset.names(split))
         task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(session, predictor.classes, split):
+        for scenes in scenes_of(session, predictor, split):
             for protocol, maps in scenes.compared.items():
                 _count(scenes, maps, len(session.dataset.classes), found[protocol])
             wanted = [name for name in scenes.names if name in request.keep and name not in kept]
@@ -154,22 +151,22 @@ def _check_second_frames(session: Session, frames: Frames) -> None:
         )
 
 
-def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
+def _virtual(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
     names = session.dataset.names(split)
     # A name that the list holds twice has the views of its first position.
     position = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
-        first = predict(moved)
+        first = predictor.classes(moved)
         indices = [position[name] for name in batch.name]
         for number in range(len(session.consistency.sets)):
             angles = session.consistency.angles(number, indices).to(first.device)
-            yield _turned(session, predict, moved, first, angles)._replace(number=number)
+            yield _turned(session, predictor, moved, first, angles)._replace(number=number)
 
 
 def _turned(
-    session: Session, predict: Predict, batch: Batch, first: Tensor, angles: Tensor
+    session: Session, predictor: Predictor, batch: Batch, first: Tensor, angles: Tensor
 ) -> Scenes:
     """The scenes of a batch with virtual second frames; `first` is the prediction of the first."""
     views = session.consistency.view
@@ -178,7 +175,7 @@ def _turned(
     except InputError as error:
         raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
     turned = views.batch(batch, warp)
-    second = predict(turned)
+    second = predictor.classes(turned)
     at_label = warp.resized((first.shape[1], first.shape[2]))
     valid = at_label.inside() & (turned.label != IGNORE)
     compared: dict[Protocol, Compared] = {
@@ -189,7 +186,7 @@ def _turned(
     return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
 
 
-def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
+def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
     after = NextFrames(session.dataset)
     settings, transform = session.loading, session.transform
     pairs = zip_longest(
@@ -212,7 +209,7 @@ def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
                 f"{after.dataset.root}."
             )
         moved = [each.to(session.fabric.device) for each in (batch, later)]
-        first, second = (predict(each).cpu() for each in moved)
+        first, second = (predictor.classes(each).cpu() for each in moved)
         followed, seen = _followed(after, batch.name, first)
         maps = Compared(followed, second, later.label, seen & (later.label != IGNORE))
         yield Scenes(batch.name, {"next": maps}, (moved[0].rgb, moved[1].rgb), first)
@@ -265,19 +262,16 @@ def frames_mark(session: Session, protocol: Protocol) -> str:
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
     """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
-    tc, ca = (
-        {
-            protocol: OF_PAIRS[HEADLINES[protocol][place]](counts.by_region(), absent)
-            for protocol, counts in found.items()
-        }
-        for place in (0, 1)
-    )
+    scores = {
+        protocol: [OF_PAIRS[name](counts.by_region(), absent) for name in HEADLINES[protocol]]
+        for protocol, counts in found.items()
+    }
     return ConsistencyTable(
         names=like.classes,
-        tc={protocol: tuple(map(float, values)) for protocol, values in tc.items()},
-        ca={protocol: tuple(map(float, values)) for protocol, values in ca.items()},
-        mean_tc={each: float(class_mean(values, like.scored)) for each, values in tc.items()},
-        mean_ca={each: float(class_mean(values, like.scored)) for each, values in ca.items()},
+        tc={protocol: tuple(map(float, tc)) for protocol, (tc, _) in scores.items()},
+        ca={protocol: tuple(map(float, ca)) for protocol, (_, ca) in scores.items()},
+        mean_tc={each: float(class_mean(tc, like.scored)) for each, (tc, _) in scores.items()},
+        mean_ca={each: float(class_mean(ca, like.scored)) for each, (_, ca) in scores.items()},
         unscored=like.unscored,
     )
 

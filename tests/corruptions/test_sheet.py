@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.corruptions.__main__ import entry
+from rgbt.corruptions.__main__ import draw, entry, sheet, side_by_side
 from rgbt.corruptions.late import Delayed
 from rgbt.corruptions.pixels import Noise, Removed
-from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
 from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample
