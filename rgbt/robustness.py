@@ -54,13 +54,7 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation.corruption_request import choose_corruptions, split_overrides
     from rgbt.evaluation.request import NetworkRequest
-    from rgbt.evaluation.robustness import (
-        counts_folder,
-        measure,
-        robustness_grid,
-        robustness_title,
-        write_tables,
-    )
+    from rgbt.evaluation.robustness import counts_folder, measure, robustness_grid, write_tables
     from rgbt.tracking.run_folder import find_run
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
@@ -86,7 +80,10 @@ def main(options: Options, overrides: list[str]) -> int:
         opened = network.open()
         folder = out or counts_folder(opened, network, split)
         measured = measure(opened.session, split, corruptions, folder)
-        grid = robustness_grid(measured, robustness_title(opened, split))
+        # A file of weights has neither a step nor a seed.
+        label = f"{opened.label} seed={opened.session.spec.seed}" if opened.step else opened.label
+        on = f"{opened.session.dataset.name}, {split}"
+        grid = robustness_grid(measured, f"Robustness of {label} ({on}): mIoU in percent")
         write_tables(measured, grid, folder / stem)
         print_rich(rich_table(grid))
         print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))

@@ -86,11 +86,7 @@ Corruption = OfPixels | OfTime
 
 
 def check_ladder(kind: Kind) -> None:
-    """Refuse an empty ladder, one that does not rise, and severities that are out of range.
-
-    Raises:
-        InputError: naming what is wrong.
-    """
+    """InputError for an empty ladder, one that does not rise, and severities out of range."""
     ladder = kind.severities
     if not ladder or any(low >= high for low, high in zip((0.0, *ladder), ladder, strict=False)):
         raise InputError(

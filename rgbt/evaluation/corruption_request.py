@@ -35,14 +35,12 @@ SEED = "seed"
 
 @dataclass(frozen=True)
 class CorruptionRequest:
-    """A corruption with a severity.
+    """A corruption with a severity; 0: the images as they are.
 
     Attributes:
         name: what files of counts call it without its changes, such as "noise_rgb".
-        corruption: built.
         changes: ``key=value`` words that differ from the file, as typed.
         seed: of what is drawn.
-        severity: 0: the images as they are.
     """
 
     name: str

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,7 @@ from rgbt.types import Batch, View
 
 
 class Predictor:
-    """Predicts batches with a network, from one view, each image by its head.
-
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        model: put into evaluation mode and left in it.
-        request: its view and head count.
+    """Predicts batches with `model`, left in evaluation mode; each image by its head.
 
     Attributes:
         view: what is predicted from.
@@ -78,14 +73,12 @@ def heads_of(
     requested = session.domains.tested_head if head is None else head
 
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
-        dark: tuple[bool | None, ...] | None = None
+        dark = None
         if requested == "own" and session.domains.target_is == "night":
-            try:
+            with suppress(InputError):  # files of one's own are in no list
                 dark = session.dataset.nights(names)
-            except InputError:
-                dark = None  # files of one's own are in no list
-        dark = dark or (None,) * len(names)
-        return tuple(session.domains.head_of(view, night, requested) for night in dark)
+        nights = dark or (None,) * len(names)
+        return tuple(session.domains.head_of(view, night, requested) for night in nights)
 
     return choose
 

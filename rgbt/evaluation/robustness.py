@@ -25,7 +25,8 @@ from rgbt.evaluation.segmentation import evaluate
 from rgbt.files import budgets
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.scores import miou
+from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
+from rgbt.metrics.scores import summary
 from rgbt.requirements import record_of
 from rgbt.tracking.csv_files import csv_text
 from rgbt.tracking.tables import TextTable, percent
@@ -44,6 +45,9 @@ FEATURES: dict[View, str] = {
 features of one branch alone are decoded."""
 
 
+SCORES = (MIOU, subset(DAY, MIOU), subset(NIGHT, MIOU))
+
+
 @dataclass(frozen=True)
 class Condition:
     """What the network sees in one evaluation: clean images, one branch, or a corruption.
@@ -53,9 +57,6 @@ class Condition:
         row: of the table: a corruption or a view, whose severities share it.
         title: what people call the row.
         unit: of the severity; "" where it has none.
-        severity: 0: clean.
-        view: what is predicted from.
-        corruption: of the images; None: they are clean.
     """
 
     file_stem: str
@@ -120,11 +121,8 @@ def measure(
         for condition in every:
             display.update(task, note=condition.file_stem)
             counts = _counts(session, condition, shared, folder)
-            parts = {"": counts, **{f"{part}/": sub for part, sub in counts.parts().items()}}
-            mious = {
-                f"{part}mIoU": float(miou(sub.whole(), session.regions.absent, sub.scored))
-                for part, sub in parts.items()
-            }
+            scores = summary(counts, session.regions.absent)
+            mious = {name: scores[name] for name in SCORES if name in scores}
             found.append(Measured(condition, counts, mious))
             display.advance(task)
     return tuple(found)
@@ -187,14 +185,6 @@ def counts_folder(opened: TrainedNetwork, network: NetworkRequest, split: str) -
     return opened.folder / FOLDER / "_".join([split, *regions, *network.suffixes, *others])
 
 
-def robustness_title(opened: TrainedNetwork, split: str) -> str:
-    """Title of the table."""
-    session = opened.session
-    is_run = opened.step > 0  # a file of weights tells neither step nor seed
-    seed = f" seed={session.spec.seed}" if is_run else ""
-    return f"Robustness of {opened.label}{seed} ({session.dataset.name}, {split}): mIoU in percent"
-
-
 def robustness_grid(measured: Sequence[Measured], title: str) -> TextTable:
     """One line per corruption; level 0 is the clean image, level n the n-th severity."""
     clean, *others = measured
@@ -207,10 +197,10 @@ def robustness_grid(measured: Sequence[Measured], title: str) -> TextTable:
         first = row[0].condition
         ladder = ", ".join(f"{each.condition.severity:g}" for each in row)
         severities = f"{ladder} {first.unit}" if first.unit else ""
-        values = [percent(each.mious["mIoU"]) for each in (clean, *row)]
+        values = [percent(each.mious[MIOU]) for each in (clean, *row)]
         empty = [""] * (levels - len(row))
         lines.append((first.title, severities, *values, *empty))
-    lines = lines or [(CLEAN, "", percent(clean.mious["mIoU"]))]
+    lines = lines or [(CLEAN, "", percent(clean.mious[MIOU]))]
     header = ("", "severities", *(f"level {level}" for level in range(levels + 1)))
     return TextTable(title, header, tuple(lines))
 

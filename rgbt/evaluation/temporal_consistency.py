@@ -283,11 +283,3 @@ def consistency_values(table: ConsistencyTable) -> dict[str, float]:
         for protocol in table.tc
         for score, means in ((TC, table.mean_tc), (CA, table.mean_ca))
     }
-
-
-def consistency_title(pairs: Pairs, label: str, dataset: str) -> str:
-    """Title of the table: what was measured, on which second frames."""
-    protocol, counts = next(iter(pairs.counts.items()))
-    frames = next(frames for frames, protocols in PROTOCOLS.items() if protocol in protocols)
-    views = counts.partition.partition("-")[2] or "published"
-    return f"Consistency of {label} ({dataset}, {counts.split}; {frames}: {views})"
