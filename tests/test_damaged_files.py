@@ -233,7 +233,8 @@ def read_label_array(path: Path) -> Any:
 
 
 def run_folder(folder: Path) -> Any:
-    from rgbt.tracking.run_folder import Description, RunFolder
+    from rgbt.tracking.run_files import Description
+    from rgbt.tracking.run_folder import RunFolder
 
     run = RunFolder(folder)
     run.describe(Description("grbm seed=0", {"rgbt.seed": "0"}, {"seed": "0", "scale": "demo"}))

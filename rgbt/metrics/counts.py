@@ -119,7 +119,7 @@ class Counts:
         return {part: self._take(indices.tolist()) for part, indices in chosen.items()}
 
     def save(self, path: Path) -> None:
-        """Write one compressed file under a temporary name, then rename: never half a file."""
+        """Write one compressed file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.array(self.night if self.night is not None else (), dtype=bool)

@@ -147,6 +147,16 @@ def pixel_accuracy(counts: Matrices) -> Scores:
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
 
 
+MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
+    names.MIOU: miou,
+    names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
+    names.MPRECISION: lambda counts, absent, scored: class_mean(precision(counts, absent), scored),
+    names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
+    names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
+}
+"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
+
+
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
 
@@ -164,12 +174,7 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     whole, scored = counts.whole(), counts.scored
     by_class = iou(whole, absent)
     result = _mean_and_variance(counts, absent)
-    result |= {
-        names.MACC: float(class_mean(recall(whole, absent), scored)),
-        names.MPRECISION: float(class_mean(precision(whole, absent), scored)),
-        names.MF1: float(class_mean(f1(whole, absent), scored)),
-        names.PIXEL_ACCURACY: float(pixel_accuracy(whole)),
-    }
+    result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
     for number, score in enumerate(miou(counts.by_region(), absent, scored), start=1):
         result[names.region(number)] = float(score)
     for name, score in zip(counts.classes, by_class, strict=True):

@@ -23,7 +23,7 @@ from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
 from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced_runs import shown_description
-from rgbt.tracking.run_files import SentForm
+from rgbt.tracking.run_files import read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
 from rgbt.tracking.tables import ResultTables, result_grids
 from rgbt.tracking.tracker import Status
@@ -83,7 +83,8 @@ def read_upload_state(folder: RunFolder) -> UploadState | None:
     """
     path = folder.path / "mlflow.json"
     advice = "remove it: the MLflow run is then found by its key"
-    return UploadState(**read_json(path, SentForm, advice)) if path.exists() else None
+    found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
+    return found
 
 
 def write_upload_state(folder: RunFolder, sent: UploadState) -> None:
@@ -102,7 +103,7 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         status: the state to show.
     """
     known_params, seen, name = _find_run(store, folder, sent)
-    tables = _tables(folder)
+    tables = read_tables(folder.path)
     lines = [line for line in folder.lines() if line.step > sent.steps.get(line.kind, -1)]
     metrics = list(_metrics(lines))
     if tables is not None and tables.split == "test" and not sent.profile:
@@ -178,7 +179,7 @@ def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
     """
     from mlflow.entities import Metric
 
-    result = folder.result()
+    result = read_result(folder.path)
     if result is None:
         return {}
     lines = folder.lines()
@@ -221,14 +222,14 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
     from mlflow.entities import RunTag
 
     description = shown_description(folder)
-    first = (folder.provenance() or [{}])[0]
+    first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
         "mlflow.source.type": "LOCAL",
         "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
         "rgbt.command": first.get("command", ""),
         "mlflow.source.git.commit": first.get("git_commit") or "",
-        "rgbt.dataset": (folder.result() or {}).get("dataset", ""),
+        "rgbt.dataset": (read_result(folder.path) or {}).get("dataset", ""),
         **identity(folder),
         **({} if description is None else description.tags),
     }
@@ -236,11 +237,6 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
         tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
     return [RunTag(name, value[:5000]) for name, value in tags.items() if value]
-
-
-def _tables(folder: RunFolder) -> ResultTables | None:
-    plain = folder.tables()
-    return None if plain is None else ResultTables.from_json(plain)
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:

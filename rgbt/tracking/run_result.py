@@ -16,13 +16,15 @@ from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import commit_of
 from rgbt.tracking.run_files import (
     ADVICE,
+    Description,
+    MarkerForm,
+    counts_name,
     read_description,
     read_marker,
     read_provenance,
     read_result,
     read_tables,
 )
-from rgbt.tracking.run_folder import Description
 from rgbt.tracking.tables import ResultTables
 
 CHECKPOINT = "best.pt"
@@ -71,15 +73,14 @@ class RunResult:
         return str(self.result["dataset"])
 
     @property
-    def marker(self) -> dict[str, Any] | None:
+    def marker(self) -> MarkerForm | None:
         """``dataset.json``: digests of the names of the images and of the files; or None."""
         return read_marker(self.folder)
 
     @property
     def description(self) -> Description:
         """Name, tags and parameters; empty where the folder has no ``run.json``."""
-        plain = read_description(self.folder)
-        return Description("", {}, {}) if plain is None else Description(**plain)
+        return read_description(self.folder) or Description("", {}, {})
 
     @property
     def name(self) -> str:
@@ -128,8 +129,7 @@ class RunResult:
     @property
     def tables(self) -> ResultTables | None:
         """Its tables by region and class, or None."""
-        plain = read_tables(self.folder)
-        return None if plain is None else ResultTables.from_json(plain)
+        return read_tables(self.folder)
 
     def scores(self) -> dict[str, float]:
         """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
@@ -143,7 +143,7 @@ class RunResult:
 
     def counts_path(self, split: str = "test") -> Path:
         """Path of the counts that the run itself ended with."""
-        return self.folder / f"counts_{split}.npz"
+        return self.folder / counts_name(split)
 
     def counts(self, path: str = "counts_test.npz") -> Counts:
         """Counts of an evaluation.

@@ -14,7 +14,8 @@ import pytest
 from analysis.results import NamedCounts, groups_in, label_of, open_counts
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from tests.analysis.uncertainty.simulated import Population, counts_of
 
 COMMAS = "grbm scale=demo sizes=[1,2]"

@@ -21,7 +21,8 @@ from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from tests.commands import SPLITS, Call
 from tests.conftest import pair
 

@@ -18,7 +18,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.run_specs import PlannedRun

@@ -9,7 +9,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
 from rgbt.tracking.replaced_runs import replace_finished, runs_dir_of, set_aside, shown_description
-from rgbt.tracking.run_folder import Description, RunFolder, find_run, runs_in
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder, find_run, runs_in
 from rgbt.tracking.sync import Options, folders_of
 
 TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}

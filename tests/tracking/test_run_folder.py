@@ -16,7 +16,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import is_held, write_atomic
-from rgbt.tracking.run_folder import Description, RunFolder, runs_in
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder, runs_in
 
 
 def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:

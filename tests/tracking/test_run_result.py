@@ -10,7 +10,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from rgbt.engine.checkpoint import State
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.training.train import Run, _show_again
 
 

@@ -16,7 +16,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
 from rgbt.randomness import numpy_generator
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.rendering.file_formats import tidy_csv
