@@ -132,7 +132,7 @@ def parse_json(text: bytes | str, form: Any) -> Any:
         values = found if isinstance(found, list) else [found]
         are_sealed = all([_unseal(value) for value in values])
         value = found
-        if is_dataclass(form):  # strict validation makes objects of JSON alone
+        if isinstance(form, type) and is_dataclass(form):  # made of JSON alone when strict
             value = _adapter(form).validate_json(json.dumps(found), strict=True)
         else:
             _adapter(form).validate_python(found, strict=True)

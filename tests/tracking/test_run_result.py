@@ -10,7 +10,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 
@@ -33,7 +33,7 @@ def run(tmp_path: Path) -> RunResult:
     folder.describe(Description("a name", {"rgbt.group": "grbm", "rgbt.seed": "3"}, {"k": "v"}))
     folder.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": True, "diff": ""})
     folder.add_provenance({"git_commit": "f" * 16, "diff": ""})
-    counts().save(folder.counts_path("test"))
+    counts().save(folder.path / counts_name("test"))
     scores = {"mIoU": 0.25, "Var": 2.5, "region/1": None}
     folder.finish({"name": "a name", "dataset": "d", "val": {"mIoU": 0.5}, "test": scores})
     return RunResult(folder.path)
