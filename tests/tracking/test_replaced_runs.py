@@ -9,7 +9,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
 from rgbt.tracking.replaced_runs import replace_finished, runs_dir_of, set_aside, shown_description
-from rgbt.tracking.run_files import Description, read_result
+from rgbt.tracking.run_files import Description, read_description, read_result
 from rgbt.tracking.run_folder import RunFolder, find_run, runs_in
 from rgbt.tracking.sync import Options, folders_of
 
