@@ -29,7 +29,6 @@ class FigureInput:
     """The arguments of one figure.
 
     Attributes:
-        figure: its name.
         values: key -> value, only those that were given.
         overrides: of the configuration: ``dataset=...``, ``metric=...``.
         metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
@@ -255,9 +254,6 @@ class FigureInput:
 def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
     """Refuse a figure that would show methods on different images, or with means over different
     classes, side by side.
-
-    Args:
-        methods: label -> counts of its seeds.
 
     Raises:
         InputError: naming the two.

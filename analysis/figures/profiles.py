@@ -36,15 +36,11 @@ class Profile:
     """MIoU by region of one method, percent.
 
     Attributes:
-        label: the method.
-        partition: name of the regions.
         means: (R,) mean over seeds.
         miou: of the whole image.
         low: (R,) lower ends of the intervals, or None where there are none.
         high: (R,) upper ends.
         covers: what the interval is over: "images", "seeds", "images and seeds", or "".
-        seeds: number of seeds.
-        images: number of images.
         level: of the intervals; NaN without.
     """
 

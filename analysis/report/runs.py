@@ -45,11 +45,9 @@ class ReportRun:
     """A training of the store with its scores and settings, as the report uses it.
 
     Attributes:
-        entry: what the page shows.
         test_counts: that the run ended with; None where there are none.
         absent: how the run scores a class without pixels.
         config: dotted key -> value; empty where the store has no configuration.
-        files: its files.
     """
 
     entry: RunEntry

@@ -82,15 +82,10 @@ class MlflowRun:
     """One run of MLflow: a training, or the record of a table or study.
 
     Attributes:
-        run_id: of MLflow.
-        name: as shown.
         status: "FINISHED", "RUNNING", "FAILED", "KILLED" or "SCHEDULED".
         started: ISO 8601, UTC; "" where unknown.
-        seconds: from start to end, or None.
-        tags: by name.
         params: by name, as text.
         metrics: last value by name, as MLflow has it.
-        files: its files.
     """
 
     run_id: str
@@ -191,9 +186,6 @@ class _FileFinder:
     """Where files of runs may lie.
 
     Attributes:
-        client: of MLflow.
-        runs_dir: the folder of runs.
-        copies: folder for fetched files.
         beside: folder of artifacts beside a database, or None.
     """
 

@@ -38,7 +38,6 @@ class ParsedMetric:
     """A metric name, taken apart.
 
     Attributes:
-        metric: the name.
         part: "day", "night", or None for all images.
         score: a mean over classes, "Var", "IoU", "acc", or one of `OF_PAIRS`.
         class_name: of one class alone, or None.
@@ -141,10 +140,6 @@ def values(
 
 def check_kind(asked: ParsedMetric, partition: str) -> None:
     """Refuse a score of pairs of frames from counts of single ones, and the other way round.
-
-    Args:
-        asked: the score.
-        partition: of the counts.
 
     Raises:
         InputError: such counts do not have it.

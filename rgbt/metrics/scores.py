@@ -164,10 +164,6 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     of each class (unscored ones too); mIoU and variance again for day and for night where the data
     set tells them apart.
 
-    Args:
-        counts: of one split, one image or more.
-        absent: see the module docstring.
-
     Returns:
         name -> fraction, or squared percent points for the variance. NaN: nothing to score.
     """

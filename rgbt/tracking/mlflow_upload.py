@@ -54,7 +54,6 @@ class UploadState:
 
     Attributes:
         uri: the store, passwords hidden.
-        experiment: name of the experiment.
         artifact_uri: where a new experiment keeps files, or None.
         experiment_id: "" before the first contact.
         run_id: "" before the first contact.

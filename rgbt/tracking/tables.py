@@ -81,10 +81,7 @@ class ResultTables:
 
     Attributes:
         split: "val" or "test".
-        step: optimiser steps done.
         region_names: R names, e.g. "ring_1", the innermost ring.
-        regions: the per-region row.
-        classes: the per-class table.
         consistency: of two frames, where the run measured it.
     """
 
