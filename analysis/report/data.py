@@ -52,15 +52,15 @@ class RunEntry:
     group: str
     studies: tuple[str, ...]
     table_rows: Mapping[str, str]
-    split: str
-    partition: str
-    classes: tuple[str, ...]
+    split: str = "test"
+    partition: str = ""
+    classes: tuple[str, ...] = ()
     unscored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     scores: Mapping[str, float]
-    region_ious: tuple[float, ...]
-    class_region_ious: tuple[tuple[float, ...], ...]
-    images: int
+    region_ious: tuple[float, ...] = ()
+    class_region_ious: tuple[tuple[float, ...], ...] = ()
+    images: int = 0
     commit: str
     started: str
     seconds: float | None

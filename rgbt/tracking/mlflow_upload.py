@@ -103,12 +103,13 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
     """
     known_params, seen, name = _find_run(store, folder, sent)
     tables = read_tables(folder.path)
-    lines = [line for line in folder.lines() if line.step > sent.steps.get(line.kind, -1)]
+    every = folder.lines()
+    lines = [line for line in every if line.step > sent.steps.get(line.kind, -1)]
     metrics = list(_metrics(lines))
     if tables is not None and tables.split == "test" and not sent.profile:
-        metrics += _profile(tables, folder)
+        metrics += _profile(tables, every)
         sent.profile = True
-    later = _later(folder, sent)
+    later = _later(folder, every, sent)
     metrics += later.values()
     _send(store, sent, (metrics, _params(folder, known_params), _tags(folder, tables)))
     sent.steps |= {line.kind: line.step for line in lines}
@@ -171,7 +172,7 @@ def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
                 yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
 
 
-def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
+def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dict[str, Any]:
     """Scores of pairs of frames in the result that no line holds and that were not sent yet.
 
     Those of the selection split, and those that `rgbt.consistency` added to a finished run.
@@ -181,7 +182,6 @@ def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
     result = read_result(folder.path)
     if result is None:
         return {}
-    lines = folder.lines()
     held = {f"{line.kind}/{name}" for line in lines if line.kind == "test" for name in line.values}
     found = {}
     for kind in ("val", "test"):
@@ -196,11 +196,11 @@ def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
     return found
 
 
-def _profile(tables: ResultTables, folder: RunFolder) -> list[Any]:
+def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
     """IoU over the regions as a line: the step is the region's number."""
     from mlflow.entities import Metric
 
-    times = [line.time for line in folder.lines()] or [time.time()]
+    times = [line.time for line in lines] or [time.time()]
     return [
         Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * times[-1]), region)
         for region, iou in enumerate(tables.regions.region_ious, start=1)
