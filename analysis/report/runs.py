@@ -25,9 +25,9 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
+from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG

@@ -31,7 +31,6 @@ from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
-ClassScore = Callable[[Matrices, Absent], Scores]
 Scored = NDArray[np.bool_] | None
 """(K,): which classes means are over; None: all."""
 

@@ -19,9 +19,9 @@ from typing import Any
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
+from rgbt.metrics.names import shown
 from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
-from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced_runs import shown_description
 from rgbt.tracking.run_files import read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder

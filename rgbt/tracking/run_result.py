@@ -11,21 +11,17 @@ from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.names import in_percent
 from rgbt.tracking.other_code import other_code
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import commit_of
 from rgbt.tracking.run_files import (
     ADVICE,
     Description,
-    MarkerForm,
     counts_name,
     read_description,
-    read_marker,
     read_provenance,
     read_result,
-    read_tables,
 )
-from rgbt.tracking.tables import ResultTables
 
 CHECKPOINT = "best.pt"
 """The network that evaluations are made with; other machines do not get it."""
@@ -73,43 +69,14 @@ class RunResult:
         return str(self.result["dataset"])
 
     @property
-    def marker(self) -> MarkerForm | None:
-        """``dataset.json``: digests of the names of the images and of the files; or None."""
-        return read_marker(self.folder)
-
-    @property
     def description(self) -> Description:
         """Name, tags and parameters; empty where the folder has no ``run.json``."""
         return read_description(self.folder) or Description("", {}, {})
 
     @property
-    def name(self) -> str:
-        """How the run is shown."""
-        return self.description.name
-
-    @property
     def tags(self) -> dict[str, str]:
         """Tags by name."""
         return self.description.tags
-
-    @property
-    def params(self) -> dict[str, str]:
-        """Parameters by dotted key, as text."""
-        return self.description.params
-
-    @property
-    def group(self) -> str:
-        """What all seeds of its configuration share, as the run wrote it; "" without one.
-
-        `rgbt.spec.naming.group_of` writes the group of an older run as it is written now.
-        """
-        return self.tags.get("rgbt.group", "")
-
-    @property
-    def seed(self) -> int | None:
-        """Its seed, or None."""
-        seed = self.tags.get("rgbt.seed", "")
-        return int(seed) if seed else None
 
     @property
     def provenance(self) -> list[dict[str, Any]]:
@@ -125,11 +92,6 @@ class RunResult:
     def other_code(self) -> str | None:
         """The code that made it, in words, where it is not that of this process; else None."""
         return other_code(self.folder)
-
-    @property
-    def tables(self) -> ResultTables | None:
-        """Its tables by region and class, or None."""
-        return read_tables(self.folder)
 
     def scores(self) -> dict[str, float]:
         """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""

@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
+from rgbt.metrics.names import shown
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import (
@@ -28,7 +29,6 @@ from rgbt.tracking.mlflow_upload import (
     write_upload_state,
 )
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
-from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder

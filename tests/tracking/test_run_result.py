@@ -41,11 +41,10 @@ def run(tmp_path: Path) -> RunResult:
 
 def test_run_result_reads_what_the_run_wrote(run: RunResult) -> None:
     assert (run.key, run.run_id, run.dataset, run.is_finished) == ("abc", "", "d", True)
-    assert (run.name, run.params, run.group, run.seed) == ("a name", {"k": "v"}, "grbm", 3)
+    assert (run.description.name, run.description.params) == ("a name", {"k": "v"})
+    assert run.tags == {"rgbt.group": "grbm", "rgbt.seed": "3"}
     assert run.commit == "0123456789+"
     assert [each["git_commit"][0] for each in run.provenance] == ["0", "f"]
-    assert run.tables is None
-    assert run.marker is None
 
 
 def test_scores_are_in_percent_without_missing_ones(run: RunResult) -> None:
@@ -55,7 +54,7 @@ def test_scores_are_in_percent_without_missing_ones(run: RunResult) -> None:
 def test_result_of_unfinished_run_is_refused(tmp_path: Path) -> None:
     run = RunResult(tmp_path / "none")
     assert not run.is_finished
-    assert (run.name, run.group, run.seed, run.commit) == ("", "", None, None)
+    assert (run.tags, run.commit) == ({}, None)
     with pytest.raises(InputError, match=r"result\.json is missing or names no data set"):
         _ = run.dataset
     assert not run.folder.exists(), "reading makes no folder"

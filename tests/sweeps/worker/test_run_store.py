@@ -11,9 +11,9 @@ import pytest
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names, scores
+from rgbt.metrics.names import in_percent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import read_upload_state
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
