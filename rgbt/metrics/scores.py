@@ -39,13 +39,7 @@ def iou(counts: Matrices, absent: Absent) -> Scores:
     """Intersection over union of each class: ``TP / (TP + FP + FN)``.
 
     Source: SpatialSeg, Eq. 18; CRM, RTFNet and Temporal releases.
-
-    Args:
-        counts: (..., K, K).
-        absent: see the module docstring.
-
-    Returns:
-        (..., K).
+    Shapes: (..., K, K) -> (..., K).
     """
     right, labelled, predicted = _sums(counts)
     return ratio(right, labelled + predicted - right, absent)
@@ -74,27 +68,15 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
 
 
 def known_mean(scores: Scores) -> Scores:
-    """Mean over the last dimension without NaN; NaN where nothing is left.
+    """Mean over the last dimension, of anything but classes, without NaN: (..., X) -> (...).
 
-    Args:
-        scores: (..., X), of anything but classes.
-
-    Returns:
-        (...).
+    NaN where nothing is left.
     """
     return _mean(scores, ~np.isnan(scores))
 
 
 def class_mean(scores: Scores, scored: Scored) -> Scores:
-    """Mean over the scored classes without NaN; NaN where nothing is left.
-
-    Args:
-        scores: (..., K).
-        scored: (K,), which classes it is over; None: all.
-
-    Returns:
-        (...).
-    """
+    """Mean over the scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
     known = ~np.isnan(scores)
     return _mean(scores, known if scored is None else known & scored)
 
@@ -103,14 +85,7 @@ def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
     """Mean over the scored classes of `iou`; the background is one unless it is left out.
 
     For the mIoU of the tables pass the counts of the whole image, regions summed.
-
-    Args:
-        counts: (..., K, K).
-        absent: see the module docstring.
-        scored: (K,), which classes it is over; None: all.
-
-    Returns:
-        (...).
+    Shapes: (..., K, K) -> (...).
     """
     return class_mean(iou(counts, absent), scored)
 
@@ -136,11 +111,7 @@ def variance(region_scores: ArrayLike) -> Scores:
 def pixel_accuracy(counts: Matrices) -> Scores:
     """Share of the valid pixels, of unscored classes too, that are right; NaN without any.
 
-    Args:
-        counts: (..., K, K).
-
-    Returns:
-        (...).
+    Shapes: (..., K, K) -> (...).
     """
     right, labelled, _ = _sums(counts)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)

@@ -25,7 +25,7 @@ from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, u
 from rgbt.tracking.replaced_runs import shown_description
 from rgbt.tracking.run_files import read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
-from rgbt.tracking.tables import ResultTables, result_grids
+from rgbt.tracking.tables import ResultTables, result_grids, without_nan
 from rgbt.tracking.tracker import Status
 
 PARAM_LENGTH = 500
@@ -260,12 +260,8 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
     for name, by_region in zip(classes.names, classes.region_ious, strict=True):
         pairs = zip(tables.region_names, by_region, strict=True)
         rows += [(f"{name} / {region}", 100 * iou, math.nan) for region, iou in pairs]
-    data = [[name, *(_two_decimals(value) for value in values)] for name, *values in rows]
+    data = [[name, *without_nan([round(v, 2) for v in values])] for name, *values in rows]
     return {"columns": ["score", "IoU %", "accuracy %"], "data": data}
-
-
-def _two_decimals(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 2)
 
 
 def _send_table(store: MlflowStore, sent: UploadState, tables: ResultTables | None) -> None:
