@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
 from rgbt.build.load_run import TrainedNetwork
@@ -15,7 +15,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, partition_name
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.pair_pictures import draw_pairs
-from rgbt.tracking.run_files import read_marker
+from rgbt.tracking.run_files import read_marker, read_result, read_tables
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.sync import Options as SyncOptions
 from rgbt.tracking.sync import status_of, tracking_of
@@ -83,14 +83,14 @@ class PairFiles:
 
 def add_to_result(run: RunFolder, session: Session, split: str, table: ConsistencyTable) -> None:
     """Add the measurement to the result, tables and MLflow run of `run`, as if made by it."""
-    result, tables = run.result(), run.tables()
+    result, tables = read_result(run.path), read_tables(run.path)
     kinds = {session.trainer.selection_split: "val", "test": "test"}
     if result is None or tables is None or split not in kinds or session.consistency.mark:
         return
     kind = kinds[split]
     result[kind] = {**result[kind], **without_nan(consistency_values(table))}
     if kind == "test":
-        run.write_tables({**tables, "consistency": without_nan(asdict(table))})
+        run.write_tables(replace(tables, consistency=table))
     run.finish(result)
     if read_upload_state(run) is None:
         return
