@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rgbt.data.folder.values import plain
 from rgbt.data.report.lists import listed_twice, shared
 from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport, ThermalStatistics
-
-if TYPE_CHECKING:
-    from rgbt.data.folder.dataset import Folder
 
 MOST_CLIPPED = 0.5
 """Largest share of the thermal values of a split that may be outside `thermal_range`."""
@@ -18,9 +15,9 @@ MOST_CLIPPED = 0.5
 class FolderChecks(DatasetChecks):
     """Overrides what differs from other data sets."""
 
-    dataset: Folder
+    dataset: Any  # a Folder, whose module imports this one
 
-    def __init__(self, dataset: Folder) -> None:
+    def __init__(self, dataset: Any) -> None:
         super().__init__(dataset)
         self._statistics: dict[str, ThermalStatistics] = {}
 

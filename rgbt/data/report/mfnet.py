@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rgbt.data.mfnet_layout import MIRRORED, base_name
 from rgbt.data.report.lists import other_times, shared
 from rgbt.data.report.values import DatasetChecks, DayNight, SplitNames, SplitReport
-
-if TYPE_CHECKING:
-    from rgbt.data.mfnet import MFNet
 
 OFFICIAL_DAY_NIGHT = {"train": (410, 374), "val": (205, 187), "test": (205, 188)}
 """Day and night images of each split of MFNet (784, 392 and 393 names), without mirrored copies."""
@@ -28,7 +25,7 @@ NAME = re.compile(rf"\d{{5}}[DN]({MIRRORED})?")
 class MFNetChecks(DatasetChecks):
     """Overrides what differs from other data sets."""
 
-    dataset: MFNet
+    dataset: Any  # a MFNet, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -55,7 +52,7 @@ class MFNetChecks(DatasetChecks):
         return other_times(splits, OFFICIAL_COUNTS)
 
     def _share_a_list(self, one: str, other: str) -> bool:
-        return self.dataset.list_path(one) == self.dataset.list_path(other)
+        return bool(self.dataset.list_path(one) == self.dataset.list_path(other))
 
     def _unlisted(self, lists: SplitNames) -> list[str]:
         unlisted = sorted(self.dataset.names_on_disk() - set().union(*lists.values()))

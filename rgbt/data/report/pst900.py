@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rgbt.data.named_files import names_in
 from rgbt.data.pst900_layout import FOLDERS, bag_of
 from rgbt.data.report.lists import listed_twice, other_sizes, shared
 from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport, ThermalStatistics
-
-if TYPE_CHECKING:
-    from rgbt.data.pst900 import PST900
 
 NUM_TRAIN = 597
 """Pairs of the training part on disk; the data set's page says 606."""
@@ -26,7 +23,7 @@ HW = (720, 1280)
 class PST900Checks(DatasetChecks):
     """Overrides what differs from other data sets."""
 
-    dataset: PST900
+    dataset: Any  # a PST900, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -54,7 +51,7 @@ class PST900Checks(DatasetChecks):
         return [*notes, *(note for split in splits for note in self._holes(split))]
 
     def _is_test(self, split: str) -> bool:
-        return self.dataset.part_of(split) == "test"
+        return bool(self.dataset.part_of(split) == "test")
 
     def _of_val(self) -> str:
         return (
