@@ -175,12 +175,7 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
 
 
 def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
-    """One line per score.
-
-    Args:
-        comparison: of two methods.
-        labels: what they are called.
-    """
+    """One line per score."""
     from rgbt.tracking.tables import TextTable, number
 
     with_seeds = any(difference.both is not None for difference in comparison.differences)

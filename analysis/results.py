@@ -14,7 +14,8 @@ from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, protocol_of
 from rgbt.spec.naming import GROUP, group_of
-from rgbt.tracking.run_folder import Description, find_run, runs_in
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import find_run, runs_in
 from rgbt.tracking.run_result import RunResult
 from rgbt.tracking.terminal import info
 

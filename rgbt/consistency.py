@@ -5,21 +5,19 @@ TC says how far the predictions of two frames of a scene agree, CA how far both 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rgbt.config.common_options import Checkpoint, Modality, RunsDir, Split, Trained, Trust
+from rgbt.config.common_options import Modality, NetworkOptions, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(NetworkOptions):
     """What is measured, and on which pairs of frames."""
 
-    run: Trained = ""
-    runs_dir: RunsDir = Path("runs")
     frames: Annotated[
         Literal["virtual", "next"],
         Help(
@@ -31,8 +29,6 @@ class Options:
     ] = "virtual"
     split: Split = "test"
     modality: Modality = "default"
-    checkpoint: Checkpoint = "best"
-    trust: Trust = ""
     out: Annotated[
         Path | None,
         Help(
@@ -49,16 +45,10 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
     they do not name is as in conf/consistency/views.yaml, whatever the run measured
     """
-    from dataclasses import replace
-
-    from rgbt.evaluation.consistency_files import add_to_result, pair_files
+    from rgbt.evaluation.consistency_files import PairFiles, add_to_result
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.evaluation.segmentation import panel_names
-    from rgbt.evaluation.temporal_consistency import (
-        consistency_table,
-        consistency_title,
-        count_pairs,
-    )
+    from rgbt.evaluation.temporal_consistency import consistency_table, count_pairs
     from rgbt.tracking.run_folder import RunFolder
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
@@ -66,19 +56,20 @@ def main(options: Options, overrides: list[str]) -> int:
     split, frames, out = options.split, options.frames, options.out
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
-    network = NetworkRequest.from_options(options, overrides)
+    network = NetworkRequest(options, overrides)
     network.check_comparable(out)
-    request = EvaluationRequest.from_options(options, split)
+    request = EvaluationRequest.from_options(split, options.modality)
     opened = network.open()
     session = opened.session
-    files = pair_files(opened, network, request, frames, out)
+    files = PairFiles(opened, network, request, frames, out)
     request = replace(request, keep=panel_names(session.dataset, split))
     pairs = count_pairs(session, session.model, request, frames)
     table = consistency_table(pairs.counts, session.regions.absent)
-    title = consistency_title(pairs, opened.label, session.dataset.name)
-    print_rich(rich_table(consistency_grid(table, title)))
+    views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
+    on = f"{session.dataset.name}, {split}; {frames}: {views}"
+    print_rich(rich_table(consistency_grid(table, f"Consistency of {opened.label} ({on})")))
     print_rich(path_lines(files.write(pairs)))
-    if frames == "virtual" and network.run and not (out or files.suffixes):
+    if frames == "virtual" and options.run and not (out or files.suffixes):
         add_to_result(RunFolder(opened.folder.parent), session, split, table)
     return 0
 

@@ -9,25 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Checkpoint, Head, Modality, RunsDir, Trained, Trust
+from rgbt.config.common_options import Head, Modality, NetworkOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
-if TYPE_CHECKING:
-    from rgbt.build.load_run import TrainedNetwork
-    from rgbt.evaluation.pseudo_labels import Labelling
-    from rgbt.evaluation.request import EvaluationRequest
 
-
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(NetworkOptions):
     """What is predicted, and how it is written."""
 
     out: Annotated[Path, Help("folder, created if it is missing")]
-    run: Trained = ""
     input: Annotated[
         str,
         Help(
@@ -38,11 +32,8 @@ class Options:
     ] = ""
     rgb: Annotated[str, Help("instead of input, with thermal: the RGB file of one pair")] = ""
     thermal: Annotated[str, Help("the thermal file of that pair")] = ""
-    runs_dir: RunsDir = Path("runs")
     modality: Modality = "default"
     head: Head = "as trained"
-    checkpoint: Checkpoint = "best"
-    trust: Trust = ""
     label_map: Annotated[
         str,
         Help(
@@ -68,9 +59,10 @@ def main(options: Options, overrides: list[str]) -> int:
 
     Overrides such as dataset=mfnet dataset.root=/data/MFNet
     """
+    from rgbt.evaluation import pseudo_labels
     from rgbt.evaluation.images import chosen_images, write_images
-    from rgbt.evaluation.pseudo_labels import Labelling, label_map_of
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
     from rgbt.training.overview import announce_network
 
     if not options.pseudo_labels and options.threshold:
@@ -78,36 +70,27 @@ def main(options: Options, overrides: list[str]) -> int:
             f"threshold={options.threshold:g} is for pseudo_labels=true; class maps and overlays "
             "show every pixel."
         )
-    labelling = Labelling(options.threshold, label_map_of(options.label_map))
-    network = NetworkRequest.from_options(options, overrides)
-    request = EvaluationRequest.from_options(options, options.input, options.head)
-    opened = network.open(labelling.label_map)
+    label_map = pseudo_labels.label_map_of(options.label_map)
+    labelling = pseudo_labels.Labelling(options.threshold, label_map)
+    request = EvaluationRequest.from_options(options.input, options.modality, options.head)
+    opened = NetworkRequest(options, overrides).open(label_map)
     announce_network(opened)
-    if options.pseudo_labels:
-        _pseudo_labels(options, opened, request, labelling)
+    session, out = opened.session, options.out
+    if not options.pseudo_labels:
+        images = chosen_images(session, options.input, options.rgb, options.thermal)
+        print(write_images(session, images, request, out, label_map))
         return 0
-    images = chosen_images(opened.session, options.input, options.rgb, options.thermal)
-    print(write_images(opened.session, images, request, options.out, labelling.label_map))
-    return 0
-
-
-def _pseudo_labels(
-    options: Options, opened: TrainedNetwork, request: EvaluationRequest, labelling: Labelling
-) -> None:
-    from rgbt.evaluation.pseudo_labels import summary, teacher_of, write_pseudo_labels
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
-
-    session, splits = opened.session, opened.session.dataset.splits
+    splits = session.dataset.splits
     if request.split not in splits or options.rgb or options.thermal:
         raise InputError(
             f"input={request.split}: pseudo-labels are written of a split of "
             f"{session.dataset.name}; name one of {', '.join(splits)}."
         )
-    key_or_file = opened.folder.parent.name if options.run else opened.label
-    teacher = teacher_of(key_or_file, session.model)
-    labels = write_pseudo_labels(session, teacher, request, labelling, options.out)
-    print_rich(rich_table(summary(labels)))
+    teacher = opened.folder.parent.name if options.run else opened.label
+    labels = pseudo_labels.write_pseudo_labels(session, teacher, request, labelling, out)
+    print_rich(rich_table(pseudo_labels.summary(labels)))
     print_rich(path_lines([("pseudo-labels", str(labels.folder.resolve()))]))
+    return 0
 
 
 entry = PlainCommand(Options, main)

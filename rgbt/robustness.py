@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Annotated
 
 from rgbt.checks import InputError, split_list
-from rgbt.config.common_options import Checkpoint, RegionsFile, RunsDir, Split, Trust
+from rgbt.config.common_options import NetworkOptions, RegionsFile, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(NetworkOptions):
     """What is measured, and under which corruptions."""
 
     run: Annotated[
@@ -27,7 +27,6 @@ class Options:
             "and its weights: model=mfnet model.weights=final.pth dataset.root=/data/MFNet"
         ),
     ] = ""
-    runs_dir: RunsDir = Path("runs")
     split: Split = "test"
     corruptions: Annotated[
         str,
@@ -38,8 +37,6 @@ class Options:
         ),
     ] = "all"
     regions: RegionsFile = "as trained"
-    checkpoint: Checkpoint = "best"
-    trust: Trust = ""
     out: Annotated[
         Path | None,
         Help("folder of the counts of one run; default: evaluations/robustness/ in the run folder"),
@@ -57,20 +54,14 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation.corruption_request import choose_corruptions, split_overrides
     from rgbt.evaluation.request import NetworkRequest
-    from rgbt.evaluation.robustness import measure
-    from rgbt.evaluation.robustness_table import (
-        counts_folder,
-        robustness_grid,
-        robustness_title,
-        write_tables,
-    )
+    from rgbt.evaluation.robustness import counts_folder, measure, robustness_grid, write_tables
     from rgbt.tracking.run_folder import find_run
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     words, overrides = split_overrides(overrides)
     split, out = options.split, options.out
     networks = [
-        NetworkRequest.from_options(replace(options, run=run), overrides, options.regions)
+        NetworkRequest(replace(options, run=run), overrides, options.regions)
         for run in (split_list(options.run, "runs") if options.run else [""])
     ]
     corruptions = choose_corruptions(options.corruptions, words, networks[0].trust)
@@ -80,8 +71,8 @@ def main(options: Options, overrides: list[str]) -> int:
         )
     for network in networks:  # before the first of them is measured
         network.check_comparable(out)
-        if network.run:
-            find_run(network.run, network.runs_dir)
+        if network.options.run:
+            find_run(network.options.run, options.runs_dir)
     # A table of some corruptions does not replace that of all.
     some = [] if options.corruptions == Options.corruptions else corruptions
     stem = "_".join(["robustness", *(each.row for each in some)])
@@ -89,7 +80,10 @@ def main(options: Options, overrides: list[str]) -> int:
         opened = network.open()
         folder = out or counts_folder(opened, network, split)
         measured = measure(opened.session, split, corruptions, folder)
-        grid = robustness_grid(measured, robustness_title(opened, split))
+        # A file of weights has neither a step nor a seed.
+        label = f"{opened.label} seed={opened.session.spec.seed}" if opened.step else opened.label
+        on = f"{opened.session.dataset.name}, {split}"
+        grid = robustness_grid(measured, f"Robustness of {label} ({on}): mIoU in percent")
         write_tables(measured, grid, folder / stem)
         print_rich(rich_table(grid))
         print_rich(path_lines([("counts", f"{folder}/ ({stem}.md, {stem}.csv)")]))

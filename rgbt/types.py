@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -45,6 +45,35 @@ class Sample:
     rgb: NDArray[np.uint8]
     thermal: NDArray[np.uint8]
     label: NDArray[np.uint8] | None
+    name: str
+    confidence: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class Example:
+    """A sample after the transform, not padded to what a network asks for.
+
+    Attributes:
+        rgb: (H, W, 3), uint8 or float32, 0..255, RGB order.
+        thermal: (H, W), dtype and range of `rgb`.
+        label: (H', W') uint8, class index or 255 = ignore. H' = H and W' = W after `train`; after
+            `test` the size of the file, which the images may have left.
+        centre_yx: pixel of the example that is nearest to pixel (rows // 2, columns // 2) of the
+            original image; the first in row-major order on a tie.
+        position: (2, H, W) float32, (row, column) in the original image of every pixel; None
+            where it is not tracked.
+        original_hw: size of the original image.
+        name: name in the split list.
+        confidence: (H', W') float32, of the label, moved as the label is and by nearest; None
+            where labels carry none.
+    """
+
+    rgb: NDArray[Any]
+    thermal: NDArray[Any]
+    label: NDArray[np.uint8]
+    centre_yx: tuple[int, int]
+    position: NDArray[np.float32] | None
+    original_hw: tuple[int, int]
     name: str
     confidence: NDArray[np.float32] | None = None
 

@@ -13,14 +13,14 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checkpoints.layout import Facts
 from rgbt.checkpoints.read import Contents
 from rgbt.checks import InputError
-from rgbt.config.common_options import RunsDir
+from rgbt.config.common_options import Checkpoint, RunsDir
 from rgbt.config.component import build
 from rgbt.config.compose import available, compose
 from rgbt.config.options import Help
@@ -72,7 +72,7 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
 def _network(
     contents: Contents, facts: Facts, overrides: list[str], trust: tuple[str, ...]
 ) -> tuple[DictConfig, str] | None:
-    """The network that is asked about and its name; None where nothing says which."""
+    """The network of the file and its name; None where nothing says which."""
     beside = contents.path.parent / "config.yaml"
     if not overrides and contents.ours and beside.is_file():
         model = read_settings(beside).get("model")
@@ -81,18 +81,14 @@ def _network(
         check_targets({"model": model}, trust, str(beside), group="model")
         return OmegaConf.create({"model": model}).model, str(beside)
     if not any(word.startswith("model=") for word in overrides):
-        usual = next((each for each in facts.fits if _is_there(each)), ())
+        known = {f"model={name}" for name in available("model")}
+        usual = next((each for each in facts.fits if each[0] in known), ())
         if not usual:
             return None
         overrides = [*usual, *overrides]
     if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
         overrides = [*overrides, f"model.num_classes={facts.classes}"]
     return compose(overrides).model, " ".join(overrides)
-
-
-def _is_there(overrides: tuple[str, ...]) -> bool:
-    model = overrides[0].removeprefix("model=")
-    return model in available("model")
 
 
 def _built(node: DictConfig) -> Any:
@@ -119,9 +115,7 @@ class ExportOptions:
         ),
     ]
     out: Annotated[Path, Help("the new file; one that exists is left alone")]
-    checkpoint: Annotated[
-        Literal["best", "last"], Help("best (by the selection split) or last")
-    ] = "best"
+    checkpoint: Checkpoint = "best"
     runs_dir: RunsDir = Path("runs")
 
 
@@ -136,22 +130,23 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
 
     del overrides  # none is heeded
     folder = find_run(options.run, options.runs_dir)
-    model = _model(folder / "config.yaml")
+    file = folder / "config.yaml"
+    model = read_settings(file).get("model", {})
+    if not isinstance(model.get("_target_"), str):
+        raise InputError(f"{file}: 'model' must be a mapping with `_target_`.")
     contents = read(folder / f"{options.checkpoint}.pt")
-    family = family_named(model._target_)
-    plain: Any = OmegaConf.to_container(model, resolve=True)
-    settings = {key: value for key, value in plain.items() if key not in NOT_SETTINGS}
+    family = family_named(model["_target_"])
+    settings = {key: value for key, value in model.items() if key not in NOT_SETTINGS}
     note = {
-        "network": plain["_target_"],
+        "network": model["_target_"],
         "family": family,
-        "inputs": json.dumps(plain.get("inputs")),
+        "inputs": json.dumps(model.get("inputs")),
         "settings": json.dumps(settings),
         "run": folder.name,
         "checkpoint": options.checkpoint,
         "step": str(contents.settings.get("step", 0)),
     }
-    out = options.out
-    remark = save(out, options.format, family, contents.tensors, note)
+    remark = save(options.out, options.format, family, contents.tensors, note)
     others = differences(model, CONVENTIONS.get((options.format, family), ()))
     if others:
         info(
@@ -160,17 +155,8 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
         )
     if remark:
         info(f"{remark}.")
-    sys.stdout.write(f"{out}\n")
+    sys.stdout.write(f"{options.out}\n")
     return 0
-
-
-def _model(path: Path) -> DictConfig:
-    """Settings of a stored network, for what is written of them; nothing is built from them."""
-    settings = read_settings(path)
-    if not isinstance(settings.get("model", {}).get("_target_"), str):
-        raise InputError(f"{path}: 'model' must be a mapping with `_target_`.")
-    config: DictConfig = OmegaConf.create(settings).model
-    return config
 
 
 entry = CommandGroup(

@@ -233,7 +233,9 @@ def read_label_array(path: Path) -> Any:
 
 
 def run_folder(folder: Path) -> Any:
-    from rgbt.tracking.run_folder import Description, RunFolder
+    from rgbt.tracking.run_files import Description
+    from rgbt.tracking.run_folder import RunFolder
+    from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
     run = RunFolder(folder)
     run.describe(Description("grbm seed=0", {"rgbt.seed": "0"}, {"seed": "0", "scale": "demo"}))
@@ -241,7 +243,15 @@ def run_folder(folder: Path) -> Any:
         run.append(step, "train", {"loss": 1 / step, "learning_rate": 1e-4})
     run.append(50, "val", {"mIoU": 0.25, "class/bump": float("nan")})
     run.append(50, "test", {"mIoU": 0.5})
-    run.write_tables({"split": "test", "classes": {"names": ["a"], "ious": [0.5]}})
+    run.write_tables(
+        ResultTables(
+            split="test",
+            step=50,
+            region_names=("ring_1",),
+            regions=RegionTable("grbm", (0.5,), 0.5, 0.0),
+            classes=ClassTable(("a",), (0.5,), (0.5,), ((0.5,),), {}),
+        )
+    )
     run.add_provenance({"command": "a", "git_commit": "0123456789", "diff": "", "cpu_usable": 2})
     scores = {"val": {"mIoU": 0.25}, "test": {"mIoU": 0.5, "Var": None}}
     run.finish(
@@ -277,13 +287,25 @@ def in_run(name: str) -> Callable[[Path], Path]:
     return make
 
 
-def of_run(method: str) -> Callable[[Path], Any]:
+def by(reader: str) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
-        from rgbt.tracking.run_folder import RunFolder
+        from rgbt.tracking import run_files
 
-        return plain(getattr(RunFolder(path.parent), method)())
+        return plain(getattr(run_files, reader)(path.parent))
 
     return read
+
+
+def read_provenance(path: Path) -> Any:
+    from rgbt.tracking.run_files import read_provenance as read
+
+    return plain(read(path))
+
+
+def read_lines(path: Path) -> Any:
+    from rgbt.tracking.run_folder import RunFolder
+
+    return plain(RunFolder(path.parent).lines())
 
 
 def resume(path: Path) -> Any:
@@ -305,9 +327,10 @@ def marker(folder: Path) -> Path:
 
 
 def read_marker(path: Path) -> Any:
-    from rgbt.tracking.run_folder import RunFolder
 
-    return plain(RunFolder(path.parent).marker())
+    from rgbt.tracking.run_files import read_marker as read
+
+    return plain(read(path.parent))
 
 
 def follow(path: Path) -> Any:
@@ -503,14 +526,14 @@ KINDS = {
         Kind("flow array", flow, read_flow, anything),
         Kind("prediction PNG", label, read_prediction),
         Kind("prediction PNG with a palette", palette_label, read_prediction),
-        Kind("metrics.jsonl", in_run("metrics.jsonl"), of_run("lines"), part_of),
+        Kind("metrics.jsonl", in_run("metrics.jsonl"), read_lines, part_of),
         Kind("metrics.jsonl of a resumed run", in_run("metrics.jsonl"), resume, part_of),
         Kind("metrics.jsonl of a sweep", in_run("metrics.jsonl"), follow, part_of_some),
-        Kind("result.json", in_run("result.json"), of_run("result")),
+        Kind("result.json", in_run("result.json"), by("read_result")),
         Kind("result.json of a sweep", in_run("result.json"), found),
-        Kind("run.json", in_run("run.json"), of_run("description")),
-        Kind("tables.json", in_run("tables.json"), of_run("tables")),
-        Kind("provenance.json", in_run("provenance.json"), of_run("provenance")),
+        Kind("run.json", in_run("run.json"), by("read_description")),
+        Kind("tables.json", in_run("tables.json"), by("read_tables")),
+        Kind("provenance.json", in_run("provenance.json"), read_provenance),
         Kind("mlflow.json", sent, read_upload_state),
         Kind("dataset.json", marker, read_marker),
         Kind("pseudo_labels.json", pseudo, read_pseudo),

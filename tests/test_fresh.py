@@ -15,7 +15,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.spec import source_code
 from rgbt.tracking import other_code
 from rgbt.tracking.provenance import code
-from rgbt.tracking.run_folder import RunFolder, runs_in
+from rgbt.tracking.run_files import read_description, read_provenance
+from rgbt.tracking.run_folder import runs_in
 from tests.commands import Call, Trained, only_run, short, train
 
 MADE_BY_OTHER_CODE = "This result was made by other code (commit 0000000 of"
@@ -31,7 +32,7 @@ def runs(trained: Trained, tmp_path: Path) -> Path:
 
 def pretend(folder: Path, **changes: Any) -> None:
     """The first process of the run ran other code."""
-    first, *others = RunFolder(folder).provenance()
+    first, *others = read_provenance(folder / "provenance.json")
     (folder / "provenance.json").write_text(json.dumps([{**first, **changes}, *others]))
 
 
@@ -55,7 +56,7 @@ def test_fresh_trains_again_what_other_code_made_and_keeps_it(
     assert [run.path for run in runs_in(runs)] == [folder]
     assert (Counts.load(folder / "counts_test.npz").counts == before.counts).all()
     assert "fresh: false" in (folder / "config.yaml").read_text()
-    known = RunFolder(folder).description()
+    known = read_description(folder)
     assert known is not None
     assert "fresh" not in known.params
     assert "fresh" not in known.tags["rgbt.group"]
@@ -72,7 +73,7 @@ def test_fresh_resumes_a_run_that_is_not_finished_and_says_who_began_it(
     assert code == 0, err
     assert "warning: the first 1 steps were trained by other code" in err
     assert not (runs / "replaced").exists()
-    assert RunFolder(folder).provenance()[-1]["from_step"] == 1
+    assert read_provenance(folder / "provenance.json")[-1]["from_step"] == 1
 
 
 def test_a_wrong_setting_with_fresh_moves_nothing(call: Call, data: Path, runs: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.tracking.run_files import read_result
 from sweeps.worker.executors import LocalExecutor, LocalJob
 from tests.commands import only_run
 from tests.conftest import write_data
@@ -129,7 +129,7 @@ def files(folder: Path) -> set[Path]:
 def check(bench: Bench, place: Path) -> None:
     """The run in `place` is as the undisturbed one, and nothing else is left."""
     folder, straight = only_run(place), bench.undisturbed
-    result, expected = (RunFolder(each).result() for each in (folder, straight))
+    result, expected = (read_result(each) for each in (folder, straight))
     assert result is not None
     assert expected is not None
     for one in (result, expected):

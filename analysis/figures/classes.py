@@ -36,7 +36,6 @@ class ClassRegions:
 
     Attributes:
         classes: K - 1 names, without the background.
-        partition: name of the regions.
         shares: (K - 1, R) occupancy in percent of the region where the class is most frequent;
             NaN for a class that occurs nowhere.
         part: of the images, "all", "day" or "night".

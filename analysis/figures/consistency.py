@@ -43,7 +43,6 @@ class ClassConsistency:
     """TC and CA of variants by class.
 
     Attributes:
-        protocol: how the frames were compared.
         classes: C names.
         variants: V names, e.g. "(G) Ours-dice".
         unscored: names of the classes that are left out of the means.

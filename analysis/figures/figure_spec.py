@@ -28,7 +28,6 @@ class FigureSpec:
         needs: what must be given, in words.
         keys: keys that take effect, beside ``figure`` and ``out``.
         groups: groups of the configuration that take effect.
-        make: draws it.
         metric: the partition unless ``metric=`` is given.
         idle: keys of the configuration below `groups` that take no effect nevertheless.
         numbers: what it shows as text, written beside it by the ending of the file; None: nothing.

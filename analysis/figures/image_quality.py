@@ -41,12 +41,9 @@ class RegionSeries:
 
     Attributes:
         measure: as the axis says it.
-        partition: name of the regions.
         values: series -> (R,).
         bands: series -> (2, R), ends of the 95 % interval over blocks of neighbouring images; NaN
             where there are too few.
-        images: part -> number of images.
-        is_log: whether the axis is logarithmic.
     """
 
     measure: str

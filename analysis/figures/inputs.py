@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from analysis.bar import progress
 from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.command import built
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from analysis.predictions.maps import PixelMaps
-    from analysis.results import Frames
+    from analysis.results import Frames, NamedCounts
+    from analysis.robustness import Training
     from analysis.statistics.data import SpatialStatistics
     from rgbt.dataset import LabelledDataset
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent, Regions
 
 T = TypeVar("T")
+Labelled = TypeVar("Labelled", "NamedCounts", "Training")
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,6 @@ class FigureInput:
     """The arguments of one figure.
 
     Attributes:
-        figure: its name.
         values: key -> value, only those that were given.
         overrides: of the configuration: ``dataset=...``, ``metric=...``.
         metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
@@ -90,17 +90,6 @@ class FigureInput:
         return any(word.startswith("dataset=") for word in self.overrides)
 
     @cached_property
-    def config(self) -> DictConfig:
-        """The configuration, with the partition of the figure unless another one was given."""
-        from rgbt.config.command import composing
-        from rgbt.config.compose import compose
-
-        chosen = any(word.startswith("metric=") for word in self.overrides)
-        words = [*([] if chosen else [f"metric={self.metric}"]), *self.overrides]
-        with composing(words):
-            return compose(words)
-
-    @cached_property
     def dataset(self) -> LabelledDataset:
         """The data set.
 
@@ -117,14 +106,13 @@ class FigureInput:
 
     @cached_property
     def regions(self) -> Regions:
-        """The partition."""
+        """The partition: of the figure unless another one was given."""
         made: Regions = self._built("metric")
         return made
 
     def _built(self, node: str) -> Any:
-        from rgbt.config.component import build
-
-        return build(self.config[node])
+        chosen = any(word.startswith("metric=") for word in self.overrides)
+        return built(node, [*([] if chosen else [f"metric={self.metric}"]), *self.overrides])
 
     def names(self, number: int) -> tuple[str, ...]:
         """The images of ``names=``, or the first `number` of the split.
@@ -234,13 +222,21 @@ class FigureInput:
         from analysis.results import open_counts
 
         what = "runs, groups or files of counts, with commas; label:run names one"
-        runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
-        found: dict[str, list[Counts]] = {}
-        for word in split_list(self.need("runs", what), what):
-            label, colon, place = word.partition(":")
-            for named in open_counts(place if colon else label, runs_dir, split, frames):
-                found.setdefault(label if colon else named.label, []).append(named.counts)
+        opened = self.opened_runs(what, partial(open_counts, frames=frames))
+        found = {label: [named.counts for named in each] for label, each in opened.items()}
         check_same_images(found)
+        return found
+
+    def opened_runs(
+        self, what: str, open_runs: Callable[[str, Path, str], Iterable[Labelled]]
+    ) -> dict[str, list[Labelled]]:
+        """Label -> what `open_runs` gives for (run, folder of runs, split), of ``runs=``."""
+        runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
+        found: dict[str, list[Labelled]] = {}
+        for word in split_list(self.need("runs", what), what):
+            label, colon, path = word.partition(":")
+            for each in open_runs(path if colon else label, runs_dir, split):
+                found.setdefault(label if colon else each.label, []).append(each)
         return found
 
     def counts(self, key: str, partition: str) -> dict[str, Counts]:
@@ -255,9 +251,6 @@ class FigureInput:
 def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
     """Refuse a figure that would show methods on different images, or with means over different
     classes, side by side.
-
-    Args:
-        methods: label -> counts of its seeds.
 
     Raises:
         InputError: naming the two.

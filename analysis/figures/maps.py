@@ -51,7 +51,6 @@ class HeatMap:
         edge: of the outermost region.
         whole: of the whole image.
         region_map: (H, W) region of every pixel.
-        partition: its name.
     """
 
     what: str
@@ -72,7 +71,6 @@ class RegionPicture:
     Attributes:
         picture: (H, W) in 0..1 for a heat map, or (H, W, 3) uint8.
         region_map: (H, W) region of every pixel.
-        partition: its name.
         what: the heat map shows, "" for an image.
     """
 

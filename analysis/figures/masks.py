@@ -33,7 +33,6 @@ class MaskExample:
     """One mask on a pair of images.
 
     Attributes:
-        title: above its column.
         rgb: (H, W, 3) uint8, hidden pixels in the colour `HIDDEN`.
         thermal: the same, grey elsewhere.
         rgb_hidden: (H, W) bool.

@@ -6,11 +6,10 @@ Everything heavy is imported when a figure is made, so that the list of figures 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.bar import progress
-from analysis.figures.figure_spec import OF_RUNS, RUNS, figure
+from analysis.figures.figure_spec import OF_RUNS, RUNS, FigureSpec, figure
 from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError, split_list
 
@@ -24,7 +23,6 @@ LEAST, MOST_PIXELS = 16, 4096
 """Pixels of a side of ``size=``."""
 
 FAILING = "runs= (run, group or folder of python -m rgbt.robustness, with labels: label:run)"
-OF_CORRUPTED = (*OF_RUNS, "corruptions")
 
 LONGEST = 8
 """Times that one side of ``size=`` may be the other."""
@@ -37,45 +35,37 @@ def robustness_numbers(given: FigureInput) -> dict[str, str]:
     return numbers(_failing(given))
 
 
-@figure(
+def _robustness(name: str, shows: str, *, relative: bool) -> FigureSpec:
+    def make(given: FigureInput) -> Figure:
+        from analysis.figures.robustness import draw
+
+        return draw(_failing(given), relative=relative)
+
+    return FigureSpec(
+        name=name,
+        shows=shows,
+        needs=FAILING,
+        keys=(*OF_RUNS, "corruptions"),
+        make=make,
+        numbers=robustness_numbers,
+    )
+
+
+robustness = _robustness(
     "robustness",
     "mIoU under corruptions, one panel per corruption, one line per method",
-    FAILING,
-    keys=OF_CORRUPTED,
-    numbers=robustness_numbers,
+    relative=False,
 )
-def robustness(given: FigureInput) -> Figure:
-    """MIoU as images fail."""
-    from analysis.figures.robustness import draw
-
-    return draw(_failing(given), relative=False)
-
-
-@figure(
-    "robustness/relative",
-    "the same in percent of the mIoU on clean images",
-    FAILING,
-    keys=OF_CORRUPTED,
-    numbers=robustness_numbers,
+robustness_relative = _robustness(
+    "robustness/relative", "the same in percent of the mIoU on clean images", relative=True
 )
-def robustness_relative(given: FigureInput) -> Figure:
-    """The same in percent of the clean mIoU."""
-    from analysis.figures.robustness import draw
-
-    return draw(_failing(given), relative=True)
 
 
 def _failing(given: FigureInput) -> tuple[Panel, ...]:
     from analysis.figures.robustness import panels
-    from analysis.robustness import Training, trainings
+    from analysis.robustness import trainings
 
-    runs_dir, split = given.get("runs_dir", "runs"), given.get("split", "")
-    found: dict[str, list[Training]] = {}
-    what = "runs or groups; label:run names one"
-    for word in split_list(given.need("runs", what), what):
-        label, colon, place = word.partition(":")
-        for each in trainings(place if colon else label, Path(runs_dir).expanduser(), split):
-            found.setdefault(label if colon else each.label, []).append(each)
+    found = given.opened_runs("runs or groups; label:run names one", trainings)
     named = given.get("corruptions", "")
     rows = split_list(named, "corruptions") if named else []
     levels = (level for each in found.values() for training in each for level in training.levels)

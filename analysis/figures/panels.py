@@ -79,8 +79,6 @@ class QualitativePanel:
     """A qualitative figure.
 
     Attributes:
-        methods: labels of the last columns.
-        rows: images.
         classes: K names.
         palette: (K, 3) uint8.
         box: rows and columns of the innermost region.
@@ -194,12 +192,7 @@ def most_different(
 
 @styled
 def draw(data: QualitativePanel, layout: str = "rows") -> Figure:
-    """Pictures with a white box on the centre; below them the classes.
-
-    Args:
-        data: the panel.
-        layout: one of `LAYOUTS`.
-    """
+    """Pictures with a white box on the centre; below them the classes."""
     plain = ("RGB", "thermal", "ground truth", *data.methods)
     height, width = data.rows[0].thermal.shape
     shape = (len(data.rows), len(plain))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
@@ -36,15 +37,11 @@ class Profile:
     """MIoU by region of one method, percent.
 
     Attributes:
-        label: the method.
-        partition: name of the regions.
         means: (R,) mean over seeds.
         miou: of the whole image.
         low: (R,) lower ends of the intervals, or None where there are none.
         high: (R,) upper ends.
         covers: what the interval is over: "images", "seeds", "images and seeds", or "".
-        seeds: number of seeds.
-        images: number of images.
         level: of the intervals; NaN without.
     """
 
@@ -52,12 +49,12 @@ class Profile:
     partition: str
     means: NDArray[np.float64]
     miou: float
-    low: NDArray[np.float64] | None
-    high: NDArray[np.float64] | None
-    covers: str
     seeds: int
     images: int
-    level: float
+    low: NDArray[np.float64] | None = None
+    high: NDArray[np.float64] | None = None
+    covers: str = ""
+    level: float = math.nan
 
 
 Band = Literal["widest", "images", "seeds", "both"]
@@ -130,12 +127,8 @@ def means_only(label: str, seeds: Sequence[Counts], absent: Absent) -> Profile:
         partition=seeds[0].partition,
         means=100 * np.mean([miou(each, absent, scored) for each in by_region], axis=0),
         miou=float(100 * np.mean([miou(each.sum(0), absent, scored) for each in by_region])),
-        low=None,
-        high=None,
-        covers="",
         seeds=len(seeds),
         images=len(seeds[0].names),
-        level=float("nan"),
     )
 
 

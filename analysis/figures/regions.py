@@ -41,10 +41,7 @@ class MethodHeatMaps:
     """Methods whose regions are painted in one scale.
 
     Attributes:
-        profiles: of the methods.
         region_map: (H, W) region of every pixel.
-        low: end of the colour scale, percent.
-        high: other end.
     """
 
     profiles: tuple[Profile, ...]

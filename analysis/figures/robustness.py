@@ -51,7 +51,6 @@ class Curve:
     """One method in one panel.
 
     Attributes:
-        method: its label.
         mious: (T, S) percent, trainings x severities, the clean images first; NaN: not measured.
     """
 
@@ -76,11 +75,9 @@ class Panel:
 
     Attributes:
         row: its name; "" of those together.
-        title: above it.
         unit: of the severities; "" where `ticks` are words.
         severities: (S,) 0 first; places of the ticks where these are words.
         ticks: words along x, or () for numbers.
-        curves: of all methods, in their order.
     """
 
     row: str

@@ -38,12 +38,9 @@ class PixelMaps:
     Attributes:
         intersection: (K, H, W) int32, images in which label and prediction are the class there.
         union: (K, H, W) int32, images in which one of them is; unlabelled pixels do not count.
-        images: number of images.
         classes: K names.
         palette: K (red, green, blue) colours.
         dataset: fingerprint of the data set.
-        split: split that the images come from.
-        name: of the method.
         unscored: names of the classes that are left out of means over classes.
 
     Raises:

@@ -72,7 +72,6 @@ class FolderScores:
     """What a folder of predictions gave.
 
     Attributes:
-        name: of the method.
         counts: one per partition, in the order of `ScoringOptions.partitions`.
         maps: counts by pixel; None where the images differ in size.
         found: which files were read, which are missing, which belong to no image.

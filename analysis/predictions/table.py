@@ -74,9 +74,7 @@ class ScoreTable:
     """The scores of one method on one partition.
 
     Attributes:
-        name: of the method.
         partition: e.g. "ring5".
-        split: of the data set.
         regions: R.
         classes: K names.
         num_images: number of images by "all" and, where both are there, "day" and "night".
@@ -124,10 +122,6 @@ class ScoreTable:
 
 def score_table(counts: Counts, name: str) -> ScoreTable:
     """All scores of one method on one partition, without intervals.
-
-    Args:
-        counts: of one split, at least one image.
-        name: of the method.
 
     Returns:
         mIoU and mAcc of the scored classes, IoU and accuracy of each class, for each region and the

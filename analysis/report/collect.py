@@ -29,7 +29,6 @@ class ReportRequest:
     """What the page is made from.
 
     Attributes:
-        tracking: as the configuration builds it.
         runs_dir: folder of runs; their files are read there where it has them.
         resamples: of the images, for intervals and p-values.
         command: that makes the page again, without passwords.
@@ -45,10 +44,6 @@ class ReportRequest:
 
 def collect(request: ReportRequest, track: Track) -> ReportData:
     """Read the store; what cannot be read becomes a remark.
-
-    Args:
-        request: which store, and how.
-        track: shows how far it is.
 
     Raises:
         InputError: there is no store, or no such experiment.

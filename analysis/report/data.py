@@ -21,31 +21,23 @@ class RunEntry:
     """One run: what a click on any of its numbers shows.
 
     Attributes:
-        key: config key.
-        name: as MLflow shows it.
-        run_id: of MLflow.
         status: "FINISHED", "RUNNING", "FAILED" or "KILLED".
         experiment: name of the experiment, or "".
         scale: "demo" or "paper".
-        seed: of the run.
         group: what seeds of one method share, or "".
         studies: names of the studies that the run is part of.
         table_rows: table -> row that the run stands for.
         split: that the scores are of.
         partition: e.g. "ring5".
         classes: K names.
-        unscored: those that are left out of means.
         notes: footnotes of the table by class, about absent classes.
         scores: metric name -> percent (`rgbt.metrics.names`).
         region_ious: R percents, region 1 first.
         class_region_ious: K rows of R percents.
-        images: number of images scored.
         commit: git commit, "+" after it for uncommitted changes, or "".
         started: ISO 8601, UTC.
-        seconds: from start to end, or None.
         command: as typed.
         repeat: command that makes the run again.
-        host: name and devices of the machine.
         dataset: fingerprint of the data set.
         config: dotted key -> value as text.
     """
@@ -60,15 +52,15 @@ class RunEntry:
     group: str
     studies: tuple[str, ...]
     table_rows: Mapping[str, str]
-    split: str
-    partition: str
-    classes: tuple[str, ...]
+    split: str = "test"
+    partition: str = ""
+    classes: tuple[str, ...] = ()
     unscored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     scores: Mapping[str, float]
-    region_ious: tuple[float, ...]
-    class_region_ious: tuple[tuple[float, ...], ...]
-    images: int
+    region_ious: tuple[float, ...] = ()
+    class_region_ious: tuple[tuple[float, ...], ...] = ()
+    images: int = 0
     commit: str
     started: str
     seconds: float | None
@@ -86,14 +78,12 @@ class CellEntry:
     Attributes:
         mean: over seeds; None where there is no value of ours.
         sd: over seeds (n - 1).
-        seeds: number of seeds.
         low: lower end of the 95 % interval of the mean.
         high: its upper end.
         covers: what the interval is over.
         published: printed value.
         difference: mean less published.
         reason: why there is no value, or seeds are missing.
-        runs: keys of the runs.
         rank: 1 best, 2 second best of the column among ours, else 0.
         published_rank: the same among the printed values.
         values: of each run, in the order of `runs`; empty: not known. Shown beside the run.
@@ -120,20 +110,14 @@ class TableEntry:
 
     Attributes:
         name: e.g. "spatialseg/table3".
-        paper: its folder.
         number: as printed.
-        caption: in own words.
         scale: "demo" or "paper"; "" where nothing was run yet.
         data: what the printed values were measured on.
         unit: e.g. "percent".
-        columns: names.
         best: by column, "highest", "lowest" or "none".
-        rows: labels.
         proposed: by row, whether it is the method that the paper proposes.
         cells: by row, then by column.
         orders: column -> (Spearman's rho or None, number of rows).
-        notes: sentences below the table.
-        command: that completes it.
         extra: overrides that every row of ours was run with, as typed, or "".
     """
 
@@ -165,7 +149,6 @@ class TrialEntry:
         params: name -> value as text.
         values: of the objectives; () where it is not complete.
         on_front: whether no other trial beats it.
-        runs: their keys.
     """
 
     number: int
@@ -181,11 +164,8 @@ class StudyEntry:
     """One search, grid or list.
 
     Attributes:
-        name: of the study.
         kind: "search", "grid" or "list".
-        objectives: names of the metrics.
         maximize: whether more is better, by objective.
-        trials: by number.
         note: its report in Markdown.
         command: that began it, or "".
     """
@@ -236,15 +216,10 @@ class ReportData:
     """Everything on the page.
 
     Attributes:
-        title: of the page.
         made: ISO 8601, UTC.
         store: address of the store, passwords hidden.
-        command: that makes the page again.
         runs: newest first.
         tables: those with runs first, then those that wait.
-        studies: by name.
-        masks: mask examples.
-        differences: paper against release.
         remarks: what could not be read, one sentence each.
         silent: configuration keys (with all below them) in which runs that are the same run may
             differ: paths, labels, hardware.

@@ -25,14 +25,13 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
+from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG
 
-SPLIT = "test"
 STUDY_TAG = "rgbt.study/"
 ABSENT = get_args(Absent)
 
@@ -45,11 +44,9 @@ class ReportRun:
     """A training of the store with its scores and settings, as the report uses it.
 
     Attributes:
-        entry: what the page shows.
         test_counts: that the run ended with; None where there are none.
         absent: how the run scores a class without pixels.
         config: dotted key -> value; empty where the store has no configuration.
-        files: its files.
     """
 
     entry: RunEntry
@@ -116,15 +113,8 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         group=group,
         studies=tuple(_after(run.tags, STUDY_TAG)),
         table_rows=_after(run.tags, TAG),
-        split=SPLIT if counts is None else counts.split,
-        partition="" if counts is None else counts.partition,
-        classes=() if counts is None else counts.classes,
-        unscored=() if counts is None else counts.unscored,
-        notes=() if counts is None else _notes(counts, absent),
         scores=scores,
-        region_ious=() if counts is None else _by_region(counts, absent),
-        class_region_ious=() if counts is None else _by_class(counts, absent),
-        images=0 if counts is None else len(counts.names),
+        **({} if counts is None else _of_counts(counts, absent)),
         commit=commit_of(first) or run.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
         started=run.started,
         seconds=run.seconds,
@@ -220,19 +210,19 @@ def _after(tags: Mapping[str, str], beginning: str) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def _by_region(counts: Counts, absent: Absent) -> tuple[float, ...]:
-    """R percents."""
-    return _percents(miou(counts.by_region(), absent, counts.scored))
-
-
-def _by_class(counts: Counts, absent: Absent) -> tuple[tuple[float, ...], ...]:
-    """K rows of R percents."""
-    return tuple(_percents(row) for row in iou(counts.by_region(), absent).T)
-
-
-def _notes(counts: Counts, absent: Absent) -> tuple[str, ...]:
-    matrices, classes = counts.by_region(), counts.classes
-    return absent_notes(matrices, classes, counts.scored, counts.split, absent)
+def _of_counts(counts: Counts, absent: Absent) -> dict[str, Any]:
+    """The fields of a `RunEntry` that come from its counts, beside the scores."""
+    matrices, classes, scored = counts.by_region(), counts.classes, counts.scored
+    return {
+        "split": counts.split,
+        "partition": counts.partition,
+        "classes": classes,
+        "unscored": counts.unscored,
+        "notes": absent_notes(matrices, classes, scored, counts.split, absent),
+        "region_ious": _percents(miou(matrices, absent, scored)),
+        "class_region_ious": tuple(_percents(row) for row in iou(matrices, absent).T),
+        "images": len(counts.names),
+    }
 
 
 def _percents(fractions: Any) -> tuple[float, ...]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -13,7 +11,7 @@ from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
 from rgbt.files.budgets import TEXT, read_bytes
-from rgbt.tracking.mlflow_client import ENVIRONMENT
+from rgbt.tracking.mlflow_client import quiet_client
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.run_files import read_result
@@ -82,15 +80,10 @@ class MlflowRun:
     """One run of MLflow: a training, or the record of a table or study.
 
     Attributes:
-        run_id: of MLflow.
-        name: as shown.
         status: "FINISHED", "RUNNING", "FAILED", "KILLED" or "SCHEDULED".
         started: ISO 8601, UTC; "" where unknown.
-        seconds: from start to end, or None.
-        tags: by name.
         params: by name, as text.
         metrics: last value by name, as MLflow has it.
-        files: its files.
     """
 
     run_id: str
@@ -128,15 +121,9 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
         )
     uri = tracking.uri
     _check_exists(uri)
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
-    from mlflow import MlflowClient
-
-    for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.WARNING)
     shown = without_passwords(uri)
     try:
-        client = MlflowClient(tracking_uri=uri)
+        client = quiet_client(uri)
         experiment = client.get_experiment_by_name(tracking.experiment)
         if experiment is None:
             known = [each.name for each in client.search_experiments()]
@@ -191,9 +178,6 @@ class _FileFinder:
     """Where files of runs may lie.
 
     Attributes:
-        client: of MLflow.
-        runs_dir: the folder of runs.
-        copies: folder for fetched files.
         beside: folder of artifacts beside a database, or None.
     """
 

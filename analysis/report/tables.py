@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from analysis.report.data import CellEntry, TableEntry
@@ -23,7 +24,7 @@ from rgbt.checks import InputError
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
 from sweeps.table.scoring import score
-from sweeps.table.table import Table
+from sweeps.table.table import Column, Row, Table
 
 
 def table_entries(
@@ -101,25 +102,20 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
         remarks.append(
             f"Table '{recorded.name}': its file has no row '{gone[0]}' any more, which was run."
         )
-    cells = tuple(
-        tuple(cell_of(draft, row, column, intervals) for column in table.columns)
-        for row in table.rows
-    )
     remarks += changed(draft)
     return _laid_out(
         recorded.name,
         table,
+        lambda row, column: cell_of(draft, row, column, intervals),
         scale=recorded.scale,
-        cells=cells,
-        orders={name: _rho(each.rho, each.rows) for name, each in scored.orders.items()},
+        orders={
+            name: (None if math.isnan(each.rho) else each.rho, each.rows)
+            for name, each in scored.orders.items()
+        },
         notes=(*_notes(table), *recorded.remarks),
         command=_command(recorded),
         extra=recorded.extra,
     )
-
-
-def _rho(rho: float, rows: int) -> tuple[float | None, int]:
-    return (None if math.isnan(rho) else rho, rows)
 
 
 def _notes(table: Table) -> tuple[str, ...]:
@@ -144,18 +140,17 @@ def _waiting(name: str, table: Table) -> TableEntry:
     return _laid_out(
         name,
         table,
+        partial(printed_cell, scored),
         scale="",
-        cells=tuple(
-            tuple(printed_cell(scored, row, column) for column in table.columns)
-            for row in table.rows
-        ),
         orders={},
         notes=_notes(table),
         command=reproduce_command(name, DEFAULT_SEEDS, DEFAULT_SCALE),
     )
 
 
-def _laid_out(name: str, table: Table, **others: Any) -> TableEntry:
+def _laid_out(
+    name: str, table: Table, cell: Callable[[Row, Column], CellEntry], **others: Any
+) -> TableEntry:
     return TableEntry(
         name=name,
         paper=table.paper,
@@ -167,6 +162,7 @@ def _laid_out(name: str, table: Table, **others: Any) -> TableEntry:
         best=tuple(column.best for column in table.columns),
         rows=tuple(row.label for row in table.rows),
         proposed=tuple(row.proposed for row in table.rows),
+        cells=tuple(tuple(cell(row, each) for each in table.columns) for row in table.rows),
         **others,
     )
 

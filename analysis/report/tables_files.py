@@ -46,7 +46,6 @@ class RecordedTable:
     Attributes:
         name: e.g. "spatialseg/table3".
         scale: "demo" or "paper".
-        seeds: that were requested.
         lines: (row, column) -> cell, in the order of the file.
         remarks: sentences that stood below it.
         extra: overrides that were added to every row, as typed.

@@ -47,7 +47,6 @@ class Intervals:
     """What is requested, then what was found.
 
     Attributes:
-        runs: by key.
         requested: source -> metrics.
         found: the intervals by source and metric, after `compute`.
     """
@@ -61,12 +60,7 @@ class Intervals:
         self.requested.setdefault(source, {})[metric] = None
 
     def compute(self, resamples: int, track: Track) -> None:
-        """Find every interval that was requested.
-
-        Args:
-            resamples: of the images.
-            track: shows how far it is.
-        """
+        """Find every interval that was requested."""
         for source in track(list(self.requested), "intervals"):
             metrics = tuple(self.requested[source])
             settings = Resampling(resamples=resamples, absent=source.absent)

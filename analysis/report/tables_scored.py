@@ -47,13 +47,7 @@ class RescoredTable:
 def score_again(
     recorded: RecordedTable, table: Table, runs: Mapping[str, ReportRun]
 ) -> ScoredTable:
-    """Means, ranks and orders from the counts of the runs that the record names.
-
-    Args:
-        recorded: the record.
-        table: its file as it is now.
-        runs: by key.
-    """
+    """Means, ranks and orders from the counts of the runs that the record names."""
     labels = {row.label for row in table.rows}
     places: dict[tuple[str, int], _Outcome] = {}
     for label in recorded.rows():

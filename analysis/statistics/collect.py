@@ -33,7 +33,6 @@ class MeasurementSettings:
     """How a split is measured.
 
     Attributes:
-        regions: the partition.
         kernel: of the Laplacian, one of `KERNELS`.
         workers: threads; 0: one per core. Threads and not processes, since decoding, filtering and
             sums run outside Python's lock. The result does not depend on their number.

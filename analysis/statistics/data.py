@@ -47,9 +47,7 @@ class SpatialStatistics:
     """Measurements of every image of a split, by region.
 
     Attributes:
-        dataset: name of the data set.
         fingerprint: its fingerprint.
-        split: split that the images come from.
         classes: names of the K classes; class 0 is the background.
         palette: (K, 3) uint8, red, green, blue.
         partition: name of the regions, e.g. "ring9" (`rgbt.metrics.metric.Regions.name`).

@@ -67,7 +67,6 @@ class Claim:
         verdict: "holds" if every finding holds, "does not hold" if one does not, else open (for
             "most classes" the majority counts). Levels are those of single findings: of m findings
             that all hold barely, one is refused in up to ``m (1 - level) / 2`` of all samples.
-        findings: the numbers.
         estimator: of the noise; "" where the claim does not depend on it.
         average: of the signal-to-noise ratios; "" likewise.
     """

@@ -6,7 +6,8 @@ A grid has a column per region, or, with many regions, a row per region.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +48,9 @@ def occupancy_grids(stats: SpatialStatistics) -> tuple[TextTable, ...]:
 
 def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple[TextTable, ...]:
     """Laplacian variance, noise and signal to noise of both modalities by part."""
-    wanted = [(modality, part) for modality in MODALITIES for part in stats.subsets()]
-    laplacian = [(f"{m}, {part}", derive.region_laplacian(stats, m, part)) for m, part in wanted]
+    title = f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)"
     return (
-        region_grid(f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)", laplacian),
+        _modality_grid(title, stats, partial(derive.region_laplacian, stats)),
         noise_grid(stats, estimator),
         snr_grid(stats, estimator, average),
     )
@@ -58,22 +58,22 @@ def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple
 
 def noise_grid(stats: SpatialStatistics, estimator: str) -> TextTable:
     """Noise of both modalities by part; below one grey level rounding is a good part of it."""
-    rows = [
-        (f"{modality}, {part}", derive.region_noise(stats, modality, part, estimator))
-        for modality in MODALITIES
-        for part in stats.subsets()
-    ]
-    return region_grid(f"noise, grey levels ({estimator}; rounding alone is 0.29)", rows)
+    title = f"noise, grey levels ({estimator}; rounding alone is 0.29)"
+    return _modality_grid(title, stats, partial(derive.region_noise, stats, estimator=estimator))
 
 
 def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> TextTable:
     """Signal to noise of both modalities by part."""
-    rows = [
-        (f"{modality}, {part}", derive.region_snr(stats, modality, part, estimator, average))
-        for modality in MODALITIES
-        for part in stats.subsets()
-    ]
-    return region_grid(f"signal to noise (Eq. 4; {estimator}, {average})", rows)
+    of_region = partial(derive.region_snr, stats, estimator=estimator, average=average)
+    return _modality_grid(f"signal to noise (Eq. 4; {estimator}, {average})", stats, of_region)
+
+
+def _modality_grid(
+    title: str, stats: SpatialStatistics, measure: Callable[[str, str], NDArray[np.float64]]
+) -> TextTable:
+    """A row per modality and part, of what `measure` gives for them."""
+    wanted = [(modality, part) for modality in MODALITIES for part in stats.subsets()]
+    return region_grid(title, [(f"{m}, {part}", measure(m, part)) for m, part in wanted])
 
 
 def entropy_grid(stats: SpatialStatistics) -> TextTable:

@@ -34,7 +34,6 @@ class ImageBlocks:
 
     Attributes:
         index: (N,) int64, block 0..count-1 of every image.
-        count: number of blocks.
         said: what they are, e.g. "40 blocks of up to 10 neighbouring frames".
         reason: of "auto", the sentence that says why these; "" for blocks that were set by hand.
     """

@@ -32,7 +32,6 @@ class Difference:
     """Method b less method a in one score; percent points (variance: squared percent points).
 
     Attributes:
-        metric: name of the score.
         a: the score of the first method.
         b: of the second.
         value: b - a, means over seeds.
@@ -71,11 +70,9 @@ class Comparison:
 
     Attributes:
         differences: in the order of the requested metrics.
-        images: number of images.
         said: how they were drawn, e.g. "393 single images".
         reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
         partition: of the regions, e.g. "ring5".
-        level: of the intervals.
     """
 
     differences: tuple[Difference, ...]

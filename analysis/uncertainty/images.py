@@ -54,8 +54,6 @@ class CommonImages:
         shape: (R, K, K).
         like: counts of the same classes, scored ones and partition.
         images: N.
-        blocks: how the images are drawn.
-        settings: of the resampling.
         absent: how a class without pixels scores.
     """
 

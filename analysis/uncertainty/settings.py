@@ -31,7 +31,6 @@ class Resampling:
             that are equal but for one number); "auto": runs of consecutively numbered frames, cut
             where one is too long for that at the distance over which the scores of the images are
             correlated (Politis and White, 2004).
-        seed: of the draws.
         absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
             say (`rgbt.metrics.counts.Counts.absent`).
 

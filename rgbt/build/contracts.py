@@ -109,7 +109,7 @@ def _check_label(returned: str, label: np.ndarray, num_classes: int) -> None:
 
 
 def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) -> None:
-    """Refuse a transform whose examples are not those of `rgbt.data.batches.TransformedSample`.
+    """Refuse a transform whose examples are not those of `rgbt.types.Example`.
 
     Raises:
         InputError: naming the method and what it returned.
@@ -124,7 +124,7 @@ def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) ->
         if missing:
             raise InputError(
                 f"transform: {kind}.{method} returned {described(found)} without `{missing[0]}`; "
-                "expected rgbt.transforms.example.Example."
+                "expected rgbt.types.Example."
             )
         hw = np.shape(found.rgb)[:2]
         shapes = {"rgb": (*hw, 3), "thermal": hw}

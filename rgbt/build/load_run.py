@@ -18,8 +18,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.spec.load_spec import load_spec
 from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import specify
-from rgbt.tracking.run_files import read_marker
-from rgbt.tracking.run_folder import RunFolder, find_run
+from rgbt.tracking.run_files import read_marker, read_provenance
+from rgbt.tracking.run_folder import find_run
 from rgbt.tracking.terminal import warn
 
 CHECKPOINTS = ("best", "last")
@@ -138,7 +138,7 @@ def open_run(
 def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     """Warn where the user's own code is not the code that the run was trained with."""
     now = dict(user_code(target_names(trained_with)))
-    entries = RunFolder(folder).provenance() if now else []
+    entries = read_provenance(folder / "provenance.json") if now else []
     before = entries[-1].get("own_code") if entries else None
     if before is not None and before != now:
         modules = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))

@@ -19,11 +19,11 @@ from rgbt.build.requirements import check_requirements
 from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import available
-from rgbt.data.batches import Dataset
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
 from rgbt.randomness import derive
@@ -48,7 +48,7 @@ class TrainingSetup:
     """
 
     session: Session
-    datasets: dict[str, Dataset]
+    datasets: dict[str, LabelledDataset]
     model: nn.Module
     others: dict[str, nn.Module]
     optimizers: dict[str, torch.optim.Optimizer]
@@ -191,7 +191,7 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
     return requested
 
 
-def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
+def _labelled(session: Session, name: str, domain: Domain) -> LabelledDataset:
     """The data set with the labels that a domain is trained with."""
     folder = session.spec.labels_folder(name)
     if folder is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -39,3 +40,13 @@ RegionsFile = Annotated[str, Help("a file of conf/metric: ring5, ring9, vertical
 Trust = Annotated[
     str, Help("modules of yours that the run was made with: trust=my_lab; their code is run")
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """Which trained network; what the options of every command that evaluates one begin with."""
+
+    run: Trained = ""
+    runs_dir: RunsDir = Path("runs")
+    checkpoint: Checkpoint = "best"
+    trust: Trust = ""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.command import built
@@ -12,11 +16,18 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rgbt.corruptions.corruption import Corruption
     from rgbt.dataset import LabelledDataset
+    from rgbt.types import Sample
 
 SUFFIXES = (".png", ".jpg")
 POSITION = 11
 """Of the sample in its split: late enough for a delay of ten frames."""
+
+CELL = 2.4
+"""Width in inches of a pair: RGB left, thermal right."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +59,10 @@ def main(options: Options, overrides: list[str]) -> int:
         split_overrides,
         standard_corruptions,
     )
-    from rgbt.evaluation.corruption_sheet import draw, sheet
 
-    path = _path(options.out)
+    path = Path(options.out).expanduser()
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"out must name the picture to write, .png or .jpg, got '{options.out}'.")
     words, overrides = split_overrides(overrides)
     known = standard_corruptions()
     usual = [name for name in known if name.partition(":")[0] not in known or ":" not in name]
@@ -69,11 +81,45 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def _path(out: str) -> Path:
-    path = Path(out).expanduser()
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"out must name the picture to write, .png or .jpg, got '{out}'.")
-    return path
+def sheet(
+    source: LabelledDataset, kinds: Sequence[Corruption], name: str, split: str, seed: int = 0
+) -> list[list[tuple[str, Sample]]]:
+    """The sample `name` with captions for every corruption: clean, then under every severity."""
+    from rgbt.evaluation.corrupted_dataset import CorruptedDataset
+
+    lines = []
+    for kind in kinds:
+        pairs = [(kind.title, source.read(name))]
+        for severity in kind.severities:
+            caption = f"{severity:g} {kind.unit}" if kind.unit else ""
+            seen = CorruptedDataset(source, kind, severity, split=split, seed=seed)
+            pairs.append((caption, seen.read(name)))
+        lines.append(pairs)
+    return lines
+
+
+def side_by_side(sample: Sample) -> NDArray[np.uint8]:
+    """(H, 2 W, 3): RGB left, thermal right."""
+    return np.hstack([sample.rgb, np.repeat(sample.thermal[..., None], 3, axis=2)])
+
+
+def draw(lines: Sequence[list[tuple[str, Sample]]]) -> Figure:
+    """The picture, drawn without a display."""
+    from matplotlib.figure import Figure
+
+    columns = max(map(len, lines))
+    height, width = lines[0][0][1].thermal.shape
+    cell_height = CELL * height / (2 * width) + 0.2
+    figure = Figure(figsize=(CELL * columns, cell_height * len(lines)))
+    figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.03, wspace=0.01, hspace=0.01)
+    grid = figure.subplots(len(lines), columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for row, line in zip(grid, lines, strict=True):
+        for axes, (caption, sample) in zip(row, line, strict=False):
+            axes.imshow(side_by_side(sample))
+            axes.set_title(caption, fontsize=7, loc="left", pad=2)
+    return figure
 
 
 entry = PlainCommand(Options, main)

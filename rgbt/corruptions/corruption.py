@@ -86,11 +86,7 @@ Corruption = OfPixels | OfTime
 
 
 def check_ladder(kind: Kind) -> None:
-    """Refuse an empty ladder, one that does not rise, and severities that are out of range.
-
-    Raises:
-        InputError: naming what is wrong.
-    """
+    """InputError for an empty ladder, one that does not rise, and severities out of range."""
     ladder = kind.severities
     if not ladder or any(low >= high for low, high in zip((0.0, *ladder), ladder, strict=False)):
         raise InputError(
@@ -99,12 +95,6 @@ def check_ladder(kind: Kind) -> None:
         )
     for severity in ladder:
         kind.check(severity)
-
-
-def check_whole(severity: float) -> None:
-    """Refuse what is no whole number of frames of at least 1."""
-    if not (math.isfinite(severity) and severity >= 1 and severity == math.floor(severity)):
-        raise InputError(f"severity counts frames: expected 1, 2, 3, ..., got {severity:g}.")
 
 
 def at_height(pixels: float, height: int) -> float:

@@ -1,4 +1,4 @@
-"""Members of data sets and transforms that the loader uses, and stacking of examples to a batch."""
+"""Members of transforms that the loader uses, and stacking of examples to a batch."""
 
 from __future__ import annotations
 
@@ -10,75 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.types import Batch, Loadable, Sample
-
-
-class Dataset(Protocol):
-    """The members of a data set that the loader uses (see `rgbt.data.mfnet.MFNet`)."""
-
-    name: str
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in order."""
-        ...
-
-    def read(self, name: str) -> Sample:
-        """One sample; InputError if it cannot be read."""
-        ...
-
-
-class TransformedSample(Protocol):
-    """A sample after the transform (see `rgbt.transforms.example.Example`)."""
-
-    @property
-    def rgb(self) -> NDArray[Any]:
-        """(H, W, 3), uint8 or float32, 0..255."""
-        ...
-
-    @property
-    def thermal(self) -> NDArray[Any]:
-        """(H, W), dtype and range of `rgb`."""
-        ...
-
-    @property
-    def label(self) -> NDArray[np.uint8]:
-        """(H', W') class indices."""
-        ...
-
-    @property
-    def centre_yx(self) -> tuple[int, int]:
-        """Pixel nearest to the centre of the original image."""
-        ...
-
-    @property
-    def position(self) -> NDArray[np.float32] | None:
-        """(2, H, W) row and column in the original image, or None."""
-        ...
-
-    @property
-    def original_hw(self) -> tuple[int, int]:
-        """Size of the original image."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """Name in the split list."""
-        ...
-
-    @property
-    def confidence(self) -> NDArray[np.float32] | None:
-        """(H', W') confidence of the labels, or None."""
-        ...
+from rgbt.types import Batch, Example, Loadable, Sample
 
 
 class Transform(Protocol):
     """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
 
-    def train(self, sample: Sample, rng: np.random.Generator) -> TransformedSample:
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example; every draw comes from `rng`."""
         ...
 
-    def test(self, sample: Sample) -> TransformedSample:
+    def test(self, sample: Sample) -> Example:
         """Example for evaluation, the same every time."""
         ...
 
@@ -98,12 +40,10 @@ class BatchTransform(Protocol):
         ...
 
 
-def collate(examples: Sequence[TransformedSample], advice: str = "") -> Batch:
+def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
 
-    Args:
-        examples: at least one, images all (H, W, 3) and labels all (H', W').
-        advice: end of the message if sizes differ; names the key to change.
+    `advice` ends the message if sizes differ; it names the key to change.
 
     Raises:
         InputError: images or labels differ in size, naming the first two that do; labels of some
@@ -127,7 +67,7 @@ def collate(examples: Sequence[TransformedSample], advice: str = "") -> Batch:
     )
 
 
-def _confidences(examples: Sequence[TransformedSample]) -> list[NDArray[np.float32]]:
+def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
     """Those of all examples, or none."""
     found = [each.confidence for each in examples if each.confidence is not None]
     if 0 < len(found) < len(examples):
@@ -143,7 +83,7 @@ def _confidences(examples: Sequence[TransformedSample]) -> list[NDArray[np.float
     return found
 
 
-def _check_sizes(examples: Sequence[TransformedSample], advice: str) -> None:
+def _check_sizes(examples: Sequence[Example], advice: str) -> None:
     first = examples[0]
     for example in examples[1:]:
         for what in ("rgb", "label"):

@@ -18,7 +18,6 @@ from PIL import Image
 
 from rgbt.checks import InputError, one_line
 from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
-from rgbt.data.integrity import within as within
 from rgbt.files.budgets import check_array
 from rgbt.types import IGNORE
 
@@ -30,9 +29,6 @@ def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
     """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal.
 
     `advice` ends the message about a file of other channels.
-
-    Raises:
-        InputError: missing, not decodable, not 8 bit, or not four channels.
     """
     image = _decode(path)
     if channels(image) != 4:
@@ -44,11 +40,7 @@ def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:
-    """RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message about others.
-
-    Raises:
-        InputError: missing, not decodable, not 8 bit, or other channels.
-    """
+    """RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message about others."""
     rgb = _decode(path)
     if channels(rgb) != 3:
         raise InputError(
@@ -58,20 +50,12 @@ def read_rgb(path: Path, advice: str = "use the original file") -> Array:
 
 
 def read_thermal(path: Path) -> Array:
-    """Grey levels of a thermal image, (H, W) uint8, of one channel or three equal ones.
-
-    Raises:
-        InputError: missing, not decodable, not 8 bit, or other channels.
-    """
+    """Grey levels of a thermal image, (H, W) uint8, of one channel or three equal ones."""
     return one_channel(_decode(path), path)
 
 
 def read_counts(path: Path) -> CountImage:
-    """Counts of a thermal camera, (H, W) uint16, at their full depth.
-
-    Raises:
-        InputError: missing, not decodable, not 16 bit, or several channels.
-    """
+    """Counts of a thermal camera, (H, W) uint16, at their full depth; InputError for others."""
     counts = decode(path)
     if counts.dtype != np.uint16:
         raise InputError(
@@ -101,11 +85,7 @@ def read_label(path: Path, num_classes: int) -> Array:
 
 
 def read_label_array(path: Path, num_classes: int) -> Array:
-    """Class indices of a `.npy` file, as `read_label`.
-
-    Raises:
-        InputError: missing, no array of whole numbers (H, W), or a value that is no class.
-    """
+    """Class indices of a `.npy` file, whole numbers (H, W), as `read_label`."""
     label = read_array(path, "class indices, whole numbers of shape (rows, columns)")
     if label.dtype.kind not in "iu" or label.ndim != 2:
         raise InputError(
@@ -207,8 +187,8 @@ def one_channel(thermal: NDArray[Any], path: Path) -> NDArray[Any]:
 def decode(path: Path) -> NDArray[Any]:
     """An image as written, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
 
-    Raises:
-        InputError: missing, cut short, not decodable.
+    All readers of images raise its InputError: missing, cut short, not decodable; and one for
+    another depth, or other channels, than they name.
     """
     return _decoded(read_image(path), path)
 

@@ -18,14 +18,15 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.files import read_counts, read_label, read_label_array, within
+from rgbt.data.file_dataset import FileDataset
+from rgbt.data.files import read_counts, read_label, read_label_array
 from rgbt.data.freiburg_images import FreiburgImages, whole_frame
 from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
-from rgbt.data.named_files import check_lengths, check_split, existing_file, existing_root, size_of
+from rgbt.data.integrity import within
+from rgbt.data.named_files import check_split, existing_file, existing_root, size_of
 from rgbt.data.prepare.freiburg import PREPARATION
 from rgbt.data.report.freiburg import FreiburgChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
-from rgbt.requirements import Record
 from rgbt.types import IGNORE, Sample
 
 CLASSES = (
@@ -59,7 +60,7 @@ MOST_STRETCH = 0.02
 Array = NDArray[np.uint8]
 
 
-class Freiburg:
+class Freiburg(FileDataset):
     """RGB-thermal street scenes of Freiburg, in the layout of their archives.
 
     Layout (XX and YY are digits; sec and nsec are seconds and nanoseconds):
@@ -85,10 +86,7 @@ class Freiburg:
 
     Args:
         root: folder that holds `train`, `test` or both.
-        name: used in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
-        palette: their (red, green, blue) colours, 0..255.
+        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
         unscored: classes that are counted but left out of every mean over classes.
         crop: first row, row after the last, first column, column after the last of the part of
             every frame and label that is used; None: whole frames.
@@ -104,6 +102,7 @@ class Freiburg:
             classes, names and colours that differ.
     """
 
+    images: FreiburgImages
     preparation = PREPARATION
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -120,11 +119,8 @@ class Freiburg:
         ignored_test: Names = ("ignore",),
         val_sequences: Names = ("seq_04_day",),
     ) -> None:
-        self.root = existing_root(root, "that holds train and test")
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = palette
+        folder = existing_root(root, "that holds train and test")
+        super().__init__(folder, name, num_classes, classes, palette)
         self.unscored = unscored
         self.crop = crop
         self.thermal_range = thermal_range
@@ -133,17 +129,11 @@ class Freiburg:
         self.splits = SPLITS
         self._split_frames: dict[str, tuple[FreiburgFrame, ...]] = {}
         _check_root(self.root)
-        check_lengths(num_classes, classes, palette)
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
                 check_choice(f"dataset.{key}", word, classes)
         _check_numbers(crop, thermal_range)
         self.images = FreiburgImages(crop, thermal_range)
-
-    @property
-    def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether `split` has frames; InputError if the split is unknown."""
@@ -163,17 +153,7 @@ class Freiburg:
         return tuple(frame.name for frame in frames)
 
     def read(self, name: str) -> Sample:
-        """The frame called `name`, decoded, cut, thermal as grey levels.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8; the label is None
-            for training frames at night.
-
-        Raises:
-            InputError: no such name, a file is missing, cannot be decoded, has other channels, bits
-                or size than expected, the label holds a value that is no class, or the frame is
-                smaller than the crop.
-        """
+        """See `FileDataset`; cut, thermal as grey levels, without a label in training at night."""
         frame = self.frame(name)
         pixels, counts = whole_frame(name, *self._image_paths(frame))
         # A label is resized to the whole frame, and cropped with it.
@@ -216,11 +196,7 @@ class Freiburg:
         return tuple(self.frame(name).night for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
-
-        It includes the settings of labels (crop, `ignored_test`), but not the root, so that equal
-        copies have equal fingerprints. Nothing is decoded; missing files have size -1.
-        """
+        """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(self.splits):
             names = [frame.name for frame in self._of(split)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.data.files import CountImage, read_counts, read_rgb
+from rgbt.data.folder.values import levels_of_16_bits
 from rgbt.data.images import PairPattern, read_packed_pair
 from rgbt.data.named_files import check_size
 from rgbt.types import Sample
@@ -55,16 +55,12 @@ class FreiburgImages:
 
     def sample(self, name: str, pixels: Array, counts: CountImage) -> Sample:
         """The sample of a whole frame, RGB (H, W, 3) and counts (H, W); errors as of `cut`."""
-        levels = np.take(_grey_levels(*self.thermal_range), self.cut(counts, name))
+        levels = np.take(levels_of_16_bits(*self.thermal_range), self.cut(counts, name))
         cut = np.ascontiguousarray(self.cut(pixels, name))
         return Sample(rgb=cut, thermal=levels, label=None, name=name)
 
     def cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
-        """The part of a whole frame that is read.
-
-        Raises:
-            InputError: the frame is smaller than the crop.
-        """
+        """The part of a whole frame that is read; InputError if it is smaller than the crop."""
         if self.crop is None:
             return image
         top, bottom, left, right = self.crop
@@ -78,19 +74,7 @@ class FreiburgImages:
 
 
 def whole_frame(name: str, rgb: Path, thermal: Path) -> tuple[Array, CountImage]:
-    """RGB (H, W, 3) and counts (H, W) of a whole frame.
-
-    Raises:
-        InputError: a file cannot be read, has other channels or bits, or sizes differ.
-    """
+    """RGB (H, W, 3) and counts (H, W) of a whole frame; InputError as of `PairReader.read`."""
     pixels, counts = read_rgb(rgb), read_counts(thermal)
     check_size(pixels, "thermal", counts, name, thermal)
     return pixels, counts
-
-
-@lru_cache(maxsize=4)
-def _grey_levels(low: int, high: int) -> Array:
-    """(65536,) uint8, the grey level of every count."""
-    above = np.clip(np.arange(np.iinfo(np.uint16).max + 1), low, high) - low
-    span = high - low
-    return ((2 * 255 * above + span) // (2 * span)).astype(np.uint8)

@@ -53,9 +53,6 @@ def find_frames(root: Path) -> tuple[FreiburgFrame, ...]:
 
     In a folder frames are sorted by file name, so that the order is the same everywhere.
 
-    Args:
-        root: holds `train`, `test` or both.
-
     Raises:
         InputError: a folder without a time of day, two frames of one name, or two RGB images with
             one thermal image.

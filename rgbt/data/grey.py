@@ -19,13 +19,10 @@ def read_grey(path: Path, *, advice: str, most_tint: int = 0) -> Array:
 
         grey = floor((c1 + c2 + c3) / 3 + 1/2)
 
-    Args:
-        path: the image.
-        advice: end of the messages.
-        most_tint: levels by which the channels of a pixel may differ, 0 to 255.
+    `advice` ends the messages. Channels of a pixel may differ by `most_tint` levels, 0 to 255.
 
     Raises:
-        InputError: missing, not decodable, not 8 bit, other channels, or channels further apart.
+        InputError: as `decode`; not 8 bit, other channels, or channels further apart.
     """
     image = decode(path)
     if image.dtype != np.uint8:

@@ -116,11 +116,7 @@ def is_there(path: Path) -> bool:
 
 
 def read_names(path: Path, key: str) -> tuple[str, ...]:
-    """Stripped lines of a list file in order, without empty ones.
-
-    Args:
-        path: text in UTF-8, one name per line.
-        key: of the configuration for the list; begins the messages.
+    """Stripped lines of a list file in order, without empty ones; `key` begins the messages.
 
     Raises:
         InputError: as `read_whole`, not a text in UTF-8, or no line.

@@ -1,7 +1,4 @@
-"""KP: the KAIST multispectral street scenes that carry labels of the 19 classes of Cityscapes.
-
-A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
-"""
+"""KP: the KAIST multispectral street scenes that carry labels of the 19 classes of Cityscapes."""
 
 from __future__ import annotations
 
@@ -13,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
+from rgbt.data.file_dataset import FileDataset
 from rgbt.data.files import read_label
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
@@ -30,20 +28,11 @@ from rgbt.data.kp_layout import (
     set_of,
     sets_of,
 )
-from rgbt.data.named_files import (
-    check_lengths,
-    check_split,
-    existing_root,
-    hash_of_files,
-    names_in,
-    root_nearby,
-    with_label,
-)
+from rgbt.data.named_files import check_split, existing_root, hash_of_files, names_in, root_nearby
 from rgbt.data.prepare.kp import PREPARATION
 from rgbt.data.report.kp import KPChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
-from rgbt.requirements import Record
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE
 
 ListSource = Literal["auto", "files", "sets"]
 
@@ -64,7 +53,7 @@ MOST_TINT = 8
 ADVICE = "use the original file of the folder lwir"
 
 
-class KP:
+class KP(FileDataset):
     """RGB-thermal street scenes by day and at night with labels, as the CRM release lays them out.
 
     Layouts (XX is the set, 00 to 11; a name of this data set is setXX_VYYY_IZZZZZ):
@@ -90,10 +79,7 @@ class KP:
 
     Args:
         root: folder that holds `images` and `labels`.
-        name: used in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
-        palette: their (red, green, blue) colours, 0..255.
+        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
         splits: split -> list file in `root`.
         lists: "files" reads the lists of `splits`; "sets" divides all labels on disk by set number,
             as CRM does; "auto" is "files" if one of the lists exists.
@@ -118,9 +104,6 @@ class KP:
 
     preparation = PREPARATION
 
-    unscored: tuple[str, ...] = ()
-    """Every class counts in the means, as in the published tables."""
-
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         root: Text,
@@ -132,22 +115,12 @@ class KP:
         splits: dict[Text, Text] = SPLITS,
         lists: ListSource = "auto",
     ) -> None:
-        self.root = existing_root(root, "that holds images and labels of KP")
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = palette
-        check_choice("dataset.lists", lists, ("auto", "files", "sets"))
-        check_lengths(num_classes, classes, palette)
+        folder = existing_root(root, "that holds images and labels of KP")
+        super().__init__(folder, name, num_classes, classes, palette)
         _check_root(self.root)
         self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
         self._files = dict(splits)
         self._names: dict[str, tuple[str, ...]] = {}
-
-    @property
-    def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:
@@ -182,26 +155,8 @@ class KP:
             self._names[split] = read(split)
         return self._names[split]
 
-    def read(self, name: str) -> Sample:
-        """The triple called `name`, decoded.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
-
-        Raises:
-            InputError: an invalid name, a file is missing, cannot be decoded, has wrong channels,
-                bits or size, or the label holds a value that is no class, void or 255.
-        """
-        pair = self.pair(name)
-        return with_label(pair, self.label(name), self.label_path(name))
-
-    def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
-        rgb, thermal = (within(path, self.root) for path in self.files(name)[:2])
-        return self.images.read(name, rgb, thermal)
-
     def label(self, name: str) -> NDArray[np.uint8]:
-        """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
+        """The label of `read` alone, (H, W) uint8; InputError as there."""
         # The value after the last class is void.
         label = read_label(within(self.files(name)[-1], self.root), self.num_classes + 1)
         label[label == self.num_classes] = IGNORE
@@ -239,7 +194,7 @@ class KP:
         return tuple(is_night(name) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files."""
+        """See `hash_of_files`."""
         splits = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(splits, self.files)
 

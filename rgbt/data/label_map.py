@@ -62,16 +62,7 @@ class LabelMap:
         return table[classes]
 
     def check(self, num_source: int, targets: tuple[str, ...], dataset: str) -> None:
-        """Refuse a network or a data set that this map is not about.
-
-        Args:
-            num_source: classes of the network.
-            targets: names of the classes of the data set.
-            dataset: what it is called.
-
-        Raises:
-            InputError: either differs.
-        """
+        """Refuse a network, or a data set of the classes `targets`, that this map is not about."""
         if num_source != self.num_source:
             raise InputError(
                 f"label_map is for a network with {self.num_source} classes, but model.num_classes "

@@ -20,7 +20,7 @@ from annotated_types import Interval
 from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, RunError
-from rgbt.data.batches import BatchTransform, Dataset, Transform, collate
+from rgbt.data.batches import BatchTransform, Transform, collate
 from rgbt.data.cache.dataset import check_cache
 from rgbt.data.reader import (
     BatchReader,
@@ -31,6 +31,7 @@ from rgbt.data.reader import (
     no_shared_memory,
     start_worker,
 )
+from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import BatchSize, Text, Workers
 from rgbt.requirements import Record, Requirement
@@ -175,27 +176,19 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
 
 
 def train_batches(
-    dataset: Dataset,
+    dataset: LabelledDataset,
     split: str,
     transform: Transform,
     settings: LoaderSettings,
     seed: int,
     steps: range,
 ) -> Batches[Loadable]:
-    """Augmented training batches of the global steps in `steps`.
+    """Augmented training batches of the global steps in `steps`, made by ``transform.train``.
 
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
-    So ``steps=range(10, 20)`` continues ``range(10)`` exactly.
-
-    Args:
-        dataset: where samples come from.
-        split: name of the split.
-        transform: its `train` makes the examples.
-        settings: batch size, workers, unreadable files. ``augment="device"`` needs a
-            `BatchTransform`, which augments batches when they are moved to the device.
-        seed: run seed.
-        steps: numbers of the batches, counted from the start of the run.
+    So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With ``augment="device"`` the
+    transform is a `BatchTransform`, which augments batches when they are moved to the device.
 
     Raises:
         InputError: the split is smaller than a batch, or, with on_error="skip", unreadable.
@@ -214,16 +207,9 @@ def train_batches(
 
 
 def eval_batches(
-    dataset: Dataset, split: str, transform: Transform, settings: LoaderSettings
+    dataset: LabelledDataset, split: str, transform: Transform, settings: LoaderSettings
 ) -> Batches[Batch]:
-    """Every sample of the split once, in the order of its list.
-
-    Args:
-        dataset: where samples come from.
-        split: name of the split.
-        transform: its `test` makes the examples.
-        settings: evaluation batch size, workers, unreadable files.
-    """
+    """Every sample of the split once, in the order of its list, made by ``transform.test``."""
     names = dataset.names(split)
     source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
@@ -234,12 +220,10 @@ def eval_batches(
     )
 
 
-def steps_per_epoch(dataset: Dataset, settings: LoaderSettings, split: str = "train") -> int:
-    """Whole batches of one epoch, at least 1.
-
-    Raises:
-        InputError: the split is smaller than a batch.
-    """
+def steps_per_epoch(
+    dataset: LabelledDataset, settings: LoaderSettings, split: str = "train"
+) -> int:
+    """Whole batches of one epoch, at least 1; InputError if the split is smaller than a batch."""
     size = len(dataset.names(split))
     if size < settings.batch_size:
         raise InputError(

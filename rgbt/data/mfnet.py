@@ -1,33 +1,20 @@
-"""MFNet and data sets in its layout: split lists, images, labels, time of day by name.
-
-A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
-"""
+"""MFNet and data sets in its layout: split lists, images, labels, time of day by name."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rgbt.checks import InputError
-from rgbt.data.files import read_label, read_thermal, within
+from rgbt.data.file_dataset import FileDataset
+from rgbt.data.files import read_thermal
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names
 from rgbt.data.mfnet_layout import FOLDERS, MIRRORED, SPLITS, base_name, either_layout
-from rgbt.data.named_files import (
-    check_lengths,
-    check_split,
-    existing_root,
-    hash_of_files,
-    with_label,
-)
+from rgbt.data.named_files import check_split, existing_root, hash_of_files
 from rgbt.data.prepare.mfnet import PREPARATION
 from rgbt.data.report.mfnet import MFNetChecks
 from rgbt.ranges import Colour, Names, NumClasses, Text
-from rgbt.requirements import Record
-from rgbt.types import Sample
 
 LayoutName = Literal["auto", "packed", "folders"]
 
@@ -41,7 +28,7 @@ PALETTE = (
 )
 
 
-class MFNet:
+class MFNet(FileDataset):
     """RGB-thermal street scenes with labels, in the layout of the MFNet archive.
 
     Layouts (NAME is a line of a split list, five digits and D for day or N for night):
@@ -56,10 +43,7 @@ class MFNet:
 
     Args:
         root: folder that holds the split lists.
-        name: used in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
-        palette: their (red, green, blue) colours, 0..255.
+        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
         splits: split -> list file in `root`; two splits may share one list.
         layout: "packed", "folders", or "auto": the one with existing folders (packed first).
 
@@ -78,9 +62,6 @@ class MFNet:
 
     preparation = PREPARATION
 
-    unscored: tuple[str, ...] = ()
-    """Every class is scored, as in the published tables."""
-
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         root: Text,
@@ -92,60 +73,25 @@ class MFNet:
         splits: dict[Text, Text] = SPLITS,
         layout: LayoutName = "auto",
     ) -> None:
-        self.root = existing_root(root, f"that holds {either_layout()} and the split lists")
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = palette
+        folder = existing_root(root, f"that holds {either_layout()} and the split lists")
+        super().__init__(folder, name, num_classes, classes, palette)
         self.splits = dict(splits)
-        check_lengths(num_classes, classes, palette)
         self.layout = _find_layout(self.root, layout)
         self._names: dict[str, tuple[str, ...]] = {}
-
-    @property
-    def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
 
     def has(self, split: str) -> bool:
         """Whether the list of `split` exists; InputError if the split is unknown."""
         return self.list_path(split).is_file()
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in the order of its list.
-
-        Raises:
-            InputError: unknown split, missing or empty list.
-        """
+        """Names in the order of the list; InputError if it is unknown, missing or empty."""
         if split not in self._names:
             self._names[split] = self._read_list(split)
         return self._names[split]
 
-    def read(self, name: str) -> Sample:
-        """The triple called `name`, decoded.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
-
-        Raises:
-            InputError: a file is missing, cannot be decoded, has other channels, bits or size than
-                expected, or the label holds a value that is neither a class nor 255.
-        """
-        label = self.label(name)
-        return with_label(self.pair(name), label, self.label_path(name))
-
-    def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
-        paths = tuple(within(path, self.root) for path in self.image_paths(name))
-        return self.images.read(name, paths[0], paths[-1])
-
-    def label(self, name: str) -> NDArray[np.uint8]:
-        """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
-        return read_label(within(self.label_path(name), self.root), self.num_classes)
-
     def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens for `name`: its images, then its label."""
-        return (*self.image_paths(name), self.label_path(name))
+        """The packed image of `name`, or its RGB and its thermal image, and its label."""
+        return tuple(self.root / folder / f"{name}.png" for folder in FOLDERS[self.layout])
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files."""
@@ -166,21 +112,13 @@ class MFNet:
         return letter == "N"
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """`is_night` of every name; None if no name contains the time of day.
-
-        Raises:
-            InputError: some names contain it and others do not.
-        """
+        """`is_night` of every name; None if none states the time of day, InputError if some do."""
         if not any(base_name(name)[-1:] in ("D", "N") for name in names):
             return None
         return tuple(self.is_night(name) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
-
-        Nothing is decoded. The root is left out, so that equal copies have equal fingerprints.
-        Splits without a list are empty; missing files have size -1.
-        """
+        """See `hash_of_files`; splits without a list are empty."""
         listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(listed, self.files)
 
@@ -192,15 +130,6 @@ class MFNet:
         """The list file of `split`; InputError if the split is unknown."""
         check_split(split, self.splits)
         return self.root / self.splits[split]
-
-    def image_paths(self, name: str) -> tuple[Path, ...]:
-        """The packed image of `name`, or its RGB and its thermal image."""
-        *folders, _ = FOLDERS[self.layout]
-        return tuple(self.root / folder / f"{name}.png" for folder in folders)
-
-    def label_path(self, name: str) -> Path:
-        """The label of `name`."""
-        return self.root / FOLDERS[self.layout][-1] / f"{name}.png"
 
     def names_on_disk(self) -> frozenset[str]:
         """Names of all PNG files in the folders of images and labels, listed or not."""

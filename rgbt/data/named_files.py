@@ -22,12 +22,7 @@ Array = NDArray[np.uint8]
 
 
 def existing_root(root: str, content: str) -> Path:
-    """The folder `root`; InputError if it does not exist.
-
-    Args:
-        root: as configured.
-        content: of the expected folder, for the message.
-    """
+    """The folder `root`; InputError if there is none, which requests "the one" with `content`."""
     path = Path(root).expanduser()
     if not path.is_dir():
         raise InputError(f"dataset.root: there is no folder '{root}'; give the one {content}.")
@@ -56,17 +51,7 @@ def names_in(folder: Path) -> tuple[str, ...]:
 
 
 def pair_of_one_size(name: str, rgb: Array, thermal: Array, path: Path) -> Sample:
-    """The sample of two arrays, without a label.
-
-    Args:
-        name: of the sample.
-        rgb: (H, W, 3).
-        thermal: (H, W).
-        path: of the thermal image; for the message.
-
-    Raises:
-        InputError: heights or widths differ.
-    """
+    """The sample of RGB (H, W, 3) and thermal (H, W) of `path`; InputError if the sizes differ."""
     check_size(rgb, "thermal", thermal, name, path)
     return Sample(rgb=rgb, thermal=thermal, label=None, name=name)
 
@@ -111,12 +96,7 @@ def hash_of_files(
 
 
 def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
-    """The folder directly above or below `root` that is a root; None if there is none.
-
-    Args:
-        root: a folder that is not a root.
-        holds: whether a folder is the root of a data set.
-    """
+    """The folder directly above or below `root` that `holds` a data set; None if there is none."""
 
     def is_one(folder: Path) -> bool:
         try:

@@ -52,16 +52,11 @@ class NewImages(NamedTuple):
 
 
 def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewImages:
-    """The pairs in `folder`.
+    """The pairs in the existing `folder`.
 
-    The layouts of the data set are tried from its root, then from the folders inside it (without
-    their first pieces), then `PLAIN`. Case is ignored. Other suffixes than those of a layout are
-    used only if its own give no pair.
-
-    Args:
-        folder: an existing folder.
-        layouts: of the data set.
-        name: of the data set, for messages.
+    The layouts of the data set `name` are tried from its root, then from the folders inside it
+    (without their first pieces), then `PLAIN`. Case is ignored. Other suffixes than those of a
+    layout are used only if its own give no pair.
 
     Raises:
         InputError: no complete pair, two of one name, or two thermal images for one RGB image.

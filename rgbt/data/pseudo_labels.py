@@ -177,11 +177,7 @@ class PseudoLabelled(DatasetWrapper):
             )
 
     def read(self, name: str) -> Sample:
-        """The sample with its pseudo-label.
-
-        Raises:
-            InputError: as the data set; no pseudo-label, or one of another size.
-        """
+        """The sample with its pseudo-label; InputError if it has none, or one of another size."""
         sample = self.source.read(name)
         label, confidence = self.labels.read(name, len(self.labels.classes))
         if label.shape != sample.thermal.shape:

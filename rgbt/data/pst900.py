@@ -1,7 +1,4 @@
-"""PST900: RGB-thermal images of mines and tunnels, with four objects of search and rescue.
-
-A reader only: it never resizes, augments or remaps, and refuses files it cannot read exactly.
-"""
+"""PST900: RGB-thermal images of mines and tunnels, with four objects of search and rescue."""
 
 from __future__ import annotations
 
@@ -15,24 +12,15 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.files import read_label
+from rgbt.data.file_dataset import FileDataset
 from rgbt.data.grey import read_grey
 from rgbt.data.images import GreyImages, PairPattern
 from rgbt.data.integrity import read_names, within
-from rgbt.data.named_files import (
-    check_lengths,
-    existing_root,
-    hash_of_files,
-    names_in,
-    root_nearby,
-    with_label,
-)
+from rgbt.data.named_files import existing_root, hash_of_files, names_in, root_nearby
 from rgbt.data.prepare.pst900 import PREPARATION
 from rgbt.data.pst900_layout import FOLDERS, PARTS, SPLITS, bag_of
 from rgbt.data.report.pst900 import PST900Checks
 from rgbt.ranges import Colour, Names, NumClasses, Text
-from rgbt.requirements import Record
-from rgbt.types import Sample
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
 CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
@@ -44,7 +32,7 @@ ADVICE = (
 )
 
 
-class PST900:
+class PST900(FileDataset):
     """Underground RGB-thermal pairs with labels, in the layout of the PST900 archive.
 
     Layouts (NAME as in 58_bag21_rect_rgb_frame0000000440, the same in each folder):
@@ -69,16 +57,13 @@ class PST900:
 
     Args:
         root: folder that holds `train` and `test`, or `rgb`, `thermal`, `labels` and the lists.
-        name: used in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
-        palette: their (red, green, blue) colours, 0..255.
+        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
         val_bags: recordings of the training part that form "val" instead of "train"; (): "val" as
             described above.
 
     Raises:
-        InputError: no such root, neither layout in it, a bag that is not a whole number, or numbers
-            of classes, names and colours differ.
+        InputError: no such root, neither layout in it, or numbers of classes, names and colours
+            differ.
     """
 
     images = GreyImages(
@@ -91,9 +76,6 @@ class PST900:
 
     preparation = PREPARATION
 
-    unscored: tuple[str, ...] = ()
-    """Every class counts in the means, as in the published tables."""
-
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         root: Text,
@@ -104,26 +86,11 @@ class PST900:
         palette: tuple[Colour, ...] = PALETTE,
         val_bags: Bags = (),
     ) -> None:
-        self.root = existing_root(root, "that holds train and test of PST900")
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = palette
+        folder = existing_root(root, "that holds train and test of PST900")
+        super().__init__(folder, name, num_classes, classes, palette)
         self.val_bags = val_bags
-        check_lengths(num_classes, classes, palette)
-        for bag in val_bags:
-            if not isinstance(bag, int):
-                raise InputError(
-                    f"dataset.val_bags: {bag!r} is not a whole number; give numbers of bags, "
-                    "such as [3,7]."
-                )
         self.has_lists = _has_lists(self.root)
         self._parts: dict[str, tuple[str, ...]] = {}
-
-    @property
-    def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
 
     @property
     def splits(self) -> Mapping[str, str]:
@@ -136,11 +103,7 @@ class PST900:
         return made_of
 
     def part_of(self, split: str) -> str:
-        """The part of the archive, or the list, that `split` is taken from.
-
-        Raises:
-            InputError: unknown split.
-        """
+        """The part of the archive, or the list, of `split`; InputError if that is unknown."""
         if split not in SPLITS:
             raise InputError(f"dataset: there is no split '{split}'; {nearest(split, SPLITS)}.")
         if split != "val":
@@ -170,32 +133,9 @@ class PST900:
             raise InputError(self._why_empty(split))
         return names
 
-    def read(self, name: str) -> Sample:
-        """The triple called `name`, decoded.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8.
-
-        Raises:
-            InputError: no such name, or one of both parts, a file is missing, cannot be decoded,
-                has other channels, bits or size than expected, or the label holds a value that is
-                neither a class nor 255.
-        """
-        pair = self.pair(name)
-        return with_label(pair, self.label(name), self.files(name)[2])
-
-    def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
-        rgb, thermal = (within(path, self.root) for path in self.files(name)[:2])
-        return self.images.read(name, rgb, thermal)
-
     def thermal(self, name: str) -> NDArray[np.uint8]:
         """The thermal image called `name` alone, (H, W) uint8; InputError as in `read`."""
         return self.images.thermal(within(self.files(name)[1], self.root))
-
-    def label(self, name: str) -> NDArray[np.uint8]:
-        """The label called `name` alone, (H, W) uint8; InputError as in `read`."""
-        return read_label(within(self.files(name)[2], self.root), self.num_classes)
 
     def files(self, name: str) -> tuple[Path, ...]:
         """RGB, thermal and label of `name`; InputError if no part or both have it."""
@@ -216,7 +156,7 @@ class PST900:
         """None: it is dark underground at any time."""
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files."""
+        """See `hash_of_files`; a name in both parts has the files of both."""
         splits = {split: self._chosen(split) if self.has(split) else () for split in SPLITS}
         return hash_of_files(
             splits,

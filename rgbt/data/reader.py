@@ -16,13 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 from torch import Tensor
-from torch.utils.data import Dataset as TorchDataset
-from torch.utils.data import get_worker_info
+from torch.utils.data import Dataset, get_worker_info
 
 from rgbt.checks import InputError
-from rgbt.data.batches import Dataset, Transform, TransformedSample
+from rgbt.data.batches import Transform
+from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
-from rgbt.types import Loadable, Sample
+from rgbt.types import Example, Loadable, Sample
 
 MakeExample = Callable[[Any, dict[str, str]], Any]
 """(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
@@ -48,7 +48,7 @@ class SplitReader:
         skip_errors: record an unreadable sample instead of raising.
     """
 
-    dataset: Dataset
+    dataset: LabelledDataset
     names: tuple[str, ...]
     transform: Transform
     skip_errors: bool
@@ -103,7 +103,7 @@ class EvalExamples:
 
     source: SplitReader
 
-    def __call__(self, key: str, skipped: dict[str, str]) -> TransformedSample | None:
+    def __call__(self, key: str, skipped: dict[str, str]) -> Example | None:
         """The example of `key`, or None if it cannot be read."""
         sample = self.source.read(key, skipped)
         return None if sample is None else self.source.transform.test(sample)
@@ -128,7 +128,7 @@ class LoadedBatch:
         return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
 
 
-class BatchReader(TorchDataset[LoadedBatch]):
+class BatchReader(Dataset[LoadedBatch]):
     """Makes the batch of a list of keys.
 
     Args:
@@ -201,11 +201,7 @@ def _shared(tensor: Tensor) -> Tensor:
 
 
 def no_shared_memory(reason: str) -> str:
-    """The message about missing shared memory.
-
-    Args:
-        reason: what the system reported.
-    """
+    """The message about missing shared memory; `reason` is what the system reported."""
     return (
         f"The loader processes cannot get shared memory in /dev/shm ({reason}). Enlarge it "
         "(docker run --shm-size=8g, or mount -o remount,size=8g /dev/shm), or load in the main "

@@ -55,11 +55,7 @@ class ToPredict:
             raise InputError(f"none of the {len(self.names)} images can be read: {first}")
 
     def check_out(self, out: Path) -> None:
-        """Refuse a folder in which input or output images would be overwritten.
-
-        Raises:
-            InputError: naming the files.
-        """
+        """Refuse a folder in which input or output images would be overwritten."""
         if out.resolve() in {folder.resolve() for folder in self.folders}:
             raise InputError(
                 f"out={out} holds the input images, which would be overwritten; name another one."
@@ -87,10 +83,7 @@ def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
 def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "skip"]) -> ToPredict:
     """The image of a packed file, or the pairs of a folder (see `find_pairs`).
 
-    Args:
-        dataset: reads images of this kind.
-        text: the path.
-        on_error: "skip" leaves out RGB images without a thermal image.
+    An RGB image without a thermal image is left out if `on_error` is "skip".
 
     Raises:
         InputError: no such path, no pair in the folder, an RGB image without a thermal one.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from lightning_fabric import Fabric
@@ -17,45 +17,6 @@ from rgbt.types import Batch, View
 FAINTEST = 1e-6
 """Smallest sum of semantic scores that shares are taken of."""
 
-HeadsOf = Callable[[tuple[str, ...]], tuple[str | None, ...]]
-"""Names of images -> the head that predicts each; None: the network's only one."""
-
-
-class Prediction(NamedTuple):
-    """A batch, on the CPU, and the class index of every pixel of its labels: (B, H', W') uint8."""
-
-    batch: Batch
-    classes: Tensor
-
-
-def predictions(
-    model: nn.Module,
-    batches: Iterable[Batch],
-    fabric: Fabric,
-    view: View | None = None,
-    heads_of: HeadsOf | None = None,
-) -> Iterator[Prediction]:
-    """Class maps at the resolution of the labels, batch by batch.
-
-    Class scores are resized (bilinear) to the label before the argmax where the transform resized
-    the images, so that scores always count the pixels of the file.
-
-    Args:
-        model: a network; put into evaluation mode here and left in it.
-        batches: from `rgbt.data.loaders.eval_batches`.
-        fabric: device and precision.
-        view: what is predicted from; None leaves it to the network.
-        heads_of: which of several heads predicts an image; None leaves it to the network.
-
-    Raises:
-        RunError: a score is NaN or infinite, with the name of the image.
-    """
-    model.eval()
-    for batch in batches:
-        heads = () if heads_of is None else heads_of(batch.name)
-        classes = class_maps(model, batch.to(fabric.device), fabric, view, heads)
-        yield Prediction(batch, classes.cpu())
-
 
 def class_maps(
     model: nn.Module,
@@ -65,6 +26,9 @@ def class_maps(
     heads: Sequence[str | None] = (),
 ) -> Tensor:
     """(B, H', W') uint8: class index of every pixel of the labels of one batch.
+
+    Class scores are resized (bilinear) to the label before the argmax where the transform resized
+    the images, so that scores always count the pixels of the file.
 
     Args:
         model: a network in evaluation mode.

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
-from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
+from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
 from rgbt.evaluation.segmentation import legend_of
-from rgbt.evaluation.temporal_consistency import (
-    Frames,
-    Pairs,
-    consistency_values,
-    frames_mark,
-)
+from rgbt.evaluation.temporal_consistency import Frames, Pairs, consistency_values, frames_mark
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, partition_name
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.pair_pictures import draw_pairs
-from rgbt.tracking.run_files import read_marker
+from rgbt.tracking.run_files import read_marker, read_result, read_tables
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.sync import Options as SyncOptions
 from rgbt.tracking.sync import status_of, tracking_of
@@ -28,41 +23,50 @@ from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info
 
 
-@dataclass(frozen=True)
 class PairFiles:
     """The files of counts of pairs of one split.
 
+    They are written to the folder `out`, or to that of the network.
+
     Attributes:
-        session: whose consistency is measured.
-        folder: that they are in.
-        split: name of the split.
         suffixes: words that end their names; (): they are the run's own measurement.
+
+    Raises:
+        InputError: counts on second frames of another motion would be replaced.
     """
 
-    session: Session
-    folder: Path
-    split: str
-    suffixes: tuple[str, ...]
-
-    def path(self, protocol: Protocol) -> Path:
-        """File of counts; those of true frames have one name, whatever the motion."""
-        views = "" if protocol == "next" else self.session.consistency.mark
-        usual = Path(file_name(protocol, self.split, views))
-        return self.folder / usual.with_stem("_".join([usual.stem, *self.suffixes])).name
-
-    def check_motion(self) -> None:
-        """Refuse to replace counts on other second frames by those on these."""
+    def __init__(
+        self,
+        opened: TrainedNetwork,
+        network: NetworkRequest,
+        request: EvaluationRequest,
+        frames: Frames,
+        out: Path | None,
+    ) -> None:
+        self.suffixes = (*([request.view] if request.view else []), *network.suffixes)
+        self._session, self._split = opened.session, request.split
+        self._folder = out or opened.folder
+        if frames == "virtual":
+            marker = None if out else read_marker(opened.folder.parent)
+            self.suffixes += other_images(opened.session.dataset, marker)
+            return
         path = self.path("next")
-        partition = partition_name("next", 1, frames_mark(self.session, "next"))
+        partition = partition_name("next", 1, frames_mark(opened.session, "next"))
         if path.is_file() and Counts.load(path).partition != partition:
             raise InputError(
                 f"{path} holds counts on second frames of another motion; name a folder for these "
                 "with out=..., or remove that file."
             )
 
+    def path(self, protocol: Protocol) -> Path:
+        """File of counts; those of true frames have one name, whatever the motion."""
+        views = "" if protocol == "next" else self._session.consistency.mark
+        usual = Path(file_name(protocol, self._split, views))
+        return self._folder / usual.with_stem("_".join([usual.stem, *self.suffixes])).name
+
     def write(self, pairs: Pairs) -> list[tuple[str, str]]:
         """Write counts and picture; (what, path) of each."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._folder.mkdir(parents=True, exist_ok=True)
         paths = {protocol: self.path(protocol) for protocol in pairs.counts}
         for protocol, counts in reversed(pairs.counts.items()):
             counts.save(paths[protocol])
@@ -73,58 +77,20 @@ class PairFiles:
         # Named like the counts that it shows, those of the first protocol.
         first = next(iter(paths.values()))
         picture = first.with_name(first.stem.replace("consistency_", "pairs_") + ".png")
-        draw_pairs(pairs.kept, legend_of(self.session.dataset), picture)
+        draw_pairs(pairs.kept, legend_of(self._session.dataset), picture)
         return [*lines, ("picture", str(picture))]
-
-
-def pair_files(
-    opened: TrainedNetwork,
-    network: NetworkRequest,
-    request: EvaluationRequest,
-    frames: Frames,
-    out: Path | None,
-) -> PairFiles:
-    """Where the counts of a measurement are written.
-
-    Args:
-        opened: the network.
-        network: how it was requested.
-        request: split and view.
-        frames: what the second frames are.
-        out: folder; None: that of the network.
-
-    Raises:
-        InputError: counts on second frames of another motion would be replaced.
-    """
-    view = () if request.view is None else (request.view,)
-    suffixes = (*view, *network.suffixes)
-    if frames == "virtual" and not out:
-        suffixes += _other_images(opened)
-    files = PairFiles(opened.session, out or opened.folder, request.split, suffixes)
-    if frames == "next":
-        files.check_motion()
-    return files
-
-
-def _other_images(opened: TrainedNetwork) -> tuple[str, ...]:
-    """Part of a file's name where a run is measured on images that it was not trained with."""
-    dataset = opened.session.dataset
-    marker, now = read_marker(opened.folder.parent), dataset.fingerprint()
-    if marker is None or marker["files"] == now:
-        return ()
-    return (f"{dataset.name}-{now[:8]}",)
 
 
 def add_to_result(run: RunFolder, session: Session, split: str, table: ConsistencyTable) -> None:
     """Add the measurement to the result, tables and MLflow run of `run`, as if made by it."""
-    result, tables = run.result(), run.tables()
+    result, tables = read_result(run.path), read_tables(run.path)
     kinds = {session.trainer.selection_split: "val", "test": "test"}
     if result is None or tables is None or split not in kinds or session.consistency.mark:
         return
     kind = kinds[split]
     result[kind] = {**result[kind], **without_nan(consistency_values(table))}
     if kind == "test":
-        run.write_tables({**tables, "consistency": without_nan(asdict(table))})
+        run.write_tables(replace(tables, consistency=table))
     run.finish(result)
     if read_upload_state(run) is None:
         return

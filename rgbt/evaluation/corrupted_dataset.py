@@ -23,11 +23,8 @@ class CorruptedDataset(DatasetWrapper):
     is drawn for an image follows from (seed, its name) alone, whatever is read before it.
 
     Args:
-        source: the data set.
-        corruption: what fails.
-        severity: how much; 0: nothing, samples are those of the source.
+        severity: 0: samples are those of the source.
         split: that is read; its order is the order of time.
-        seed: of what is drawn.
 
     Raises:
         InputError: a severity out of range, an unknown or missing split.

@@ -35,14 +35,12 @@ SEED = "seed"
 
 @dataclass(frozen=True)
 class CorruptionRequest:
-    """A corruption with a severity.
+    """A corruption with a severity; 0: the images as they are.
 
     Attributes:
         name: what files of counts call it without its changes, such as "noise_rgb".
-        corruption: built.
         changes: ``key=value`` words that differ from the file, as typed.
         seed: of what is drawn.
-        severity: 0: the images as they are.
     """
 
     name: str
@@ -144,7 +142,7 @@ def choose_corruption(
     Args:
         name: a file of ``conf/corruption/`` without extension, alone or as NAME:IMAGE, or a path
             that ends in .yaml.
-        words: ``corruption.KEY=VALUE``, as `split_overrides` returns them.
+        words: ``corruption.KEY=VALUE``.
         trust: modules that the file may name (`rgbt.config.stored_config`).
 
     Raises:
@@ -161,6 +159,9 @@ def choose_corruption(
     for key, value in pairs:
         if key != SEED:
             OmegaConf.update(node, key, parse_yaml(value, f"{NODE}.{key}"))
+    seed = dict(pairs).get(SEED, "0")
+    if not seed.isdecimal():
+        raise InputError(f"{NODE}.{SEED}={seed}: expected a whole number of at least 0.")
     corruption = build(node)
     if is_own(corruption) and not isinstance(corruption, OfTime):
         check_corruption(corruption)
@@ -170,7 +171,7 @@ def choose_corruption(
         name=path.stem if is_file else row_name(f"{stem}:{node.get('image', '')}"),
         corruption=corruption,
         changes=tuple(f"{key}={value}" for key, value in pairs if key not in unnamed),
-        seed=_seed([value for key, value in pairs if key == SEED]),
+        seed=int(seed),
     )
 
 
@@ -194,12 +195,9 @@ def requested_corruption(
 def choose_corruptions(
     text: str, words: Sequence[str], trust: Collection[str] = ()
 ) -> list[CorruptionRequest]:
-    """The corruptions of ``corruptions=``.
+    """The corruptions of ``corruptions=``: names with commas, or "all".
 
-    Args:
-        text: names with commas, or "all".
-        words: ``corruption.KEY=VALUE``; any key of a single corruption, the seed of several.
-        trust: see `choose_corruption`.
+    `words` are any key of a single corruption, the seed of several.
 
     Raises:
         InputError: an unknown name, one given twice, or keys of several corruptions at once.
@@ -234,10 +232,3 @@ def _node(path: Path, trust: Collection[str]) -> DictConfig:
     node = OmegaConf.create({NODE: load_config(path, trust)})[NODE]
     assert isinstance(node, DictConfig), "load_config returns a mapping"
     return node
-
-
-def _seed(typed: Sequence[str]) -> int:
-    text = typed[-1] if typed else "0"
-    if not text.isdecimal():
-        raise InputError(f"{NODE}.{SEED}={text}: expected a whole number of at least 0.")
-    return int(text)

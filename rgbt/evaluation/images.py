@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -14,14 +13,12 @@ from rgbt.checks import InputError
 from rgbt.data.batches import collate
 from rgbt.data.label_map import LabelMap
 from rgbt.data.to_predict import ToPredict, of_files, of_path, of_split
-from rgbt.engine.evaluate import predictions
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import heads_of, view_of
+from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import overlay
 from rgbt.tracking.terminal import info
-from rgbt.types import Sample
 
 
 def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
@@ -53,15 +50,7 @@ def write_images(
     out: Path,
     label_map: LabelMap | None,
 ) -> str:
-    """Write NAME_overlay.png and NAME.png of every image, with a progress bar.
-
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        images: see `chosen_images`.
-        request: view and head.
-        out: folder, made where it is missing.
-        label_map: from the classes of the network to those of the data set; None: they are the
-            same.
+    """Write NAME_overlay.png and NAME.png of every image to `out`, with a progress bar.
 
     Returns:
         how many images were written, and where.
@@ -72,14 +61,18 @@ def write_images(
     images.check_out(out)
     out.mkdir(parents=True, exist_ok=True)
     palette = np.array(session.dataset.palette, np.uint8)
+    predictor = Predictor(session, session.model, request)
     written = 0
     with progress() as display:
         task = display.add_task("predicting", total=len(images.names), note="images")
-        for sample, predicted in _predicted(session, images, request):
-            classes = predicted if label_map is None else label_map(predicted)
+        for sample in images.samples(session.loading.on_error):
+            # One image at a time: a folder may hold images of any size.
+            batch = collate([session.transform.test(sample)], "").to(session.fabric.device)
+            classes = predictor.classes(batch)[0].cpu().numpy()
+            classes = classes if label_map is None else label_map(classes)
             painted = overlay(sample.rgb, classes, palette)
-            _write(out / f"{sample.name}_overlay.png", painted[..., ::-1])
-            _write(out / f"{sample.name}.png", classes)
+            write_png(out / f"{sample.name}_overlay.png", painted[..., ::-1])
+            write_png(out / f"{sample.name}.png", classes)
             written += 1
             display.advance(task)
     for reason in list(images.skipped.values())[:1]:
@@ -89,19 +82,9 @@ def write_images(
     return f"{written} images in {out.resolve()}"
 
 
-def _predicted(
-    session: Session, images: ToPredict, request: EvaluationRequest
-) -> Iterator[tuple[Sample, NDArray[np.uint8]]]:
-    view = view_of(session, request.view)
-    heads = heads_of(session, view, request.head)
-    for sample in images.samples(session.loading.on_error):
-        # One image at a time: a folder may hold images of any size.
-        batch = collate([session.transform.test(sample)], "")
-        for found in predictions(session.model, [batch], session.fabric, view, heads):
-            yield sample, found.classes[0].numpy()
-
-
-def _write(path: Path, image: NDArray[np.uint8]) -> None:
+def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write an image of 8 or 16 bit, three channels in the order B, G, R."""
     encoded, content = cv2.imencode(".png", image)
-    assert encoded, "8 bit images can be encoded"
+    assert encoded, "images of 8 and 16 bit can be encoded"
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, content.tobytes())

@@ -1,27 +1,56 @@
-"""What all evaluations of a network share: its view, its heads, and the images decoded ahead."""
+"""What all evaluations of a network share: view, heads, predicted batches, counts by image."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
+from torch import Tensor, nn
 
 from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
-from rgbt.engine.evaluate import HeadsOf
+from rgbt.engine.evaluate import class_maps, probabilities
 from rgbt.engine.progress import progress
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.metrics.counts import Counts
 from rgbt.requirements import record_of
-from rgbt.types import View
+from rgbt.types import Batch, View
+
+
+class Predictor:
+    """Predicts batches with `model`, left in evaluation mode; each image by its head.
+
+    Attributes:
+        view: what is predicted from.
+
+    Raises:
+        InputError: the network does not predict from the view of the request.
+    """
+
+    def __init__(self, session: Session, model: nn.Module, request: EvaluationRequest) -> None:
+        self.view = view_of(session, request.view)
+        self._heads = heads_of(session, self.view, request.head)
+        self._fabric = session.fabric
+        self._model = model.eval()
+
+    def classes(self, batch: Batch) -> Tensor:
+        """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
+        return class_maps(self._model, batch, self._fabric, self.view, self._heads(batch.name))
+
+    def probabilities(self, batch: Batch) -> Tensor:
+        """`rgbt.engine.evaluate.probabilities` of a batch on the device."""
+        return probabilities(self._model, batch, self._fabric, self.view, self._heads(batch.name))
 
 
 def view_of(session: Session, view: View | None = None) -> View:
-    """What the network of a session predicts from.
+    """What the network of a session predicts from: `view`.
 
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        view: None: what its source domain is seen as; where that does not say, its first view.
+    None: what its source domain is seen as; where that does not say, the network's first view.
 
     Raises:
         InputError: the network does not predict from `view`.
@@ -33,30 +62,48 @@ def view_of(session: Session, view: View | None = None) -> View:
     return view
 
 
-def heads_of(session: Session, view: View, head: TestedHead | None = None) -> HeadsOf:
-    """Which head predicts an image: that of its domain, or the requested one.
+def heads_of(
+    session: Session, view: View, head: TestedHead | None = None
+) -> Callable[[tuple[str, ...]], tuple[str | None, ...]]:
+    """Names of images -> the head that predicts each; None: the network's only one.
 
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        view: what is predicted from.
-        head: None: as the run's configuration says (`domains.tested_head`).
+    Where `head` is None the run's configuration says which (`domains.tested_head`).
     """
     requested = session.domains.tested_head if head is None else head
 
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
-        by_night = requested == "own" and session.domains.target_is == "night"
-        dark = (_nights(session, names) if by_night else None) or (None,) * len(names)
-        return tuple(session.domains.head_of(view, night, requested) for night in dark)
+        dark = None
+        if requested == "own" and session.domains.target_is == "night":
+            with suppress(InputError):  # files of one's own are in no list
+                dark = session.dataset.nights(names)
+        nights = dark or (None,) * len(names)
+        return tuple(session.domains.head_of(view, night, requested) for night in nights)
 
     return choose
 
 
-def _nights(session: Session, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-    """Which images were taken at night; None where that is not known, as of files of one's own."""
-    try:
-        return session.dataset.nights(names)
-    except InputError:
-        return None
+def counts_of(
+    session: Session, split: str, by_name: Mapping[str, NDArray[np.int64]], partition: str
+) -> Counts:
+    """The counts (R, K, K) of each image as those of a split.
+
+    Raises:
+        InputError: there is none, because no image could be read.
+    """
+    dataset, names = session.dataset, tuple(by_name)
+    if not names:
+        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
+    return Counts(
+        counts=np.stack(list(by_name.values())).astype(np.int32),
+        names=names,
+        night=dataset.nights(names),
+        classes=dataset.classes,
+        partition=partition,
+        dataset=dataset.fingerprint(),
+        split=split,
+        unscored=dataset.unscored,
+        absent=session.regions.absent,
+    )
 
 
 def decode_ahead(session: Session, *splits: str) -> None:

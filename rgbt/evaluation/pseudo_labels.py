@@ -10,23 +10,20 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from rgbt.build.session import Session
-from rgbt.checks import InputError, RunError, check_range
+from rgbt.checks import InputError, check_range
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.batches import Dataset
 from rgbt.data.label_map import LabelMap
 from rgbt.data.loaders import eval_batches
 from rgbt.data.pseudo_labels import (
@@ -38,16 +35,17 @@ from rgbt.data.pseudo_labels import (
     label_path,
     read_pair,
 )
-from rgbt.engine.evaluate import probabilities
+from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.images import write_png
+from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding, write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.tables import TextTable, percent
 from rgbt.tracking.terminal import info
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE
 
 BEGUN = "pseudo_labels.begun.json"
 """What a folder that is not finished was begun with."""
@@ -56,26 +54,12 @@ LOCK = ".lock"
 
 
 @dataclass(frozen=True)
-class Teacher:
-    """The network whose predictions become labels.
-
-    Attributes:
-        name: key of its run, or file of its weights; for people.
-        weights: SHA-256 over its parameters and statistics, in hexadecimal.
-    """
-
-    name: str
-    weights: str
-
-
-@dataclass(frozen=True)
 class Labelling:
     """How a prediction becomes labels.
 
     Attributes:
         threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
-        label_map: from the classes of the network to those of the data set; None: they are the
-            same.
+        label_map: from the classes of the network to those of the data set, where they differ.
 
     Raises:
         InputError: a threshold out of range.
@@ -88,14 +72,14 @@ class Labelling:
         check_range("threshold", self.threshold, 0, 1)
 
 
-def teacher_of(name: str, model: nn.Module) -> Teacher:
-    """The teacher that `model` is, with the weights it holds now."""
+def teacher_digest(model: nn.Module) -> str:
+    """SHA-256 over the parameters and statistics of a network, in hexadecimal."""
     digest = hashlib.sha256()
     for key, tensor in model.state_dict().items():
         digest.update(f"{key} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().cpu().contiguous().reshape(-1)
         digest.update(flat.view(torch.uint8).numpy().tobytes())
-    return Teacher(name, digest.hexdigest())
+    return digest.hexdigest()
 
 
 def label_map_of(name: str) -> LabelMap | None:
@@ -113,7 +97,7 @@ def label_map_of(name: str) -> LabelMap | None:
 
 
 def write_pseudo_labels(
-    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling, out: Path
+    session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling, out: Path
 ) -> PseudoLabels:
     """Predict a split with the network of `session` and write its sure pixels as labels.
 
@@ -126,9 +110,9 @@ def write_pseudo_labels(
     keeps every pixel: threshold 0.
 
     Args:
-        session: see `rgbt.build.session.open_session`; its network is the teacher.
-        teacher: who that is.
-        request: split, view and head; a head of None: as the teacher's configuration says.
+        session: its network is the teacher.
+        teacher: key of its run, or file of its weights; for people.
+        request: split, view and head.
         labelling: how predictions become labels.
         out: folder, made where it is missing.
 
@@ -138,23 +122,22 @@ def write_pseudo_labels(
         RunError: the network's predictions are not finite.
     """
     assert request.corruption is None, "labels are predicted from clean images"
-    if (label_map := labelling.label_map) is not None:
-        num_classes = session.spec.model.values.get("num_classes", label_map.num_source)
-        label_map.check(num_classes, tuple(session.dataset.classes), session.dataset.name)
-    request = replace(request, view=view_of(session, request.view))
     settings = _settings(session, teacher, request, labelling)
     names = tuple(dict.fromkeys(session.dataset.names(request.split)))
     _refuse_other_content(out)
     out.mkdir(parents=True, exist_ok=True)
     with _alone(out):
         finished = _is_finished(out, settings)
-        missing = tuple(name for name in names if not _is_written(out, name))
+        missing = tuple(
+            name
+            for name in names
+            if not (label_path(out, name).is_file() and confidence_path(out, name).is_file())
+        )
         if not finished or set(missing) - set(PseudoLabels(out).manifest["skipped"]):
             # First the one, then the other: a killed process leaves a folder that is known.
             write_atomic(out / BEGUN, _text(settings))
             (out / MANIFEST).unlink(missing_ok=True)
-            written = _Writer(out, labelling)
-            skipped = _predict(session, request, written, missing, len(names))
+            skipped = _predict(session, request, labelling, out, missing, len(names))
             _finish(out, settings, [name for name in names if name not in skipped], skipped)
     return PseudoLabels(out)
 
@@ -181,32 +164,28 @@ def _percent(fraction: float | None) -> str:
     return percent(float("nan") if fraction is None else fraction)
 
 
-@dataclass
-class _Subset:
+class _Subset(DatasetWrapper):
     """A data set of which only some names are read."""
 
-    name: str
-    dataset: Dataset
-    chosen: tuple[str, ...]
+    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
+        super().__init__(source)
+        self._chosen = chosen
 
     def names(self, split: str) -> tuple[str, ...]:
         del split
-        return self.chosen
-
-    def read(self, name: str) -> Sample:
-        return self.dataset.read(name)
+        return self._chosen
 
 
 def _settings(
-    session: Session, teacher: Teacher, request: EvaluationRequest, labelling: Labelling
+    session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling
 ) -> dict[str, Any]:
     """The first part of the manifest: all that the files follow from."""
     settings = {
         "format": FORMAT,
-        "teacher": teacher.name,
-        "weights": teacher.weights,
+        "teacher": teacher,
+        "weights": teacher_digest(session.model),
         "network": _network(session.spec),
-        "view": request.view,
+        "view": view_of(session, request.view),
         "head": request.head or session.domains.tested_head,
         "label_map": None if labelling.label_map is None else asdict(labelling.label_map),
         "threshold": float(labelling.threshold),
@@ -245,35 +224,26 @@ def _refuse_other_content(out: Path) -> None:
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
     """No other process writes to the folder meanwhile; leftovers of killed ones are removed."""
-    with holding(out / LOCK) as holder:
-        if holder is None:
-            yield from _tidied(out)
-            return
-    info(f"{out} is being written by {holder}; waiting for it.")
-    with holding(out / LOCK, wait_s=math.inf):
-        yield from _tidied(out)
-
-
-def _tidied(out: Path) -> Iterator[None]:
-    for folder in ("labels", "confidence"):
-        for leftover in (out / folder).rglob(".*.png.*"):
-            leftover.unlink()
-    yield
+    with ExitStack() as locks:
+        holder = locks.enter_context(holding(out / LOCK))
+        if holder is not None:
+            info(f"{out} is being written by {holder}; waiting for it.")
+            locks.enter_context(holding(out / LOCK, wait_s=math.inf))
+        for folder in ("labels", "confidence"):
+            for leftover in (out / folder).rglob(".*.png.*"):
+                leftover.unlink()
+        yield
 
 
 def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     """Whether all was written before; InputError where it was begun with other settings."""
     finished = (out / MANIFEST).exists()
     if finished:
-        _refuse_others(out, PseudoLabels(out).manifest, settings)
+        begun = PseudoLabels(out).manifest
     elif (out / BEGUN).exists():
-        _refuse_others(
-            out, read_json(out / BEGUN, dict[str, Any], "remove it and predict again"), settings
-        )
-    return finished
-
-
-def _refuse_others(out: Path, begun: dict[str, Any], settings: dict[str, Any]) -> None:
+        begun = read_json(out / BEGUN, dict[str, Any], "remove it and predict again")
+    else:
+        return False
     for key, value in settings.items():
         if key != "teacher" and begun.get(key) != value:
             before, now = (str(each)[:60] for each in (begun.get(key), value))
@@ -281,64 +251,39 @@ def _refuse_others(out: Path, begun: dict[str, Any], settings: dict[str, Any]) -
                 f"{out} was begun with pseudo-labels of another {key} ({before}, now {now}); name "
                 "another folder, or remove this one."
             )
-
-
-def _is_written(out: Path, name: str) -> bool:
-    return label_path(out, name).is_file() and confidence_path(out, name).is_file()
+    return finished
 
 
 def _predict(
     session: Session,
     request: EvaluationRequest,
-    writer: _Writer,
+    labelling: Labelling,
+    out: Path,
     missing: tuple[str, ...],
     total: int,
 ) -> dict[str, str]:
     """Predict and write the missing images; why others could not be read, by name."""
     if not missing:
         return {}
+    label_map = labelling.label_map
     decode_ahead(session, request.split)
-    subset = _Subset(session.dataset.name, session.dataset, missing)
+    subset = _Subset(session.dataset, missing)
     batches = eval_batches(subset, request.split, session.transform, session.loading)
-    model, fabric = session.model.eval(), session.fabric
-    view = view_of(session, request.view)
-    heads_by = heads_of(session, view, request.head)
+    predictor = Predictor(session, session.model, request)
     with progress() as display:
         done = total - len(missing)
         task = display.add_task("predicting", total=total, completed=done, note="images")
         for batch in batches:
-            heads = heads_by(batch.name)
-            found = probabilities(model, batch.to(fabric.device), fabric, view, heads)
+            found = predictor.probabilities(batch.to(session.fabric.device))
             confidence, classes = (each.cpu().numpy() for each in found.max(1))
             for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
-                writer.write(name, sure, ids.astype(np.uint8))
+                ids = ids.astype(np.uint8) if label_map is None else label_map(ids.astype(np.uint8))
+                label = np.where(sure < labelling.threshold, np.uint8(IGNORE), ids)
+                scaled = np.rint(FULL * sure.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+                write_png(confidence_path(out, name), scaled)
+                write_png(label_path(out, name), label)
             display.advance(task, len(batch.name))
     return batches.skipped
-
-
-@dataclass(frozen=True)
-class _Writer:
-    """Writes labels and confidences of images to the folder `out`."""
-
-    out: Path
-    labelling: Labelling
-
-    def write(self, name: str, confidence: NDArray[np.float32], classes: NDArray[np.uint8]) -> None:
-        if not np.isfinite(confidence).all():
-            raise RunError(f"the teacher's predictions of '{name}' are not finite; is it trained?")
-        label_map, threshold = self.labelling.label_map, self.labelling.threshold
-        mapped = classes if label_map is None else label_map(classes)
-        label = np.where(confidence < threshold, np.uint8(IGNORE), mapped)
-        scaled = np.rint(FULL * confidence.astype(np.float64)).clip(0, FULL).astype(np.uint16)
-        _write_png(confidence_path(self.out, name), scaled)
-        _write_png(label_path(self.out, name), label)
-
-
-def _write_png(path: Path, image: NDArray[Any]) -> None:
-    encoded, content = cv2.imencode(".png", image)
-    assert encoded, "an 8-bit or 16-bit image of one channel"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, content.tobytes())
 
 
 def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict[str, str]) -> None:

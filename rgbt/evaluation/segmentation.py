@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import RenderableType
 from torch import nn
 
+from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
-from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.evaluate import predictions
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
+from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.metrics import scores
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
@@ -22,6 +24,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+from rgbt.tracking.terminal import result_view
 from rgbt.types import View
 
 NUM_PANELS = 6
@@ -30,11 +33,9 @@ NUM_PANELS = 6
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Counts of one split.
+    """Counts of one split per image and region, predicted from `view`.
 
     Attributes:
-        counts: per image and region.
-        view: what was predicted from.
         kept: examples for pictures.
         skipped: names of unreadable files that were left out.
     """
@@ -46,73 +47,43 @@ class EvaluationResult:
 
 
 def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> EvaluationResult:
-    """Predict a split and count, with a progress bar.
-
-    Args:
-        session: see `rgbt.build.session.open_session`.
-        model: the network to evaluate; left in evaluation mode.
-        request: split, view, head, corruption, and the images to return for pictures.
+    """Predict a split with `model`, left in evaluation mode, and count, with a progress bar.
 
     Raises:
         InputError: a file cannot be read (data.on_error=raise), or none could be; the network
             has not the view or the head; a corruption that does not fit the images.
     """
-    view = view_of(session, request.view)
+    predictor = Predictor(session, model, request)
     if request.corruption is not None:
         session = request.corruption.applied_to(session, request.split)
     dataset = session.dataset
     decode_ahead(session, request.split)
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
-    counted: dict[str, np.ndarray] = {}
+    counted: dict[str, NDArray[np.int64]] = {}
     kept: list[PanelExample] = []
-    heads = heads_of(session, view, request.head)
     with progress() as display:
         total = len(dataset.names(request.split))
         task = display.add_task(request.split, total=total, note="images")
-        for found in predictions(model, batches, session.fabric, view, heads):
-            triples = zip(found.batch.name, found.batch.label, found.classes, strict=True)
-            for name, label, classes in triples:
+        for batch in batches:
+            predicted = predictor.classes(batch.to(session.fabric.device)).cpu()
+            for name, label, classes in zip(batch.name, batch.label, predicted, strict=True):
                 counted[name] = counter(label, classes)
                 is_kept = name in request.keep
                 kept += [_example(session, name, classes.numpy())] if is_kept else []
-            display.advance(task, len(found.batch.name))
-    counts = _counts(session, request.split, counted)
-    return EvaluationResult(counts, view, tuple(kept), tuple(batches.skipped))
+            display.advance(task, len(batch.name))
+    counts = counts_of(session, request.split, counted, session.regions.name)
+    return EvaluationResult(counts, predictor.view, tuple(kept), tuple(batches.skipped))
 
 
-def _counts(session: Session, split: str, counted: dict[str, np.ndarray]) -> Counts:
-    dataset = session.dataset
-    if not counted:
-        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
-    return Counts(
-        counts=np.stack(list(counted.values())).astype(np.int32),
-        names=tuple(counted),
-        night=dataset.nights(tuple(counted)),
-        classes=dataset.classes,
-        partition=session.regions.name,
-        dataset=dataset.fingerprint(),
-        split=split,
-        unscored=dataset.unscored,
-        absent=session.regions.absent,
-    )
-
-
-def _example(session: Session, name: str, classes: np.ndarray) -> PanelExample:
+def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelExample:
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
     return PanelExample(name, sample.rgb, sample.thermal, label, classes)
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
-    """The tables of one evaluation, from its counts alone.
-
-    Args:
-        counts: of the split.
-        regions: partition of the counts and the rule for absent classes.
-        label: what the row stands for, e.g. "grbm".
-        step: optimiser steps done.
-    """
+    """The tables of one evaluation, from its counts alone; `label` names its row."""
     absent, scored = regions.absent, counts.scored
     whole, by_region = counts.whole(), counts.by_region()
     region_ious = scores.miou(by_region, absent, scored)
@@ -137,6 +108,34 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             notes=absent_notes(by_region, counts.classes, scored, counts.split, absent),
         ),
     )
+
+
+def counts_path(
+    opened: TrainedNetwork,
+    network: NetworkRequest,
+    request: EvaluationRequest,
+    result: EvaluationResult,
+) -> Path:
+    """File of the counts in the folder of the network: its name says what was evaluated."""
+    words = [opened.session.dataset.name, request.split, result.view, result.counts.partition]
+    words += [] if request.head is None else [f"{request.head}-head"]
+    words += [] if request.corruption is None else [request.corruption.file_stem]
+    return opened.folder / f"{'_'.join([*words, *network.suffixes])}.npz"
+
+
+def overview(
+    opened: TrainedNetwork, request: EvaluationRequest, result: EvaluationResult, path: Path
+) -> RenderableType:
+    """The tables of an evaluation, and where its counts are."""
+    session, head, corruption = opened.session, request.head, request.corruption
+    label = f"{opened.label} {session.dataset.name} {result.view}{f' {head} head' if head else ''}"
+    label += f", {corruption.title}" if corruption else ""
+    tables = result_tables(result.counts, session.regions, label, opened.step)
+    heads = session.domains.heads_in_words(head or session.domains.tested_head)
+    lines = [*([("heads", heads)] if heads else []), ("counts", str(path))]
+    if result.skipped:
+        lines.append(("left out", f"{len(result.skipped)} images that cannot be read"))
+    return result_view(tables, path.parent, lines)
 
 
 def legend_of(dataset: LabelledDataset) -> Legend:

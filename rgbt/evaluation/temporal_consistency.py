@@ -5,8 +5,8 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Literal, NamedTuple
 
@@ -20,9 +20,8 @@ from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
-from rgbt.engine.evaluate import class_maps
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
@@ -34,9 +33,6 @@ from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
 from rgbt.types import IGNORE, Batch
 
-Predict = Callable[[Batch], Tensor]
-"""A batch on the device -> its class maps (B, H', W') uint8."""
-
 Frames = Literal["virtual", "next"]
 PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
     "virtual": ("aligned", "released"),
@@ -46,12 +42,9 @@ PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
 
 
 class Compared(NamedTuple):
-    """Class maps (H', W') of one scene, as one protocol compares them.
+    """Class maps (B, H', W') of scenes as one protocol compares them, and labels of the second.
 
     Attributes:
-        first: prediction of the first frame.
-        second: prediction of the second frame.
-        label: label of the second frame.
         valid: pixels that count; None: all.
     """
 
@@ -61,17 +54,8 @@ class Compared(NamedTuple):
     valid: Tensor | None
 
 
-@dataclass
-class Collected:
-    """Counts of one protocol: name -> number of the set of views -> (K + 1, K, K)."""
-
-    by_name: dict[str, dict[int, NDArray[np.int64]]] = field(default_factory=dict)
-
-    def add(self, scenes: Scenes, compared: Compared, num_classes: int) -> None:
-        """Count the scenes of a batch; a name that a list holds twice counts once."""
-        for name, each in zip(scenes.names, _each(compared), strict=True):
-            counts = pair_counts(each.first, each.second, each.label, num_classes, each.valid)
-            self.by_name.setdefault(name, {})[scenes.number] = counts
+CountsBySet = dict[int, NDArray[np.int64]]
+"""Number of the set of views -> (K + 1, K, K) of one scene."""
 
 
 class Scenes(NamedTuple):
@@ -89,17 +73,12 @@ class Scenes(NamedTuple):
     compared: dict[Protocol, Compared]
     images: tuple[Tensor, Tensor]
     first: Tensor
-    number: int
+    number: int = 0
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """What `count_pairs` found.
-
-    Attributes:
-        counts: by protocol, see `rgbt.metrics.pairs`.
-        kept: scenes for pictures.
-    """
+    """Counts of pairs by protocol (`rgbt.metrics.pairs`), and scenes for pictures."""
 
     counts: dict[Protocol, Counts]
     kept: tuple[PairExample, ...]
@@ -114,8 +93,8 @@ def count_pairs(
     its release (released: it is not). On true frames points are followed by their exact flow.
 
     Args:
-        session: see `rgbt.build.session.open_session`; its `consistency` says which virtual views.
-        model: the network to evaluate; left in evaluation mode.
+        session: its `consistency` says which virtual views.
+        model: left in evaluation mode.
         request: split, view, head, and the scenes to return for pictures.
         frames: what the second frames are.
 
@@ -126,28 +105,39 @@ def count_pairs(
     split = request.split
     _check_second_frames(session, frames)
     decode_ahead(session, split)
-    model.eval()
-    found: dict[Protocol, Collected] = {each: Collected() for each in PROTOCOLS[frames]}
+    predictor = Predictor(session, model, request)
+    found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
-    view = view_of(session, request.view)
-    heads = heads_of(session, view, request.head)
-
-    def predict(batch: Batch) -> Tensor:
-        return class_maps(model, batch, session.fabric, view, heads(batch.name))
-
     scenes_of = _virtual if frames == "virtual" else _next
-    num_classes = len(session.dataset.classes)
     with progress() as display:
         total = len(session.dataset.names(split))
         task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(session, predict, split):
+        for scenes in scenes_of(session, predictor, split):
             for protocol, maps in scenes.compared.items():
-                found[protocol].add(scenes, maps, num_classes)
+                _count(scenes, maps, len(session.dataset.classes), found[protocol])
             wanted = [name for name in scenes.names if name in request.keep and name not in kept]
             kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
-            display.update(task, completed=len(next(iter(found.values())).by_name))
-    counts = {protocol: _counts(session, split, protocol, each) for protocol, each in found.items()}
+            display.update(task, completed=len(found[PROTOCOLS[frames][0]]))
+    counts = {}
+    for protocol, by_name in found.items():
+        joined = {
+            name: np.concatenate([by_set[number] for number in sorted(by_set)])
+            for name, by_set in by_name.items()
+        }
+        sets = max(map(len, by_name.values()), default=0)
+        partition = partition_name(protocol, sets, frames_mark(session, protocol))
+        counts[protocol] = counts_of(session, split, joined, partition)
     return Pairs(counts, tuple(kept.values()))
+
+
+def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, CountsBySet]) -> None:
+    """Add the scenes of a batch; a name that a list holds twice counts once."""
+    first, second, label = (each.cpu() for each in maps[:3])
+    valid = None if maps.valid is None else maps.valid.cpu()
+    for index, name in enumerate(scenes.names):
+        seen = None if valid is None else valid[index]
+        counts = pair_counts(first[index], second[index], label[index], num_classes, seen)
+        found.setdefault(name, {})[scenes.number] = counts
 
 
 def _check_second_frames(session: Session, frames: Frames) -> None:
@@ -161,44 +151,42 @@ def _check_second_frames(session: Session, frames: Frames) -> None:
         )
 
 
-def _virtual(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
+def _virtual(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
     """Every batch with each set of views in turn."""
-    sets = session.consistency
     names = session.dataset.names(split)
     # A name that the list holds twice has the views of its first position.
     position = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
     for batch in eval_batches(session.dataset, split, session.transform, session.loading):
         moved = batch.to(session.fabric.device)
-        first = predict(moved)
+        first = predictor.classes(moved)
         indices = [position[name] for name in batch.name]
-        for number in range(len(sets.sets)):
-            yield _turned(session, predict, moved, first, (number, indices))
+        for number in range(len(session.consistency.sets)):
+            angles = session.consistency.angles(number, indices).to(first.device)
+            yield _turned(session, predictor, moved, first, angles)._replace(number=number)
 
 
 def _turned(
-    session: Session, predict: Predict, batch: Batch, first: Tensor, turn: tuple[int, list[int]]
+    session: Session, predictor: Predictor, batch: Batch, first: Tensor, angles: Tensor
 ) -> Scenes:
-    views, angles = session.consistency.view, session.consistency.angles(*turn)
+    """The scenes of a batch with virtual second frames; `first` is the prediction of the first."""
+    views = session.consistency.view
     try:
-        warp = views.warp(angles.to(first.device), (batch.rgb.shape[2], batch.rgb.shape[3]))
+        warp = views.warp(angles, (batch.rgb.shape[2], batch.rgb.shape[3]))
     except InputError as error:
         raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
     turned = views.batch(batch, warp)
-    second = predict(turned)
+    second = predictor.classes(turned)
     at_label = warp.resized((first.shape[1], first.shape[2]))
-    aligned = Compared(
-        at_label.nearest(first, 0),
-        second,
-        turned.label,
-        at_label.inside() & (turned.label != IGNORE),
-    )
-    # As released: the first prediction stays where it is, and every pixel counts.
-    released = Compared(first, second, turned.label, None)
-    compared: dict[Protocol, Compared] = {"aligned": aligned, "released": released}
-    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first, turn[0])
+    valid = at_label.inside() & (turned.label != IGNORE)
+    compared: dict[Protocol, Compared] = {
+        "aligned": Compared(at_label.nearest(first, 0), second, turned.label, valid),
+        # As released: the first prediction stays where it is, and every pixel counts.
+        "released": Compared(first, second, turned.label, None),
+    }
+    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
 
 
-def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
+def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
     after = NextFrames(session.dataset)
     settings, transform = session.loading, session.transform
     pairs = zip_longest(
@@ -221,13 +209,10 @@ def _next(session: Session, predict: Predict, split: str) -> Iterator[Scenes]:
                 f"{after.dataset.root}."
             )
         moved = [each.to(session.fabric.device) for each in (batch, later)]
-        first, second = (predict(each).cpu() for each in moved)
+        first, second = (predictor.classes(each).cpu() for each in moved)
         followed, seen = _followed(after, batch.name, first)
-        valid = seen & (later.label != IGNORE)
-        compared: dict[Protocol, Compared] = {
-            "next": Compared(followed, second, later.label, valid)
-        }
-        yield Scenes(batch.name, compared, (moved[0].rgb, moved[1].rgb), first, 0)
+        maps = Compared(followed, second, later.label, seen & (later.label != IGNORE))
+        yield Scenes(batch.name, {"next": maps}, (moved[0].rgb, moved[1].rgb), first)
 
 
 def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[Tensor, Tensor]:
@@ -238,15 +223,6 @@ def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[T
     seen = rows >= 0
     flat = (rows * width + columns).clamp(min=0).flatten(1)
     return first.flatten(1).gather(1, flat).view_as(first), seen
-
-
-def _each(maps: Compared) -> Iterator[Compared]:
-    """The scenes of a batch, on the CPU."""
-    first, second, label = (each.cpu() for each in maps[:3])
-    valid = None if maps.valid is None else maps.valid.cpu()
-    for number in range(len(first)):
-        shown = None if valid is None else valid[number]
-        yield Compared(first[number], second[number], label[number], shown)
 
 
 def _example(scenes: Scenes, name: str, protocol: Protocol) -> PairExample:
@@ -273,29 +249,6 @@ def _picture(image: Tensor) -> NDArray[np.uint8]:
     return (255 * image).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
-def _counts(session: Session, split: str, protocol: Protocol, collected: Collected) -> Counts:
-    dataset = session.dataset
-    if not collected.by_name:
-        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
-    names = tuple(collected.by_name)
-    arrays = [
-        np.concatenate([by_set[number] for number in sorted(by_set)])
-        for by_set in collected.by_name.values()
-    ]
-    sets = len(collected.by_name[names[0]])
-    return Counts(
-        counts=np.stack(arrays).astype(np.int32),
-        names=names,
-        night=dataset.nights(names),
-        classes=dataset.classes,
-        partition=partition_name(protocol, sets, frames_mark(session, protocol)),
-        dataset=dataset.fingerprint(),
-        split=split,
-        unscored=dataset.unscored,
-        absent=session.regions.absent,
-    )
-
-
 def frames_mark(session: Session, protocol: Protocol) -> str:
     """Which second frames counts are of: "" for the published views, else six digits of others.
 
@@ -307,43 +260,26 @@ def frames_mark(session: Session, protocol: Protocol) -> str:
 
 
 def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
-    """TC and CA of every class and protocol; means over the scored classes.
-
-    Args:
-        found: counts by protocol, see `count_pairs`.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-    """
-    scores, right = (
-        {
-            protocol: OF_PAIRS[HEADLINES[protocol][place]](counts.by_region(), absent)
-            for protocol, counts in found.items()
-        }
-        for place in (0, 1)
-    )
+    """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
+    scores = {
+        protocol: [OF_PAIRS[name](counts.by_region(), absent) for name in HEADLINES[protocol]]
+        for protocol, counts in found.items()
+    }
     return ConsistencyTable(
         names=like.classes,
-        tc={protocol: tuple(map(float, values)) for protocol, values in scores.items()},
-        ca={protocol: tuple(map(float, values)) for protocol, values in right.items()},
-        mean_tc={each: float(class_mean(values, like.scored)) for each, values in scores.items()},
-        mean_ca={each: float(class_mean(values, like.scored)) for each, values in right.items()},
+        tc={protocol: tuple(map(float, tc)) for protocol, (tc, _) in scores.items()},
+        ca={protocol: tuple(map(float, ca)) for protocol, (_, ca) in scores.items()},
+        mean_tc={each: float(class_mean(tc, like.scored)) for each, (tc, _) in scores.items()},
+        mean_ca={each: float(class_mean(ca, like.scored)) for each, (_, ca) in scores.items()},
         unscored=like.unscored,
     )
 
 
 def consistency_values(table: ConsistencyTable) -> dict[str, float]:
     """The means as metrics of a run, as fractions: "TC/aligned", "CA/aligned", ..."""
-    means = {TC: table.mean_tc, CA: table.mean_ca}
     return {
-        consistency(score, protocol): by_protocol[protocol]
+        consistency(score, protocol): means[protocol]
         for protocol in table.tc
-        for score, by_protocol in means.items()
+        for score, means in ((TC, table.mean_tc), (CA, table.mean_ca))
     }
-
-
-def consistency_title(pairs: Pairs, label: str, dataset: str) -> str:
-    """Title of the table: what was measured, on which second frames."""
-    protocol, counts = next(iter(pairs.counts.items()))
-    frames = next(frames for frames, protocols in PROTOCOLS.items() if protocol in protocols)
-    views = counts.partition.partition("-")[2] or "published"
-    return f"Consistency of {label} ({dataset}, {counts.split}; {frames}: {views})"

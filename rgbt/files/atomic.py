@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 POLL_S = 0.1
 """Seconds between two attempts to take a lock."""
@@ -17,8 +18,8 @@ LEFT_BEHIND = re.compile(
     r"\.(?:last|last_previous|best)\.pt\.partial|\.counts_\w+\.npz\.partial"
     r"|\..+\.(\d+)|.+\.(\d+)\.partial"
 )
-"""Temporary names in a run folder, with the process that wrote them. Those without one are written
-by the holder of the run's lock alone."""
+"""Temporary names in a run folder, of earlier versions too, with the process that wrote them. Those
+without one are written by the holder of the run's lock alone."""
 
 STALE_S = 3600.0
 """Age above which a temporary file is nobody's any more, whoever began it."""
@@ -28,14 +29,21 @@ _held: set[int] = set()
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a machine that crashes, sees the old or the new content.
+    """Write a file so that a reader, or a machine that crashes, sees the old or the new content."""
+    with replacing(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write, which takes the place of `path` when the block ends without an exception.
 
     Temporary name in the same folder, fsync, rename, fsync of the folder.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with temporary.open("wb") as file:
-            file.write(content)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

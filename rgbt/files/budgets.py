@@ -7,7 +7,7 @@ import os
 import stat
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -100,7 +100,7 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
 
     Args:
         path: of the file, which exists.
-        form: such as ``list[str]`` or a TypedDict.
+        form: such as ``list[str]``, a TypedDict or a dataclass, of which an object is returned.
         advice: what to do with a damaged file.
 
     Raises:
@@ -119,7 +119,7 @@ def parse_json(text: bytes | str, form: Any) -> Any:
     """The value that `text` says.
 
     The seal of a mapping, and of each mapping of a list, is compared and removed. What has none is
-    of before there were any, so that it has no other keys than a TypedDict `form` names.
+    of before there were any, so that it has no other keys than `form` names.
 
     Raises:
         ValueError: no JSON in UTF-8, another type than `form`, or another check sum.
@@ -131,17 +131,22 @@ def parse_json(text: bytes | str, form: Any) -> Any:
         found = json.loads(text)
         values = found if isinstance(found, list) else [found]
         are_sealed = all([_unseal(value) for value in values])
-        _adapter(form).validate_python(found, strict=True)
+        value = found
+        if isinstance(form, type) and is_dataclass(form):  # made of JSON alone when strict
+            value = _adapter(form).validate_json(json.dumps(found), strict=True)
+        else:
+            _adapter(form).validate_python(found, strict=True)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     except pydantic.ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"]))
         raise ValueError(f"{where}: {first['msg']}".removeprefix(": ")) from error
-    strange = set(found) - set(form.__annotations__) if is_typeddict(form) else set()
+    has_keys = is_typeddict(form) or is_dataclass(form)
+    strange = set(found) - set(form.__annotations__) if has_keys else set()
     if strange and not are_sealed:
         raise ValueError(f"unknown key '{min(strange)}'")
-    return found
+    return value
 
 
 def _unseal(value: Any) -> bool:

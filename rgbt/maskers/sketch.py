@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,20 +23,11 @@ from rgbt.config.component import build
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.contract import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.types import AnyMasker
+from rgbt.types import AnyMasker, Example
 
 SAMPLES = 5
 DRAWS = 2000
 GREY = 127
-
-
-class DrawnExample(Protocol):
-    """What a transform returns (see `rgbt.transforms.example.Example`), as far as it is drawn."""
-
-    rgb: NDArray[np.uint8] | NDArray[np.float32]
-    thermal: NDArray[np.uint8] | NDArray[np.float32]
-    centre_yx: tuple[int, int]
-    name: str
 
 
 class Sketch(NamedTuple):
@@ -59,9 +50,7 @@ class Sketch(NamedTuple):
     thermal_frequency: NDArray[np.float64]
 
 
-def sketch(
-    masker: AnyMasker, examples: Iterable[DrawnExample], seed: int, draws: int = DRAWS
-) -> Sketch:
+def sketch(masker: AnyMasker, examples: Iterable[Example], seed: int, draws: int = DRAWS) -> Sketch:
     """Masked images of `examples`, and how often each cell is hidden.
 
     Args:

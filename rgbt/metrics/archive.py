@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, one_line
+from rgbt.files.atomic import replacing
 from rgbt.files.budgets import ARRAYS, check_array
 
 FORMAT, DIGEST = "format", "digest"
@@ -68,19 +69,12 @@ class Archive:
     optional: tuple[str, ...] = ()
 
     def save(self, path: Path, values: Mapping[str, Any]) -> None:
-        """Write arrays under a temporary name, then rename: never half a file."""
+        """Write arrays as one whole file."""
         arrays: dict[str, Any] = {FORMAT: np.array(self.mark)}
         arrays |= {name: np.asanyarray(value) for name, value in values.items()}
         arrays[DIGEST] = np.array(_digest(arrays))
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        try:
-            with partial.open("wb") as stream:
-                np.savez_compressed(stream, **arrays)
-                stream.flush()
-                os.fsync(stream.fileno())
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with replacing(path) as file:
+            np.savez_compressed(file, **arrays)
 
     def load(self, path: Path) -> dict[str, Any]:
         """What `save` wrote, by name; nothing in the file is executed.

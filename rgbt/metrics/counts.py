@@ -41,7 +41,6 @@ class Counts:
         partition: name of the regions, e.g. "ring5" (`rgbt.metrics.metric.Regions.name`); of pairs
             of frames protocol and number of sets, e.g. "aligned3".
         dataset: fingerprint of the data set.
-        split: split that the images come from.
         unscored: names of the classes that are left out of every mean over classes. Their pixels
             count as all others do: what is labelled so and predicted as another class is a false
             positive of that class, and the other way round a miss.
@@ -119,7 +118,7 @@ class Counts:
         return {part: self._take(indices.tolist()) for part, indices in chosen.items()}
 
     def save(self, path: Path) -> None:
-        """Write one compressed file under a temporary name, then rename: never half a file."""
+        """Write one compressed file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.array(self.night if self.night is not None else (), dtype=bool)

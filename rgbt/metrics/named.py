@@ -18,28 +18,7 @@ from rgbt.checks import InputError, nearest
 from rgbt.metrics import names, pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import (
-    Matrices,
-    Scored,
-    Scores,
-    class_mean,
-    f1,
-    iou,
-    miou,
-    pixel_accuracy,
-    precision,
-    recall,
-    variance,
-)
-
-MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
-    names.MIOU: miou,
-    names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
-    names.MPRECISION: lambda counts, absent, scored: class_mean(precision(counts, absent), scored),
-    names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
-    names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
-}
-"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
+from rgbt.metrics.scores import MEANS, Matrices, Scores, class_mean, iou, miou, recall, variance
 
 OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
     names.TC: pairs.tc,
@@ -59,7 +38,6 @@ class ParsedMetric:
     """A metric name, taken apart.
 
     Attributes:
-        metric: the name.
         part: "day", "night", or None for all images.
         score: a mean over classes, "Var", "IoU", "acc", or one of `OF_PAIRS`.
         class_name: of one class alone, or None.
@@ -162,10 +140,6 @@ def values(
 
 def check_kind(asked: ParsedMetric, partition: str) -> None:
     """Refuse a score of pairs of frames from counts of single ones, and the other way round.
-
-    Args:
-        asked: the score.
-        partition: of the counts.
 
     Raises:
         InputError: such counts do not have it.

@@ -42,10 +42,7 @@ Map: TypeAlias = "NDArray[np.integer] | Tensor"
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
     """What counts of pairs carry as their partition: "aligned3".
 
-    Args:
-        protocol: see the module docstring.
-        sets: S.
-        views: which virtual views; "" are the published ones: "aligned3-1c0ffe" are others.
+    `views` are virtual views: "" the published ones, "aligned3-1c0ffe" has others.
     """
     return f"{protocol}{sets}{_dashed(views)}"
 

@@ -27,12 +27,7 @@ def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> Reg
     """Strips of equal width (``vertical``, left to right) or height (top to bottom).
 
     Pixel n of a side of length N lies in region ``floor(n R / N)``, so that widths differ by at
-    most one pixel. Source: SpatialSeg, Fig. 2; the release has no strips.
-
-    Args:
-        image_hw: (H, W) pixels.
-        regions: R.
-        vertical: whether the cuts are vertical.
+    most one pixel; R is `regions`. Source: SpatialSeg, Fig. 2; the release has no strips.
 
     Raises:
         InputError: fewer pixels across than regions.

@@ -31,7 +31,6 @@ from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
-ClassScore = Callable[[Matrices, Absent], Scores]
 Scored = NDArray[np.bool_] | None
 """(K,): which classes means are over; None: all."""
 
@@ -40,13 +39,7 @@ def iou(counts: Matrices, absent: Absent) -> Scores:
     """Intersection over union of each class: ``TP / (TP + FP + FN)``.
 
     Source: SpatialSeg, Eq. 18; CRM, RTFNet and Temporal releases.
-
-    Args:
-        counts: (..., K, K).
-        absent: see the module docstring.
-
-    Returns:
-        (..., K).
+    Shapes: (..., K, K) -> (..., K).
     """
     right, labelled, predicted = _sums(counts)
     return ratio(right, labelled + predicted - right, absent)
@@ -75,27 +68,15 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
 
 
 def known_mean(scores: Scores) -> Scores:
-    """Mean over the last dimension without NaN; NaN where nothing is left.
+    """Mean over the last dimension, of anything but classes, without NaN: (..., X) -> (...).
 
-    Args:
-        scores: (..., X), of anything but classes.
-
-    Returns:
-        (...).
+    NaN where nothing is left.
     """
     return _mean(scores, ~np.isnan(scores))
 
 
 def class_mean(scores: Scores, scored: Scored) -> Scores:
-    """Mean over the scored classes without NaN; NaN where nothing is left.
-
-    Args:
-        scores: (..., K).
-        scored: (K,), which classes it is over; None: all.
-
-    Returns:
-        (...).
-    """
+    """Mean over the scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
     known = ~np.isnan(scores)
     return _mean(scores, known if scored is None else known & scored)
 
@@ -104,14 +85,7 @@ def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
     """Mean over the scored classes of `iou`; the background is one unless it is left out.
 
     For the mIoU of the tables pass the counts of the whole image, regions summed.
-
-    Args:
-        counts: (..., K, K).
-        absent: see the module docstring.
-        scored: (K,), which classes it is over; None: all.
-
-    Returns:
-        (...).
+    Shapes: (..., K, K) -> (...).
     """
     return class_mean(iou(counts, absent), scored)
 
@@ -137,14 +111,20 @@ def variance(region_scores: ArrayLike) -> Scores:
 def pixel_accuracy(counts: Matrices) -> Scores:
     """Share of the valid pixels, of unscored classes too, that are right; NaN without any.
 
-    Args:
-        counts: (..., K, K).
-
-    Returns:
-        (...).
+    Shapes: (..., K, K) -> (...).
     """
     right, labelled, _ = _sums(counts)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
+
+
+MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
+    names.MIOU: miou,
+    names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
+    names.MPRECISION: lambda counts, absent, scored: class_mean(precision(counts, absent), scored),
+    names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
+    names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
+}
+"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
 
 
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
@@ -154,22 +134,13 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     of each class (unscored ones too); mIoU and variance again for day and for night where the data
     set tells them apart.
 
-    Args:
-        counts: of one split, one image or more.
-        absent: see the module docstring.
-
     Returns:
         name -> fraction, or squared percent points for the variance. NaN: nothing to score.
     """
     whole, scored = counts.whole(), counts.scored
     by_class = iou(whole, absent)
     result = _mean_and_variance(counts, absent)
-    result |= {
-        names.MACC: float(class_mean(recall(whole, absent), scored)),
-        names.MPRECISION: float(class_mean(precision(whole, absent), scored)),
-        names.MF1: float(class_mean(f1(whole, absent), scored)),
-        names.PIXEL_ACCURACY: float(pixel_accuracy(whole)),
-    }
+    result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
     for number, score in enumerate(miou(counts.by_region(), absent, scored), start=1):
         result[names.region(number)] = float(score)
     for name, score in zip(counts.classes, by_class, strict=True):

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten, with_pixels
 from rgbt.spec.run_spec import NODES, RunSpec
-from rgbt.tracking.run_folder import Description
+from rgbt.tracking.run_files import Description
 
 TAGS = "RGBT_TAGS"
 """Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it."""

@@ -73,22 +73,27 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
     Raises:
         Exception: whatever MLflow raises when the store cannot be used.
     """
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
     check_reachable(uri)
-    # Takes seconds, hence not at the top.
-    from mlflow import MlflowClient
-
-    for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.WARNING)
     with _alone(uri):
-        client = MlflowClient(tracking_uri=uri)
+        client = quiet_client(uri)
         found = _experiment(client, experiment, artifact_uri)
     tags = {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}
     for name, value in tags.items():
         if found.tags.get(name) != value:
             client.set_experiment_tag(found.experiment_id, name, value)
     return MlflowStore(client, str(found.experiment_id))
+
+
+def quiet_client(uri: str) -> Any:
+    """MLflow's client, without its messages on the way."""
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    # Takes seconds, hence not at the top.
+    from mlflow import MlflowClient
+
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    return MlflowClient(tracking_uri=uri)
 
 
 def check_reachable(uri: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.replaced_runs import shown_description, shown_key
+from rgbt.tracking.run_files import read_provenance
 from rgbt.tracking.run_folder import RunFolder
 
 NAME_LENGTH = 250
@@ -69,6 +70,6 @@ def short_name(name: str) -> str:
 
 def _start_time(folder: RunFolder) -> int:
     """Milliseconds since 1970 at which the first process of the run began."""
-    first = (folder.provenance() or [{}])[0].get("started")
+    first = (read_provenance(folder.path / "provenance.json") or [{}])[0].get("started")
     seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
     return round(1000 * seconds)

@@ -43,7 +43,8 @@ def pages_of(uri: str, run_id: str) -> Pages:
     """
     if uri.startswith(("http://", "https://")):
         return Pages(without_passwords(uri.rstrip("/")), None)
-    for port in sorted(_mlflow_ports()):
+    # The MLflow servers of this machine, read from the running commands (Linux).
+    for port in sorted({_port_of(words) for words in _commands() if _is_server(words)}):
         address = f"http://{HOST}:{port}"
         if _shows(address, run_id):
             return Pages(address, None)
@@ -71,11 +72,6 @@ def python_command() -> str:
     here, program = Path.cwd(), Path(sys.executable)
     program = program.relative_to(here) if program.is_relative_to(here) else program
     return shlex.quote(str(program))
-
-
-def _mlflow_ports() -> set[int]:
-    """Ports of the MLflow servers of this machine, read from the running commands (Linux)."""
-    return {_port_of(words) for words in _commands() if _is_server(words)}
 
 
 def _commands() -> Iterator[list[str]]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,38 +19,19 @@ from rgbt.tracking.mlflow_server import pages_of, python_command
 from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, upload, write_upload_state
 from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
 from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.run_folder import Description, RunFolder
-from rgbt.tracking.tracker import Link, Status
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
+from rgbt.tracking.tracker import Link, Status, Tracking
 
 PAUSE_S = 300.0
 """Seconds a running training leaves a store alone after it failed."""
 
 
-class NoTracking:
+class NoTracking(Tracking):
     """Keeps the run folder alone; `python -m rgbt.tracking.sync` can send it later."""
 
-    def start(
-        self,
-        folder: RunFolder,
-        run_name: str,
-        tags: Mapping[str, str],
-        params: Mapping[str, object],
-    ) -> None:
-        """Write the description that a later sync needs."""
-        folder.describe(described(run_name, tags, params))
 
-    def update(self) -> None:
-        """Nothing: the folder holds it already."""
-
-    def finish(self, status: Status) -> None:
-        """Nothing: the folder holds it already."""
-
-    def links(self) -> list[Link]:
-        """None: there is the folder alone."""
-        return []
-
-
-class MlflowTracking:
+class MlflowTracking(Tracking):
     """Shows runs in MLflow.
 
     Args:
@@ -69,24 +49,18 @@ class MlflowTracking:
         root = Path(runs_dir).resolve()
         self.uri = f"sqlite:///{root / 'mlflow.db'}" if uri is None else uri
         is_server = self.uri.startswith(("http://", "https://"))
-        default_place = None if is_server else (root / "mlartifacts").as_uri()
-        self.artifact_uri = default_place if artifact_uri is None else artifact_uri
+        default_uri = None if is_server else (root / "mlartifacts").as_uri()
+        self.artifact_uri = default_uri if artifact_uri is None else artifact_uri
         self.experiment = experiment
         self._store: MlflowStore | None = None
         self._folder: RunFolder | None = None
         self._quiet_until = 0.0
         self._warned = False
 
-    def start(
-        self,
-        folder: RunFolder,
-        run_name: str,
-        tags: Mapping[str, str],
-        params: Mapping[str, object],
-    ) -> None:
+    def start(self, folder: RunFolder, description: Description) -> None:
         """Begin the MLflow run of `folder`, or continue the one it already has."""
         self._folder = folder
-        folder.describe(described(run_name, tags, params))
+        folder.describe(description)
         write_upload_state(folder, self._sent(folder))
         self.update()
 
@@ -171,15 +145,6 @@ class MlflowTracking:
             f"({type(error).__name__}: {without_passwords(reason)}). The run continues; "
             f"`{sync_command(self._folder)}` sends it later.\n"
         )
-
-
-def described(run_name: str, tags: Mapping[str, str], params: Mapping[str, object]) -> Description:
-    """The description of a run, all values as text."""
-    return Description(
-        name=run_name,
-        tags={name: str(value) for name, value in tags.items()},
-        params={name: str(value) for name, value in params.items()},
-    )
 
 
 def sync_command(folder: RunFolder) -> str:

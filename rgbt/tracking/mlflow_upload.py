@@ -19,13 +19,13 @@ from typing import Any
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
+from rgbt.metrics.names import shown
 from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
-from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced_runs import shown_description
-from rgbt.tracking.run_files import SentForm
+from rgbt.tracking.run_files import read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
-from rgbt.tracking.tables import ResultTables, result_grids
+from rgbt.tracking.tables import ResultTables, result_grids, without_nan
 from rgbt.tracking.tracker import Status
 
 PARAM_LENGTH = 500
@@ -54,7 +54,6 @@ class UploadState:
 
     Attributes:
         uri: the store, passwords hidden.
-        experiment: name of the experiment.
         artifact_uri: where a new experiment keeps files, or None.
         experiment_id: "" before the first contact.
         run_id: "" before the first contact.
@@ -83,7 +82,8 @@ def read_upload_state(folder: RunFolder) -> UploadState | None:
     """
     path = folder.path / "mlflow.json"
     advice = "remove it: the MLflow run is then found by its key"
-    return UploadState(**read_json(path, SentForm, advice)) if path.exists() else None
+    found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
+    return found
 
 
 def write_upload_state(folder: RunFolder, sent: UploadState) -> None:
@@ -102,13 +102,14 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         status: the state to show.
     """
     known_params, seen, name = _find_run(store, folder, sent)
-    tables = _tables(folder)
-    lines = [line for line in folder.lines() if line.step > sent.steps.get(line.kind, -1)]
+    tables = read_tables(folder.path)
+    every = folder.lines()
+    lines = [line for line in every if line.step > sent.steps.get(line.kind, -1)]
     metrics = list(_metrics(lines))
     if tables is not None and tables.split == "test" and not sent.profile:
-        metrics += _profile(tables, folder)
+        metrics += _profile(tables, every)
         sent.profile = True
-    later = _later(folder, sent)
+    later = _later(folder, every, sent)
     metrics += later.values()
     _send(store, sent, (metrics, _params(folder, known_params), _tags(folder, tables)))
     sent.steps |= {line.kind: line.step for line in lines}
@@ -171,17 +172,16 @@ def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
                 yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
 
 
-def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
+def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dict[str, Any]:
     """Scores of pairs of frames in the result that no line holds and that were not sent yet.
 
     Those of the selection split, and those that `rgbt.consistency` added to a finished run.
     """
     from mlflow.entities import Metric
 
-    result = folder.result()
+    result = read_result(folder.path)
     if result is None:
         return {}
-    lines = folder.lines()
     held = {f"{line.kind}/{name}" for line in lines if line.kind == "test" for name in line.values}
     found = {}
     for kind in ("val", "test"):
@@ -196,11 +196,11 @@ def _later(folder: RunFolder, sent: UploadState) -> dict[str, Any]:
     return found
 
 
-def _profile(tables: ResultTables, folder: RunFolder) -> list[Any]:
+def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
     """IoU over the regions as a line: the step is the region's number."""
     from mlflow.entities import Metric
 
-    times = [line.time for line in folder.lines()] or [time.time()]
+    times = [line.time for line in lines] or [time.time()]
     return [
         Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * times[-1]), region)
         for region, iou in enumerate(tables.regions.region_ious, start=1)
@@ -221,14 +221,14 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
     from mlflow.entities import RunTag
 
     description = shown_description(folder)
-    first = (folder.provenance() or [{}])[0]
+    first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
         "mlflow.source.type": "LOCAL",
         "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
         "rgbt.command": first.get("command", ""),
         "mlflow.source.git.commit": first.get("git_commit") or "",
-        "rgbt.dataset": (folder.result() or {}).get("dataset", ""),
+        "rgbt.dataset": (read_result(folder.path) or {}).get("dataset", ""),
         **identity(folder),
         **({} if description is None else description.tags),
     }
@@ -236,11 +236,6 @@ def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
         tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
     return [RunTag(name, value[:5000]) for name, value in tags.items() if value]
-
-
-def _tables(folder: RunFolder) -> ResultTables | None:
-    plain = folder.tables()
-    return None if plain is None else ResultTables.from_json(plain)
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
@@ -265,12 +260,8 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
     for name, by_region in zip(classes.names, classes.region_ious, strict=True):
         pairs = zip(tables.region_names, by_region, strict=True)
         rows += [(f"{name} / {region}", 100 * iou, math.nan) for region, iou in pairs]
-    data = [[name, *(_two_decimals(value) for value in values)] for name, *values in rows]
+    data = [[name, *without_nan([round(v, 2) for v in values])] for name, *values in rows]
     return {"columns": ["score", "IoU %", "accuracy %"], "data": data}
-
-
-def _two_decimals(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 2)
 
 
 def _send_table(store: MlflowStore, sent: UploadState, tables: ResultTables | None) -> None:

@@ -28,7 +28,6 @@ class PairExample:
     """Two frames of a scene and what was predicted of them.
 
     Attributes:
-        name: shown beside the row.
         first_rgb: (H, W, 3) uint8, the first frame.
         first: (H, W) uint8, its predicted classes.
         second_rgb: (H, W, 3) uint8, the second frame.

@@ -38,7 +38,6 @@ class PanelExample:
     """One image of a qualitative panel.
 
     Attributes:
-        name: shown beside the row.
         rgb: (H, W, 3) uint8.
         thermal: (H, W) uint8.
         label: (H', W') uint8, class index or 255.
@@ -180,7 +179,6 @@ class RegionHeat:
     """What the region heat map shows.
 
     Attributes:
-        title: of the picture.
         region_map: (H, W) integers in 0..R-1, region of every pixel.
         ious: R fractions; NaN regions stay white.
     """

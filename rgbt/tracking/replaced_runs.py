@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, read_description, read_result
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Tracking
 
@@ -28,23 +29,23 @@ def set_aside(folder: RunFolder) -> RunFolder | None:
         InputError: a process trains there.
     """
     with folder.lock():
-        if folder.result() is None:
+        if read_result(folder.path) is None:
             return None
         number = 1
-        while _place(folder, number).exists():
+        while _replaced_path(folder, number).exists():
             number += 1
-        _place(folder, number).parent.mkdir(exist_ok=True)
-        folder.path.rename(_place(folder, number))
-    return RunFolder(_place(folder, number))
+        _replaced_path(folder, number).parent.mkdir(exist_ok=True)
+        folder.path.rename(_replaced_path(folder, number))
+    return RunFolder(_replaced_path(folder, number))
 
 
 def replace_finished(folder: RunFolder, tracking: Tracking) -> None:
     """Set a finished run aside and show it so in its tracker."""
     kept = set_aside(folder)
-    known = None if kept is None else kept.description()
+    known = None if kept is None else read_description(kept.path)
     if kept is None or known is None:
         return
-    tracking.start(kept, known.name, known.tags, known.params)
+    tracking.start(kept, known)
     tracking.finish("FINISHED")
     info(f"the finished run was moved to {kept.path}; run={kept.path} opens it.")
 
@@ -62,7 +63,7 @@ def shown_key(folder: RunFolder) -> str:
 
 def shown_description(folder: RunFolder) -> Description | None:
     """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
-    known = folder.description()
+    known = read_description(folder.path)
     if known is None or not _is_replaced(folder):
         return known
     tags = {
@@ -78,5 +79,5 @@ def _is_replaced(folder: RunFolder) -> bool:
     return folder.path.parent.name == REPLACED
 
 
-def _place(folder: RunFolder, number: int) -> Path:
+def _replaced_path(folder: RunFolder, number: int) -> Path:
     return folder.path.parent / REPLACED / f"{folder.path.name}-{number}"

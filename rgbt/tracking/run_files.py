@@ -6,12 +6,15 @@ refused and gives no other value. Files of before there was one are read by thei
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Required
+from typing import Any, Literal
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
+from rgbt.checks import InputError, one_line
 from rgbt.files.budgets import read_json
+from rgbt.tracking.tables import ResultTables
 
 Kind = Literal["train", "val", "test"]
 
@@ -27,8 +30,9 @@ class LineForm(TypedDict):
     values: dict[str, float | None]
 
 
-class DescriptionForm(TypedDict):
-    """``run.json`` (`rgbt.tracking.run_folder.Description`)."""
+@dataclass(frozen=True)
+class Description:
+    """``run.json``: how a tracker shows the run."""
 
     name: str
     tags: dict[str, str]
@@ -57,18 +61,9 @@ class ResultForm(TypedDict, total=False):
     test: dict[str, float | None]
 
 
-class SentForm(TypedDict, total=False):
-    """``mlflow.json`` (`rgbt.tracking.mlflow_upload.UploadState`)."""
-
-    uri: Required[str]
-    experiment: Required[str]
-    artifact_uri: str | None
-    experiment_id: str
-    run_id: str
-    steps: dict[str, int]
-    files: dict[str, str]
-    profile: bool
-    later: list[str]
+def counts_name(split: str) -> str:
+    """Name of the file of the counts that a run ended with."""
+    return f"counts_{split}.npz"
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:
@@ -77,36 +72,40 @@ def read_result(folder: Path) -> dict[str, Any] | None:
     Raises:
         InputError: the file is damaged.
     """
-    return _read(folder / "result.json", ResultForm)
+    found: dict[str, Any] | None = _read(folder / "result.json", ResultForm)
+    return found
 
 
-def read_description(folder: Path) -> dict[str, Any] | None:
+def read_description(folder: Path) -> Description | None:
     """``run.json``; None: there is none. InputError where it is damaged."""
-    return _read(folder / "run.json", DescriptionForm)
+    found: Description | None = _read(folder / "run.json", Description)
+    return found
 
 
-def read_marker(folder: Path) -> dict[str, Any] | None:
+def read_marker(folder: Path) -> MarkerForm | None:
     """``dataset.json``; None: there is none. InputError where it is damaged."""
-    return _read(folder / "dataset.json", MarkerForm)
+    found: MarkerForm | None = _read(folder / "dataset.json", MarkerForm)
+    return found
 
 
-def read_tables(folder: Path) -> dict[str, Any] | None:
+def read_tables(folder: Path) -> ResultTables | None:
     """``tables.json``; None: there is none. InputError where it is damaged."""
-    return _read(folder / "tables.json", dict[str, Any])
+    path = folder / "tables.json"
+    plain = _read(path, dict[str, Any])
+    try:
+        return None if plain is None else ResultTables.from_json(plain)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({one_line(error)}); {ADVICE}.") from error
 
 
 def read_provenance(file: Path) -> list[dict[str, Any]]:
-    """Entries of a ``provenance.json``, one per process; [] where there is no such file.
+    """Entries of a ``provenance.json``, one per process, the first one first; [] without a file.
 
     Raises:
         InputError: the file is damaged.
     """
-    found: list[dict[str, Any]] = []
-    if file.exists():
-        found = read_json(file, list[dict[str, Any]], ADVICE)
-    return found
+    return _read(file, list[dict[str, Any]]) or []
 
 
-def _read(path: Path, form: Any) -> dict[str, Any] | None:
-    found: dict[str, Any] | None = read_json(path, form, ADVICE) if path.exists() else None
-    return found
+def _read(path: Path, form: Any) -> Any:
+    return read_json(path, form, ADVICE) if path.exists() else None

@@ -35,15 +35,8 @@ from typing import Any, get_args
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
 from rgbt.files.budgets import TEXT, parse_json, read_bytes, read_json, sealed
-from rgbt.tracking.run_files import (
-    Kind,
-    LineForm,
-    read_description,
-    read_marker,
-    read_provenance,
-    read_result,
-    read_tables,
-)
+from rgbt.tracking.run_files import Description, Kind, LineForm, read_provenance
+from rgbt.tracking.tables import ResultTables
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -69,15 +62,6 @@ class MetricLine:
 
 
 @dataclass(frozen=True)
-class Description:
-    """How a tracker shows the run: its name, tags (text) and parameters (text)."""
-
-    name: str
-    tags: dict[str, str]
-    params: dict[str, str]
-
-
-@dataclass(frozen=True)
 class Truncation:
     """What `RunFolder.truncate_after` found.
 
@@ -91,7 +75,9 @@ class Truncation:
 
 
 class RunFolder:
-    """One run's folder; made where it does not exist.
+    """Writes one run's folder, which is made where it does not exist.
+
+    `rgbt.tracking.run_files` reads the files.
 
     Args:
         path: the folder, usually ``runs/<config key>``.
@@ -140,7 +126,7 @@ class RunFolder:
 
     def add_provenance(self, entry: Mapping[str, Any]) -> None:
         """Append one process's `provenance()`; its diff becomes a file that can be applied."""
-        before = self.provenance()
+        before = self._provenance()
         diff = entry.get("diff") or ""
         name = f"diff_{len(before) + 1}.patch" if before else "diff.patch"
         if diff:
@@ -148,14 +134,13 @@ class RunFolder:
         plain = {**entry, "diff": name if diff else None}
         self._write_provenance([*before, plain])
 
-    def provenance(self) -> list[dict[str, Any]]:
-        """Entries of all processes that worked on this run, first one first."""
-        return read_provenance(self.path / "provenance.json")
-
     def begin_at(self, step: int) -> None:
-        """Note the step at which the last process of `provenance` began."""
-        entries = self.provenance()
+        """Note the step at which the last process of ``provenance.json`` began."""
+        entries = self._provenance()
         self._write_provenance([*entries[:-1], {**entries[-1], "from_step": step}])
+
+    def _provenance(self) -> list[dict[str, Any]]:
+        return read_provenance(self.path / "provenance.json")
 
     def _write_provenance(self, entries: Sequence[Mapping[str, Any]]) -> None:
         self._write_json("provenance.json", [sealed(each) for each in entries])
@@ -163,11 +148,6 @@ class RunFolder:
     def describe(self, description: Description) -> None:
         """Write how a tracker shall show this run."""
         self._write_json("run.json", sealed(vars(description)))
-
-    def description(self) -> Description | None:
-        """What `describe` wrote, or None."""
-        plain = read_description(self.path)
-        return None if plain is None else Description(**plain)
 
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
         """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
@@ -243,39 +223,23 @@ class RunFolder:
             found.setdefault((line.kind, line.step), line)
         return list(found.values()), damaged
 
-    def counts_path(self, split: str) -> Path:
-        """Path of the counts of a split."""
-        return self.path / f"counts_{split}.npz"
-
     def figure_path(self, name: str) -> Path:
         """Path of the picture `name`; its folder is made."""
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
         return folder / f"{name}.png"
 
-    def write_tables(self, tables: Mapping[str, Any]) -> None:
-        """Write the tables (`ResultTables.to_json`)."""
-        self._write_json("tables.json", sealed(tables))
-
-    def tables(self) -> dict[str, Any] | None:
-        """What `write_tables` wrote last, or None."""
-        return read_tables(self.path)
+    def write_tables(self, tables: ResultTables) -> None:
+        """Write the tables."""
+        self._write_json("tables.json", sealed(tables.to_json()))
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Mark the run as finished; everything else must be written before."""
         self._write_json("result.json", sealed(result))
 
-    def result(self) -> dict[str, Any] | None:
-        """What the finished run returned; None while it is not finished."""
-        return read_result(self.path)
-
     def mark(self, names: str, files: str) -> None:
         """Write ``dataset.json``: digests of the names of the images and of the files."""
         self._write_json("dataset.json", sealed({"names": names, "files": files}))
-
-    def marker(self) -> dict[str, Any] | None:
-        """What `mark` wrote: "names" and "files"; None before."""
-        return read_marker(self.path)
 
     def _write_json(self, name: str, value: Any) -> None:
         write_atomic(self.path / name, (json.dumps(value, indent=1) + "\n").encode())

@@ -11,19 +11,17 @@ from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.names import in_percent
 from rgbt.tracking.other_code import other_code
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.provenance import commit_of
 from rgbt.tracking.run_files import (
     ADVICE,
+    Description,
+    counts_name,
     read_description,
-    read_marker,
     read_provenance,
     read_result,
-    read_tables,
 )
-from rgbt.tracking.run_folder import Description
-from rgbt.tracking.tables import ResultTables
 
 CHECKPOINT = "best.pt"
 """The network that evaluations are made with; other machines do not get it."""
@@ -71,44 +69,14 @@ class RunResult:
         return str(self.result["dataset"])
 
     @property
-    def marker(self) -> dict[str, Any] | None:
-        """``dataset.json``: digests of the names of the images and of the files; or None."""
-        return read_marker(self.folder)
-
-    @property
     def description(self) -> Description:
         """Name, tags and parameters; empty where the folder has no ``run.json``."""
-        plain = read_description(self.folder)
-        return Description("", {}, {}) if plain is None else Description(**plain)
-
-    @property
-    def name(self) -> str:
-        """How the run is shown."""
-        return self.description.name
+        return read_description(self.folder) or Description("", {}, {})
 
     @property
     def tags(self) -> dict[str, str]:
         """Tags by name."""
         return self.description.tags
-
-    @property
-    def params(self) -> dict[str, str]:
-        """Parameters by dotted key, as text."""
-        return self.description.params
-
-    @property
-    def group(self) -> str:
-        """What all seeds of its configuration share, as the run wrote it; "" without one.
-
-        `rgbt.spec.naming.group_of` writes the group of an older run as it is written now.
-        """
-        return self.tags.get("rgbt.group", "")
-
-    @property
-    def seed(self) -> int | None:
-        """Its seed, or None."""
-        seed = self.tags.get("rgbt.seed", "")
-        return int(seed) if seed else None
 
     @property
     def provenance(self) -> list[dict[str, Any]]:
@@ -125,12 +93,6 @@ class RunResult:
         """The code that made it, in words, where it is not that of this process; else None."""
         return other_code(self.folder)
 
-    @property
-    def tables(self) -> ResultTables | None:
-        """Its tables by region and class, or None."""
-        plain = read_tables(self.folder)
-        return None if plain is None else ResultTables.from_json(plain)
-
     def scores(self) -> dict[str, float]:
         """Scores by "val/..." and "test/..." names, as MLflow shows them but not rounded."""
         result = self.result
@@ -143,7 +105,7 @@ class RunResult:
 
     def counts_path(self, split: str = "test") -> Path:
         """Path of the counts that the run itself ended with."""
-        return self.folder / f"counts_{split}.npz"
+        return self.folder / counts_name(split)
 
     def counts(self, path: str = "counts_test.npz") -> Counts:
         """Counts of an evaluation.

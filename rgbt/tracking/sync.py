@@ -20,6 +20,7 @@ from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.provenance import HIDDEN, without_passwords
 from rgbt.tracking.replaced_runs import REPLACED, runs_dir_of
+from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import RunFolder, runs_in
 from rgbt.tracking.tracker import Status
 
@@ -89,7 +90,7 @@ def tracking_of(folder: RunFolder, options: Options) -> MlflowTracking:
 
 def status_of(folder: RunFolder) -> Status:
     """Finished, running (a process holds the folder), or killed."""
-    if folder.result() is not None:
+    if read_result(folder.path) is not None:
         return "FINISHED"
     return "RUNNING" if folder.is_locked() else "KILLED"
 

@@ -74,18 +74,6 @@ class ConsistencyTable:
     mean_ca: Mapping[str, float]
     unscored: tuple[str, ...] = ()
 
-    @classmethod
-    def from_json(cls, plain: Mapping[str, Any]) -> ConsistencyTable:
-        """The inverse of `dataclasses.asdict` with None for NaN."""
-        return cls(
-            names=tuple(plain["names"]),
-            tc={protocol: _numbers(values) for protocol, values in plain["tc"].items()},
-            ca={protocol: _numbers(values) for protocol, values in plain["ca"].items()},
-            mean_tc={protocol: _number(value) for protocol, value in plain["mean_tc"].items()},
-            mean_ca={protocol: _number(value) for protocol, value in plain["mean_ca"].items()},
-            unscored=tuple(plain.get("unscored", ())),
-        )
-
 
 @dataclass(frozen=True)
 class ResultTables:
@@ -93,10 +81,7 @@ class ResultTables:
 
     Attributes:
         split: "val" or "test".
-        step: optimiser steps done.
         region_names: R names, e.g. "ring_1", the innermost ring.
-        regions: the per-region row.
-        classes: the per-class table.
         consistency: of two frames, where the run measured it.
     """
 
@@ -108,35 +93,18 @@ class ResultTables:
     consistency: ConsistencyTable | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for `RunFolder.write_tables`; NaN becomes None."""
+        """Plain values; NaN becomes None."""
         return dict(without_nan(asdict(self)))
 
     @classmethod
     def from_json(cls, plain: Mapping[str, Any]) -> ResultTables:
         """The inverse of `to_json`."""
-        regions, classes = plain["regions"], plain["classes"]
-        consistency = plain.get("consistency")
-        return cls(
-            split=plain["split"],
-            step=plain["step"],
-            region_names=tuple(plain["region_names"]),
-            regions=RegionTable(
-                row_label=regions["row_label"],
-                region_ious=_numbers(regions["region_ious"]),
-                miou=_number(regions["miou"]),
-                variance=_number(regions["variance"]),
-            ),
-            classes=ClassTable(
-                names=tuple(classes["names"]),
-                ious=_numbers(classes["ious"]),
-                accuracies=_numbers(classes["accuracies"]),
-                region_ious=tuple(_numbers(row) for row in classes["region_ious"]),
-                subset_mious={k: _number(v) for k, v in classes["subset_mious"].items()},
-                unscored=tuple(classes.get("unscored", ())),
-                notes=tuple(classes.get("notes", ())),
-            ),
-            consistency=None if consistency is None else ConsistencyTable.from_json(consistency),
-        )
+        values = _with_nan(plain)
+        values["regions"] = RegionTable(**values["regions"])
+        values["classes"] = ClassTable(**values["classes"])
+        is_consistent = plain.get("consistency") is not None
+        values["consistency"] = ConsistencyTable(**values["consistency"]) if is_consistent else None
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -255,9 +223,10 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _numbers(values: Sequence[float | None]) -> tuple[float, ...]:
-    return tuple(_number(value) for value in values)
+def _with_nan(value: Any) -> Any:
+    """The inverse of `without_nan`, with tuples for lists."""
+    if isinstance(value, dict):
+        return {key: _with_nan(child) for key, child in value.items()}
+    if isinstance(value, list):
+        return tuple(map(_with_nan, value))
+    return math.nan if value is None else value

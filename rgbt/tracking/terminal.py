@@ -138,16 +138,6 @@ def line_width() -> int:
     return Console().width if sys.stdout.isatty() else WIDTH
 
 
-def final_lines(folder: Path, links: Sequence[tuple[str, str]]) -> Text:
-    """Where the run is, one "name  path" pair per line.
-
-    Args:
-        folder: the run folder.
-        links: what the tracker answered (`links()`): (name, command or address).
-    """
-    return path_lines([("run folder", str(folder)), *links])
-
-
 def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
     """Paths, commands and addresses, one "name  path" pair per line."""
     width = max(len(name) for name, _ in paths)
@@ -157,8 +147,9 @@ def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
 def result_view(
     tables: ResultTables, folder: Path, links: Sequence[tuple[str, str]]
 ) -> RenderableType:
-    """Tables and paths of a finished run."""
-    return Group(*map(rich_table, result_grids(tables)), final_lines(folder, links))
+    """Tables and paths of a finished run; `links` as its tracker answered."""
+    paths = path_lines([("run folder", str(folder)), *links])
+    return Group(*map(rich_table, result_grids(tables)), paths)
 
 
 def print_rich(renderable: RenderableType) -> None:

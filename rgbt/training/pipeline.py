@@ -18,7 +18,7 @@ from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
 from rgbt.config.component import target_names
 from rgbt.data.pseudo_labels import MANIFEST
-from rgbt.evaluation.pseudo_labels import Labelling, teacher_of, write_pseudo_labels
+from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
@@ -145,7 +145,7 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
     write_pseudo_labels(
         session,
-        teacher_of(teacher.run.folder.name, session.model),
+        teacher.run.folder.name,
         EvaluationRequest(split=domain.split, view=domain.teacher_view),
         Labelling(domain.threshold),
         folder,

@@ -36,7 +36,15 @@ from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import PanelExample, RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import (
+    Description,
+    counts_name,
+    read_description,
+    read_marker,
+    read_result,
+    read_tables,
+)
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
 from rgbt.tracking.terminal import info, print_rich, result_view, warn
 from rgbt.tracking.tracker import Tracking
@@ -83,21 +91,22 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
 
 
 def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
-    tables = folder.tables()
+    tables = read_tables(folder.path)
     assert tables is not None, "a finished run has its tables"
     heads = domains.heads_in_words(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
-    print_rich(result_view(ResultTables.from_json(tables), folder.path, links))
+    print_rich(result_view(tables, folder.path, links))
 
 
 def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
-    known = folder.description()
+    known = read_description(folder.path)
     assert known is not None, "a finished run has its description"
     info(f"{requested.name} is finished; showing its result. Another seed is another run: seed=1.")
     # A point of a grid may be the default of an experiment: the longer name says what it varies.
     lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
     shown = requested if lengths[0] > lengths[1] else known
-    tracking.start(folder, shown.name, {**known.tags, **shown.tags}, known.params)
+    merged = Description(shown.name, {**known.tags, **shown.tags}, known.params)
+    tracking.start(folder, merged)
     tracking.finish("FINISHED")
 
 
@@ -105,7 +114,7 @@ def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
     """Warn where a finished run of the same key was made on another copy of the data set."""
     if "root" not in spec.dataset.plain:
         return  # drawn from its settings alone, which are in the key
-    result = folder.result()
+    result = read_result(folder.path)
     try:
         now = spec.dataset.build().fingerprint()
     except InputError:
@@ -141,10 +150,9 @@ class Run:
         started = time.time()
         session = self.setup.session
         self._claim(session)
-        shown = self.description
-        tags = {**shown.tags, "rgbt.key": self.folder.path.name}
+        tags = {**self.description.tags, "rgbt.key": self.folder.path.name}
         try:
-            self.tracking.start(self.folder, shown.name, tags, shown.params)
+            self.tracking.start(self.folder, replace(self.description, tags=tags))
             state = self._train(session)
             checkpoints = Checkpoints(self.folder.path)
             best = checkpoints.load_best(state.best_step)
@@ -194,14 +202,14 @@ class Run:
     def _validated(self) -> dict[str, float]:
         """Scores of the best checkpoint from its counts, where their line was damaged."""
         session = self.setup.session
-        path = self.folder.counts_path(session.trainer.selection_split)
+        path = self.folder.path / counts_name(session.trainer.selection_split)
         return scores.summary(Counts.load(path), session.regions.absent)
 
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
         now = {"names": names_key(session), "files": dataset.fingerprint()}
-        before = self.folder.marker() or now
+        before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
                 f"{self.folder.path} was started on other images than the lists of "
@@ -277,7 +285,7 @@ class Run:
         def validate(step: int) -> float:
             result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
             folder = trainer.checkpoints.begin_evaluation(step)
-            result.counts.save(folder / self.folder.counts_path(split).name)
+            result.counts.save(folder / counts_name(split))
             values = scores.summary(result.counts, session.regions.absent)
             values |= self._of_target(session, self.setup.model, split, folder)
             self.folder.append(step, "val", values)
@@ -327,7 +335,7 @@ class Run:
         keep = panel_names(session.dataset, "test")
         result = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
         state.skip(result.skipped)
-        result.counts.save(self.folder.counts_path("test"))
+        result.counts.save(self.folder.path / counts_name("test"))
         values = scores.summary(result.counts, session.regions.absent)
         of_target = self._of_target(session, session.model, "test", self.folder.path)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
@@ -337,7 +345,7 @@ class Run:
         subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)
-        self.folder.write_tables(tables.to_json())
+        self.folder.write_tables(tables)
         if result.kept:
             self._draw(session, tables, result.kept)
         else:
@@ -355,7 +363,7 @@ class Run:
             return {}
         request = EvaluationRequest(split=split, view=target.view)
         counts = evaluate(session, model, request).counts
-        counts.save(folder / self.folder.counts_path(f"{split}_{target.view}").name)
+        counts.save(folder / counts_name(f"{split}_{target.view}"))
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rgbt.ranges import GreyLevel, Pixels, Share, Size
 from rgbt.requirements import Record
-from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.example import evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE, Example, Sample
 
 SizeFactor = Annotated[float, Interval(ge=0.01, le=16)]
 

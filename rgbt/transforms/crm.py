@@ -14,11 +14,11 @@ import numpy as np
 
 from rgbt.ranges import GreyLevel, Lengths, Pixels, Share, Size
 from rgbt.requirements import Record
-from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.example import evaluated, image_hw, viewed
 from rgbt.transforms.joint import View, draw_view, short_edge_hw
 from rgbt.transforms.on_batch import Drawn, DrawnBatch
 from rgbt.transforms.photometric import ColourJitter, Colours, FactorRange, HueDelta
-from rgbt.types import Sample
+from rgbt.types import Example, Sample
 
 
 @dataclass(kw_only=True, eq=False)

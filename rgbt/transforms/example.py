@@ -1,4 +1,4 @@
-"""What a transform returns, and how it is made of a sample and a view.
+"""How an example is made of a sample and a view.
 
 Every transform has `train(sample, rng)`, for which all draws come from `rng`, and `test(sample)`;
 of a sample without a label, all pixels are ignored.
@@ -7,49 +7,19 @@ of a sample without a label, all pixels are ignored.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from rgbt.transforms.joint import View, short_edge_hw, whole_view
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE, Example, Sample
 
 ImageResize = Callable[[View, NDArray[np.uint8], DTypeLike], NDArray[Any]]
 """(view, image, dtype) -> the view of the image, of that dtype; such as `View.bilinear`."""
 
 LabelResize = Callable[[View, NDArray[np.uint8]], NDArray[np.uint8]]
 """(view, label) -> the view of the label; such as `View.nearest`."""
-
-
-@dataclass(frozen=True)
-class Example:
-    """A sample after the transform, not padded to what a network asks for.
-
-    Attributes:
-        rgb: (H, W, 3), uint8 or float32, 0..255, RGB order.
-        thermal: (H, W), dtype and range of `rgb`.
-        label: (H', W') uint8, class index or 255 = ignore. H' = H and W' = W after `train`; after
-            `test` the size of the file, which the images may have left.
-        centre_yx: pixel of the example that is nearest to pixel (rows // 2, columns // 2) of the
-            original image; the first in row-major order on a tie.
-        position: (2, H, W) float32, (row, column) in the original image of every pixel; None
-            where it is not tracked.
-        original_hw: size of the original image.
-        name: name in the split list.
-        confidence: (H', W') float32, of the label, moved as the label is and by nearest; None
-            where labels carry none.
-    """
-
-    rgb: NDArray[Any]
-    thermal: NDArray[Any]
-    label: NDArray[np.uint8]
-    centre_yx: tuple[int, int]
-    position: NDArray[np.float32] | None
-    original_hw: tuple[int, int]
-    name: str
-    confidence: NDArray[np.float32] | None = None
 
 
 def image_hw(sample: Sample) -> tuple[int, int]:

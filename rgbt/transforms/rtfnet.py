@@ -10,9 +10,9 @@ from annotated_types import Interval
 
 from rgbt.ranges import Pixels, Share, Size
 from rgbt.requirements import Record
-from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.example import evaluated, image_hw, viewed
 from rgbt.transforms.joint import Part, View
-from rgbt.types import Sample
+from rgbt.types import Example, Sample
 
 
 @dataclass(frozen=True, kw_only=True)

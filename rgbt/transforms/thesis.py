@@ -12,9 +12,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from rgbt.ranges import Pixels, Share, Size
 from rgbt.requirements import Record
-from rgbt.transforms.example import Example, evaluated, image_hw, viewed
+from rgbt.transforms.example import evaluated, image_hw, viewed
 from rgbt.transforms.joint import View
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE, Example, Sample
 
 OddPixels = Annotated[
     int,

@@ -11,6 +11,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
+from rgbt.tracking.run_files import read_description
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from rgbt.tracking.terminal import info
@@ -91,7 +92,7 @@ class RunStore:
         self._describe(RunFolder(path), {"rgbt.stopped": reason}, "KILLED")
 
     def _describe(self, folder: RunFolder, tags: Mapping[str, str], status: Status) -> None:
-        description = folder.description()
+        description = read_description(folder.path)
         assert description is not None, "a run that has begun has run.json"
         folder.describe(replace(description, tags={**description.tags, **tags}))
         self._with_mlflow(lambda tracking: tracking.sync(folder, status))

@@ -8,8 +8,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
+from rgbt.metrics.names import in_percent
 from rgbt.spec.naming import VARIED
-from rgbt.tracking.percent import in_percent
 from rgbt.tracking.run_folder import MetricLine
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description
+from rgbt.tracking.run_folder import RunFolder
 from tests.analysis.figures.drawn import counts
 
 SCORES = {

@@ -282,7 +282,7 @@ def test_help_is_light():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "  missing      refuse, or leave_out" in done.stdout
+    assert "  missing     refuse, or leave_out" in done.stdout
 
 
 def test_csv_tells_the_trainings_of_each():

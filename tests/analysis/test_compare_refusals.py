@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.metrics.counts import Counts
-from tests.analysis.test_compare import ENTRY, FAST, pair
+from tests.analysis.test_compare import FAST, entry, pair
 from tests.analysis.test_results import make_run
 from tests.commands import Call, assert_one_sentence
 
@@ -50,7 +50,7 @@ def test_counts_that_cannot_be_compared(call: Call, tmp_path: Path, kind: str, s
     a, b = pair()
     a.save(tmp_path / "a.npz")
     spoilt(kind, b).save(tmp_path / "b.npz")
-    code, out, err = call(ENTRY, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
+    code, out, err = call(entry, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
     assert (code, out) == (2, "")
     assert_one_sentence(err, sentence)
 
@@ -63,7 +63,7 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
     a.save(tmp_path / "a.npz")
     spoilt(kind, b).save(tmp_path / "b.npz")
     arguments = f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", "missing=leave_out"
-    code, out, err = call(ENTRY, *arguments, *FAST)
+    code, out, err = call(entry, *arguments, *FAST)
     assert (code, out) == (2, "")
     assert sentence in err.splitlines()[-1]
     assert "Traceback" not in err
@@ -80,7 +80,7 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
         ("metric=mIoU", "'metric' has no effect here; did you mean 'metrics'?"),
         ("mIoU", "'mIoU': expected key=value"),
         ("level=2", "level must lie in [0.5, 0.999], got 2"),
-        ("level=nan", "level must lie in"),
+        ("level=nan", "'level' must be a number, got NaN"),
         ("level=high", "'level' must be a number"),
         ("resamples=5", "'resamples' must be a whole number from 100 to 1000000, got 5"),
         ("resamples=nan", "'resamples' must be a whole number"),
@@ -88,10 +88,10 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
         ("resamples=200.5", "'resamples' must be a whole number"),
         ("seed=x", "'seed' must be a whole number"),
         ("seed=0.5", "'seed' must be a whole number"),
-        ("blocks=abc", "blocks=abc: expected auto, none, sequence or a number of images"),
+        ("blocks=abc", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
         ("seed=-1", "'seed' must be a whole number"),
-        ("blocks=0", "blocks must lie in"),
-        ("blocks=-3", "blocks=-3: expected auto, none, sequence or a number of images"),
+        ("blocks=0", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
+        ("blocks=-3", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
         ("blocks=20", "blocks=20: 40 images make 2 blocks"),
         ("blocks=sequence", "blocks=sequence: 40 images make 1 sequences"),
         ("method=t", "'method' must be"),
@@ -100,17 +100,17 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
     ],
 )
 def test_bad_arguments(call: Call, files: tuple[str, str], argument: str, sentence: str):
-    code, out, err = call(ENTRY, *files, *FAST, argument)
+    code, out, err = call(entry, *files, *FAST, argument)
     assert (code, out) == (2, "")
     assert_one_sentence(err, sentence)
 
 
 def test_the_same_file_twice(call: Call, files: tuple[str, str]):
     a = files[0].partition("=")[2]
-    code, _, err = call(ENTRY, f"a={a}", f"b={a}", *FAST)
+    code, _, err = call(entry, f"a={a}", f"b={a}", *FAST)
     assert code == 2
     assert_one_sentence(err, "a and b both hold ")
-    code, _, err = call(ENTRY, f"a={a},{a}", files[1], *FAST)
+    code, _, err = call(entry, f"a={a},{a}", files[1], *FAST)
     assert code == 2
     assert_one_sentence(err, "twice; one training counts once")
 
@@ -128,25 +128,25 @@ def test_no_such_run_group_or_folder(call: Call, files: tuple[str, str], tmp_pat
         ("b=", ": crm."),
         ("b=crm,", "expected runs, files of counts or a group"),
     ):
-        code, out, err = call(ENTRY, files[0], b, place, *FAST)
+        code, out, err = call(entry, files[0], b, place, *FAST)
         assert (code, out) == (2, "")
         assert_one_sentence(err, sentence)
 
 
 def test_both_sides_must_be_given(call: Call, files: tuple[str, str]):
-    code, _, err = call(ENTRY, files[0])
+    code, _, err = call(entry, files[0])
     assert code == 2
     assert_one_sentence(err, "'b' has no value")
 
 
 def test_out_that_is_a_file(call: Call, files: tuple[str, str], tmp_path: Path):
     (tmp_path / "taken").write_text("")
-    code, _, err = call(ENTRY, *files, *FAST, f"out={tmp_path}/taken")
+    code, _, err = call(entry, *files, *FAST, f"out={tmp_path}/taken")
     assert code == 2
     assert_one_sentence(err, "taken")
 
 
 def test_a_file_of_another_split(call: Call, files: tuple[str, str]):
-    code, _, err = call(ENTRY, *files, "split=val")
+    code, _, err = call(entry, *files, "split=val")
     assert code == 2
     assert_one_sentence(err, "is of split 'test', not of split=val")

@@ -14,7 +14,8 @@ import pytest
 from analysis.results import NamedCounts, groups_in, label_of, open_counts
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, counts_name, read_description
+from rgbt.tracking.run_folder import RunFolder
 from tests.analysis.uncertainty.simulated import Population, counts_of
 
 COMMAS = "grbm scale=demo sizes=[1,2]"
@@ -29,8 +30,8 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     run.write_config("name: x\n")
     tags = {"rgbt.group": group, "rgbt.seed": str(seed)} if group else {}
     run.describe(Description(f"{group} seed={seed}", tags, {}))
-    some(seed).save(run.counts_path("test"))
-    replace(some(seed + 100), split="val").save(run.counts_path("val"))
+    some(seed).save(run.path / counts_name("test"))
+    replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
     (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
     if finished:
         run.finish({"mIoU": 0.5})
@@ -113,7 +114,7 @@ def test_a_run_made_before_is_found_by_its_old_group_and_with_new_runs(runs: Pat
     for seed, value in ((0, "${px:64}"), (1, "32")):
         folder = make_run(runs, f"ddd{seed}", f"grbm patch_size={value}", seed)
         run = RunFolder(folder)
-        description = run.description()
+        description = read_description(run.path)
         assert description is not None
         run.describe(replace(description, params={"scale.pixel_factor": "0.5"}))
     found = open_counts("grbm patch_size=32", runs)

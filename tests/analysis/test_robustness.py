@@ -11,8 +11,7 @@ from analysis.compare import entry
 from analysis.results import open_counts
 from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
-from rgbt.evaluation.robustness import CLEAN, FORMAT
-from rgbt.evaluation.robustness_table import FOLDER
+from rgbt.evaluation.robustness import CLEAN, FOLDER, FORMAT
 from rgbt.metrics.named import value
 from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run

@@ -21,7 +21,8 @@ from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, counts_name
+from rgbt.tracking.run_folder import RunFolder
 from tests.commands import SPLITS, Call
 from tests.conftest import pair
 
@@ -251,7 +252,7 @@ def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
             partition="ring2",
             dataset="x",
             split="test",
-        ).save(run.counts_path("test"))
+        ).save(run.path / counts_name("test"))
         run.finish({})
     out = tmp_path / "out"
     words = (f"runs_dir={tmp_path / 'runs'}", "resamples=0")

@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.evaluation.prediction import decode_ahead
-from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, Teacher, write_pseudo_labels
+from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.requirements import Record
 from rgbt.spec.run_spec import RunSpec
@@ -219,9 +219,7 @@ def test_another_range_of_thermal_counts_is_another_input(
     def written(*typed: str) -> Any:
         session = open_session(composed("thermal_teacher", *typed))
         request = EvaluationRequest(split="val", view="thermal")
-        return write_pseudo_labels(
-            session, Teacher("a", "w"), request, Labelling(), tmp_path / "out"
-        )
+        return write_pseudo_labels(session, "a", request, Labelling(), tmp_path / "out")
 
     first = written()
     other = "dataset.thermal_range=[21800,25000]"

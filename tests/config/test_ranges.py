@@ -42,7 +42,7 @@ OUTSIDE: dict[str, dict[str, list[Any]]] = {
         **{"height": [8, 10**6], "night_share": [1.5], "num_val": [0], "ego_forward_m": [9.0]},
     },
     "data.synth.freiburg.synth_freiburg": {"num_test": [1], "num_train_night": [0], "width": [8]},
-    "corruptions.occluded.Occluded": {"block": [0, 481], "severities": [[]]},
+    "corruptions.pixels.Occluded": {"block": [0, 481], "severities": [[]]},
     "engine.optimizers.Adam": {"lr": [-1.0], "betas": [[0.9, 1.0]], "weight_decay": [-0.1]},
     "engine.optimizers.AdamW": {"lr": [0, -1], "eps": [0], "backbone_multiplier": [-1]},
     "engine.optimizers.RMSprop": {"lr": [0.0], "alpha": [1.0]},

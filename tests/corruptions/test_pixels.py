@@ -10,12 +10,8 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.corruptions.blur import Blur
 from rgbt.corruptions.corruption import OfPixels, OfTime
-from rgbt.corruptions.misregistered import DIRECTIONS, Misregistered, moved
-from rgbt.corruptions.noise import Noise
-from rgbt.corruptions.occluded import Occluded
-from rgbt.corruptions.removed import Removed
+from rgbt.corruptions.pixels import DIRECTIONS, Blur, Misregistered, Noise, Occluded, Removed, moved
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
 from tests.corruptions.recorded import sample

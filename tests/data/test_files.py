@@ -21,9 +21,8 @@ from rgbt.data.files import (
     read_label,
     read_packed,
     read_thermal,
-    within,
 )
-from rgbt.data.integrity import is_there, read_names, read_whole
+from rgbt.data.integrity import is_there, read_names, read_whole, within
 
 SKIP = "use data.on_error=skip to leave it out"
 

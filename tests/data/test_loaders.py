@@ -54,7 +54,7 @@ def dataset(write_mfnet) -> MFNet:
 
 
 def damage(dataset: MFNet, name: str) -> None:
-    dataset.image_paths(name)[0].write_bytes(b"damaged")
+    dataset.files(name)[0].write_bytes(b"damaged")
 
 
 def assert_equal(one: Batch, other: Batch) -> None:
@@ -175,8 +175,8 @@ def test_evaluation_in_list_order(dataset: MFNet) -> None:
 
 def test_sizes_that_differ(dataset: MFNet, expected_pair, png) -> None:
     rgb, thermal, label = expected_pair(NAMES[1], (20, 32))
-    png(dataset.image_paths(NAMES[1])[0], np.dstack([rgb, thermal]))
-    png(dataset.label_path(NAMES[1]), label)
+    png(dataset.files(NAMES[1])[0], np.dstack([rgb, thermal]))
+    png(dataset.files(NAMES[1])[-1], label)
     with pytest.raises(InputError, match=r"24x32 \('00001N'\) and 20x32 .*eval_batch_size=1"):
         next(eval_batches(dataset, "val", crm(), settings()))
     batches = list(eval_batches(dataset, "val", crm(), settings(eval_batch_size=1)))

@@ -153,6 +153,7 @@ def test_refuses_other_channels_and_bits(write_mfnet, expected_pair, png) -> Non
     png(root / "images" / "00001D.png", np.dstack([rgb, thermal]).astype(np.uint16))
     with pytest.raises(InputError, match="expected 8 bits per channel, got uint16"):
         dataset.read("00001D")
+    png(root / "images" / "00001D.png", np.dstack([rgb, thermal]))
     png(root / "labels" / "00001D.png", label.astype(np.uint16))
     with pytest.raises(InputError, match=r"labels/00001D.png: expected 8 bits"):
         dataset.read("00001D")

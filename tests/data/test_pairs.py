@@ -118,7 +118,7 @@ def test_moved_both_are_moved(dataset: MFNet) -> None:
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_unreadable_file_stops_both_domains(dataset: MFNet, workers: int) -> None:
-    dataset.image_paths(NIGHT[0])[0].write_bytes(b"damaged")
+    dataset.files(NIGHT[0])[0].write_bytes(b"damaged")
     found = pairs(dataset, range(4), num_workers=workers)
     with pytest.raises(InputError, match=f"{NIGHT[0]}.png cannot be decoded"):
         list(found)
@@ -128,7 +128,7 @@ def test_unreadable_file_stops_both_domains(dataset: MFNet, workers: int) -> Non
 
 def test_skipped_files_of_both_are_named(dataset: MFNet) -> None:
     for name in (DAY[0], NIGHT[0]):
-        dataset.image_paths(name)[0].write_bytes(b"damaged")
+        dataset.files(name)[0].write_bytes(b"damaged")
     found = pairs(dataset, range(6), on_error="skip")
     assert len(list(found)) == 6
     assert set(found.skipped) == {DAY[0], NIGHT[0]}

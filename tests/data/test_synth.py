@@ -10,7 +10,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.data.synth import cache, dataset, scene, sheet, writer
 from rgbt.data.synth.camera import SynthCamera, camera_of, flow_between, ground_homography
-from rgbt.data.synth.dataset import cached, plan_key, synth
+from rgbt.data.synth.dataset import cached, synth
 from rgbt.data.synth.facets import sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.layout import place_objects
@@ -355,9 +355,10 @@ def test_folder_is_reused_and_named_by_plan(
     assert cached(plan(), tmp_path) == folder
     others = [plan(seed=4), plan(num_val=3), plan(motion=EgoMotion(1.0))]
     others.append(plan(factors=replace(plan().factors, rgb_noise=0.5)))
-    assert len({plan_key(p) for p in [plan(), *others]}) == 5
+    monkeypatch.setattr(dataset, "write", lambda *_: None)
+    assert len({cached(each, tmp_path) for each in [plan(), *others]}) == 5
     monkeypatch.setattr(dataset, "VERSION", dataset.VERSION + 1)
-    assert folder.name != f"synth-{plan_key(plan())}"
+    assert cached(plan(), tmp_path) != folder
 
 
 def test_an_interrupted_generation_leaves_nothing(
@@ -379,16 +380,18 @@ def test_an_interrupted_generation_leaves_nothing(
 
 
 def test_first_of_two_generations_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache_dir = tmp_path / "cache"
+    other = cache_dir / cached(plan(), tmp_path / "elsewhere").name
+
     def overtaken(made: SynthPlan, folder: Path) -> None:
         write(made, folder)
-        other = tmp_path / f"synth-{plan_key(made)}"
         other.mkdir()
         (other / "first.txt").write_text("")
 
     monkeypatch.setattr(dataset, "write", overtaken)
-    folder = cached(plan(), tmp_path)
-    assert (folder / "first.txt").is_file()
-    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+    assert cached(plan(), cache_dir) == other
+    assert (other / "first.txt").is_file()
+    assert [path.name for path in cache_dir.iterdir()] == [other.name]
 
 
 def test_synth_returns_a_reader_of_its_folder(tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from rgbt.config.component import Component, build
 from rgbt.config.compose import compose
 from rgbt.data.freiburg import CLASSES, Freiburg
 from rgbt.data.synth import freiburg
+from rgbt.data.synth.classes import FREIBURG_BY_LABEL, FREIBURG_OF_SCENERY, freiburg_ids
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.freiburg import cached, synth_freiburg
-from rgbt.data.synth.freiburg_classes import BY_LABEL, OF_SCENERY, class_ids
 from rgbt.data.synth.freiburg_writer import FreiburgPlan, counts_of, seen_in_thermal, write
 from rgbt.data.synth.materials import INDEX
 from rgbt.data.synth.scene import render_scene
@@ -79,7 +79,7 @@ def test_files_hold_the_scenes(data: Freiburg) -> None:
         assert np.abs(apart[seen]).max() <= 1
         assert not sample.thermal[~seen].any()
         if sample.label is not None:
-            label = class_ids(scene.label, scene.material)[1:97, 48:240]
+            label = freiburg_ids(scene.label, scene.material)[1:97, 48:240]
             label = np.where(seen, label, 255) if "test" in name else label
             assert np.array_equal(sample.label, label)
 
@@ -178,13 +178,13 @@ def test_nights_are_darker_but_hardly_colder(many: Freiburg) -> None:
 def test_sky_is_where_no_surface_is() -> None:
     for index in range(6):
         scene = render_scene(0, index, FACTORS)
-        ids = class_ids(scene.label, scene.material)
+        ids = freiburg_ids(scene.label, scene.material)
         assert np.array_equal(ids == CLASSES.index("sky"), np.isinf(scene.depth))
 
 
 def test_classes_by_hand() -> None:
     def ids(label: int, material: str) -> str:
-        found = class_ids(np.array([[label]], np.uint8), np.array([[INDEX[material]]]))
+        found = freiburg_ids(np.array([[label]], np.uint8), np.array([[INDEX[material]]]))
         return CLASSES[found[0, 0]]
 
     assert ids(0, "sky") == "sky"
@@ -202,11 +202,11 @@ def test_classes_by_hand() -> None:
 
 
 def test_every_label_and_material_has_one_class() -> None:
-    assert sorted(BY_LABEL) == list(range(1, 9))
-    named = [material for materials in OF_SCENERY.values() for material in materials]
+    assert sorted(FREIBURG_BY_LABEL) == list(range(1, 9))
+    named = [material for materials in FREIBURG_OF_SCENERY.values() for material in materials]
     assert len(named) == len(set(named))
     assert set(named) <= set(INDEX)
-    assert set(OF_SCENERY) | set(BY_LABEL.values()) == set(CLASSES) - {"ignore"}
+    assert set(FREIBURG_OF_SCENERY) | set(FREIBURG_BY_LABEL.values()) == set(CLASSES) - {"ignore"}
 
 
 def test_counts_by_hand() -> None:

@@ -15,11 +15,9 @@ from rgbt.config.compose import compose, conf_dir
 from rgbt.data.kp import CLASSES, KP
 from rgbt.data.kp_layout import set_of
 from rgbt.data.synth import kp, people
-from rgbt.data.synth.classes import ids_in
+from rgbt.data.synth.classes import KP_BY_LABEL, KP_OF_SCENERY, KP_TABLE, VOID, ids_in, kp_ids
 from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.kp import cached, synth_kp
-from rgbt.data.synth.kp_classes import _TABLE, BY_LABEL, OF_SCENERY, VOID, class_ids
-from rgbt.data.synth.kp_writer import names_of, write
+from rgbt.data.synth.kp import cached, names_of, synth_kp, write
 from rgbt.data.synth.materials import INDEX
 from rgbt.data.synth.scene import Scene, render_scene
 from rgbt.data.synth.shapes import BIKE, BUMP, CAR, CAR_STOP, CURVE, GUARDRAIL, PERSON
@@ -70,7 +68,7 @@ def test_files_hold_the_scenes(data: KP) -> None:
         scene = render_scene(0, int(name[-5:]), FACTORS)
         sample = data.read(name)
         assert scene.is_night == data.nights((name,))[0]
-        ids = class_ids(scene)
+        ids = kp_ids(scene)
         assert np.array_equal(sample.label, np.where(ids == 19, 255, ids))
         # JPEG loses a few grey levels, of colours more than of grey.
         assert np.abs(sample.thermal.astype(int) - scene.thermal).mean() < 3
@@ -143,7 +141,7 @@ def test_no_night_lists_without_nights(tmp_path: Path) -> None:
 
 def test_classes_by_hand() -> None:
     def of(label: int, material: str) -> str:
-        found = ids_in(_TABLE, np.array([[label]], np.uint8), np.array([[INDEX[material]]]))
+        found = ids_in(KP_TABLE, np.array([[label]], np.uint8), np.array([[INDEX[material]]]))
         return [*CLASSES, VOID][found[0, 0]]
 
     assert of(0, "sky") == "sky"
@@ -160,18 +158,18 @@ def test_classes_by_hand() -> None:
 
 
 def test_every_label_and_material_has_one_class() -> None:
-    assert sorted(BY_LABEL) == list(range(1, 9))
-    named = [material for materials in OF_SCENERY.values() for material in materials]
+    assert sorted(KP_BY_LABEL) == list(range(1, 9))
+    named = [material for materials in KP_OF_SCENERY.values() for material in materials]
     assert len(named) == len(set(named))
     assert set(named) <= set(INDEX)
-    given = {*OF_SCENERY, *BY_LABEL.values(), "rider"}
+    given = {*KP_OF_SCENERY, *KP_BY_LABEL.values(), "rider"}
     assert {*CLASSES, VOID} - given == ABSENT
 
 
 def test_rider_is_not_person(scenes: list[Scene]) -> None:
     persons = riders = 0
     for scene in scenes:
-        ids = class_ids(scene)
+        ids = kp_ids(scene)
         person, rider = (ids == CLASSES.index(name) for name in ("person", "rider"))
         assert np.array_equal(person | rider, scene.label == PERSON)
         shapes = {owner: scene.placed[owner].shape for owner in np.unique(scene.owner[person])}
@@ -198,7 +196,7 @@ def test_owner_is_object_except_ground_and_sky(scenes: list[Scene]) -> None:
 def test_every_present_class_is_frequent(scenes: list[Scene]) -> None:
     shown = np.zeros(20)
     for scene in scenes:
-        shown += np.bincount(class_ids(scene).ravel(), minlength=20) > 0
+        shown += np.bincount(kp_ids(scene).ravel(), minlength=20) > 0
     assert {name for name, times in zip(CLASSES, shown) if not times} == ABSENT
     assert shown[[n for n, name in enumerate(CLASSES) if name not in ABSENT]].min() >= 4
     assert shown[19] > 6

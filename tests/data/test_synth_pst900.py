@@ -16,8 +16,7 @@ from rgbt.data.pst900 import CLASSES, PST900
 from rgbt.data.pst900_layout import bag_of
 from rgbt.data.synth import pst900
 from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.pst900 import cached, synth_pst900
-from rgbt.data.synth.pst900_writer import CLASS_OF, shots_of, write
+from rgbt.data.synth.pst900 import CLASS_OF, cached, shots_of, synth_pst900, write
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.shapes import BUMP, CAR, CAR_STOP, COLOR_CONE, PERSON
 from rgbt.data.synth.writer import SynthPlan

@@ -10,7 +10,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.checks import RunError
-from rgbt.engine.evaluate import class_maps, class_scores, predictions
+from rgbt.engine.evaluate import class_maps, class_scores
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, Output, View
 
@@ -84,32 +84,13 @@ def test_what_is_not_chosen_is_left_to_the_network(model: Heads) -> None:
     assert model.calls == [(7, (), None), (7, (), None), (7, ("rgb",), "day")]
 
 
-def test_the_names_of_a_batch_choose_its_heads(model: Heads) -> None:
-    asked: list[tuple[str, ...]] = []
-
-    def heads_of(names: tuple[str, ...]) -> tuple[str | None, ...]:
-        asked.append(names)
-        return tuple(HEADS[int(name) % 2] for name in names)
-
-    images = batch()
-    model.train()
-    fabric = Fabric(accelerator="cpu", devices=1)
-    found = list(predictions(model, [images, images], fabric, "rgb", heads_of))
-    assert asked == [images.name] * 2
-    assert not model.training
-    heads = tuple(HEADS[index % 2] for index in range(7))
-    expected = class_maps(model, images.to("cpu"), fabric, "rgb", heads)
-    assert torch.equal(found[0].classes, expected)
-    assert torch.equal(found[1].classes, expected)
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_scores_that_are_not_finite_are_refused_with_the_image(model: Heads, value: float) -> None:
     fabric = Fabric(accelerator="cpu", devices=1)
     data = batch(3)
     data.rgb[1, 0, 2, 3] = value
     with pytest.raises(RunError, match="^image '1': the network's class scores are NaN or inf"):
-        list(predictions(model, [data], fabric))
+        class_maps(model, data, fabric)
 
 
 def test_large_finite_scores_are_counted(model: Heads) -> None:

@@ -11,9 +11,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.corruptions.corruption import OfPixels, OfTime
 from rgbt.corruptions.late import Delayed, Frozen
-from rgbt.corruptions.noise import Noise
-from rgbt.corruptions.occluded import Occluded
-from rgbt.corruptions.removed import Removed
+from rgbt.corruptions.pixels import Noise, Occluded, Removed
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
 from tests.corruptions.recorded import NAMES, Recorded, sample

@@ -101,7 +101,7 @@ def test_image_as_a_setting_is_the_image_of_the_name(name: str, row: str) -> Non
 
 def test_own_file(tmp_path: Path) -> None:
     path = tmp_path / "hazy.yaml"
-    path.write_text("_target_: rgbt.corruptions.blur.Blur\nimage: rgb\nseverities: [3, 30]\n")
+    path.write_text("_target_: rgbt.corruptions.pixels.Blur\nimage: rgb\nseverities: [3, 30]\n")
     request = choose_corruption(str(path))
     assert (request.row, request.corruption.severities) == ("hazy", (3.0, 30.0))
     changed = choose_corruption(str(path), ["corruption.image=thermal"])

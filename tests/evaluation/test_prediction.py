@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.corruptions.noise import Noise
+from rgbt.corruptions.pixels import Noise
 from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset
-from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.evaluation.prediction import Predictor, decode_ahead, heads_of, view_of
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.requirements import Record
+from rgbt.types import Batch, Output
 
 
 class Network:
@@ -75,6 +81,40 @@ def test_heads_of_unlisted_images() -> None:
     alone = session_of({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
     assert alone.dataset.calls == 0
+
+
+def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
+    calls: list[tuple[int, str | None]] = []
+
+    class Heads(nn.Module):
+        record = Record(views=("rgb",))
+
+        def forward(self, rgb: Tensor, thermal: Tensor, *, views: object, head: str) -> Output:
+            calls.append((len(rgb), head))
+            index = ("day", "dark").index(head)
+            return Output(
+                torch.eye(2)[index][:, None, None].expand(len(rgb), 2, *rgb.shape[2:]), {}
+            )
+
+    session: Any = session_of({"head": "day", "view": "rgb"}, target_is="night")
+    session.model, session.fabric = Heads(), Fabric(accelerator="cpu", devices=1)
+    predictor = Predictor(session, session.model, EvaluationRequest(split="test"))
+    batch = Batch(
+        rgb=torch.zeros(3, 3, 2, 2),
+        thermal=torch.zeros(3, 1, 2, 2),
+        label=torch.zeros(3, 2, 2, dtype=torch.int64),
+        name=("day", "night", "day"),
+        centre_yx=torch.zeros(3, 2, dtype=torch.int64),
+        position=None,
+        original_hw=torch.full((3, 2), 2),
+    )
+    assert predictor.classes(batch)[:, 0, 0].tolist() == [0, 1, 0]
+    assert calls == [(2, "day"), (1, "dark")]
+    assert predictor.probabilities(batch)[:, 1, 0, 0].tolist() == pytest.approx(
+        [0.269, 0.731, 0.269], abs=1e-3
+    )
+    assert not session.model.training
+    assert predictor.view == "rgb"
 
 
 @pytest.mark.parametrize("corrupted", [False, True])

@@ -15,18 +15,25 @@ from torch import nn
 
 from rgbt.evaluation.corruption_request import choose_corruption
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.robustness import Condition, Measured, conditions, measure, weights_digest
-from rgbt.evaluation.robustness_table import robustness_grid
+from rgbt.evaluation.robustness import (
+    Condition,
+    Measured,
+    conditions,
+    measure,
+    robustness_grid,
+    weights_digest,
+)
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.requirements import Record
+from rgbt.types import View
 from tests.corruptions.recorded import Recorded
 
 EVALUATE = "rgbt.evaluation.robustness.evaluate"
 
 
 class Network(nn.Module):
-    def __init__(self, views: tuple[str, ...] = ("rgbt", "rgb", "thermal")) -> None:
+    def __init__(self, views: tuple[View, ...] = ("rgbt", "rgb", "thermal")) -> None:
         super().__init__()
         self.record = Record(views=views)
         self.weight = nn.Parameter(torch.arange(4.0))
@@ -124,7 +131,7 @@ def test_conditions_are_clean_branches_and_severities() -> None:
     ],
 )
 def test_conditions_follow_the_views_of_the_network(
-    views: tuple[str, ...], source: str | None, marks: list[str]
+    views: tuple[View, ...], source: str | None, marks: list[str]
 ) -> None:
     domains = SimpleNamespace(source=SimpleNamespace(view=source))
     session = opened(model=Network(views), domains=domains)

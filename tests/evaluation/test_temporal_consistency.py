@@ -27,6 +27,7 @@ from rgbt.evaluation.segmentation import evaluate
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, ca, tc
+from rgbt.requirements import Record
 from rgbt.spec.specify import specify
 from rgbt.transforms.view_sets import read_angles
 from rgbt.types import Output
@@ -40,7 +41,7 @@ VAL, TEST = EvaluationRequest(split="val"), EvaluationRequest(split="test")
 class Decoder(nn.Module):
     """Predicts what the thermal image says: class = grey level / 28."""
 
-    views = ("rgbt",)
+    record = Record(views=("rgbt",))
 
     def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
         classes = (thermal[:, 0] * 255 / 28).round().long().clamp(0, 8)
@@ -50,7 +51,7 @@ class Decoder(nn.Module):
 class Oracle(nn.Module):
     """Knows the right answer of every image."""
 
-    views = ("rgbt",)
+    record = Record(views=("rgbt",))
 
     def __init__(self) -> None:
         super().__init__()

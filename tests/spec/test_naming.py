@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.spec.naming import VARIED, describe, group_of
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.run_folder import Description
+from rgbt.tracking.run_files import Description
 from tests.composed import specified
 
 

@@ -18,7 +18,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, counts_name
+from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.run_specs import PlannedRun
@@ -131,7 +132,7 @@ def finish(
     """Write what a finished run leaves."""
     run = RunFolder(folder)
     run.describe(Description(f"fake {folder.name}", {"rgbt.key": folder.name, **(tags or {})}, {}))
-    counts(dataset=dataset).save(run.counts_path("test"))
+    counts(dataset=dataset).save(run.path / counts_name("test"))
     run.finish(
         {
             "name": f"fake {folder.name}",

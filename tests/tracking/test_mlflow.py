@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
+from rgbt.metrics.names import shown
 from rgbt.tracking import mlflow_client, sync
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import (
@@ -28,15 +29,15 @@ from rgbt.tracking.mlflow_upload import (
     write_upload_state,
 )
 from rgbt.tracking.mlflow_view import SECTIONS, view_tags
-from rgbt.tracking.percent import shown
 from rgbt.tracking.replaced_runs import replace_finished
+from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
 DEAD = "http://127.0.0.1:9"
 TAGS = {"rgbt.group": "grbm", "rgbt.seed": "0"}
-PARAMS = {"seed": 0, "masker.sigma_div": 2, "long": "x" * 900}
+PARAMS = {"seed": "0", "masker.sigma_div": "2", "long": "x" * 900}
 TABLES = ResultTables(
     split="test",
     step=20,
@@ -63,15 +64,15 @@ def tracking(runs_dir: Path, uri: str | None = None) -> MlflowTracking:
 
 
 def begin(folder: RunFolder, tracker: MlflowTracking | NoTracking) -> None:
-    tracker.start(folder, "grbm seed=0", TAGS, PARAMS)
+    tracker.start(folder, Description("grbm seed=0", TAGS, PARAMS))
 
 
 def conclude(folder: RunFolder) -> None:
     """What a run writes at its end."""
     folder.append(20, "test", {"mIoU": 0.4, "Var": 156.25, "region/1": 0.25, "class/car": math.nan})
-    folder.write_tables(TABLES.to_json())
+    folder.write_tables(TABLES)
     folder.figure_path("region_iou").write_bytes(b"png")
-    folder.counts_path("test").write_bytes(b"npz")
+    (folder.path / counts_name("test")).write_bytes(b"npz")
     folder.finish({"mIoU": 0.4})
 
 
@@ -135,7 +136,7 @@ def test_a_killed_run_continues_in_the_same_mlflow_run_without_duplicates(
 
 def test_sending_lines_again_after_a_crash_leaves_no_duplicate(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "crashed")
-    NoTracking().start(folder, "grbm", TAGS, PARAMS)
+    NoTracking().start(folder, Description("grbm", TAGS, PARAMS))
     folder.append(5, "train", {"loss": 3.0})
     conclude(folder)
     tracking(runs_dir).sync(folder, "FINISHED")
@@ -269,7 +270,7 @@ def test_a_replaced_run_whose_id_was_not_noted_is_not_doubled(runs_dir: Path) ->
 
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "deleted")
-    NoTracking().start(folder, "grbm", TAGS, PARAMS)
+    NoTracking().start(folder, Description("grbm", TAGS, PARAMS))
     tracker = tracking(runs_dir)
     folder.append(5, "train", {"loss": 3.0})
     first = tracker.sync(folder, "RUNNING")
@@ -385,11 +386,12 @@ def test_links_open_the_pages(runs_dir: Path) -> None:
 def test_many_processes_may_start_on_a_fresh_store(tmp_path: Path) -> None:
     code = (
         "import sys\n"
+        "from rgbt.tracking.run_files import Description\n"
         "from rgbt.tracking.run_folder import RunFolder\n"
         "from rgbt.tracking.mlflow_store import MlflowTracking\n"
         "runs, key = sys.argv[1:]\n"
         "t = MlflowTracking(None, artifact_uri=None, experiment='rgbt', runs_dir=runs)\n"
-        "t.start(RunFolder(f'{runs}/{key}'), key, {}, {})\n"
+        "t.start(RunFolder(f'{runs}/{key}'), Description(key, {}, {}))\n"
     )
     workers = [
         subprocess.Popen(
@@ -485,7 +487,7 @@ def test_a_run_described_anew_is_renamed(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "renamed")
     begin(folder, tracking(runs_dir))
     tracker = tracking(runs_dir)
-    tracker.start(folder, "grbm sigma_div=4 seed=0", TAGS, PARAMS)
+    tracker.start(folder, Description("grbm sigma_div=4 seed=0", TAGS, PARAMS))
     assert client(runs_dir).get_run(run_id(folder)).info.run_name == "grbm sigma_div=4 seed=0"
 
 

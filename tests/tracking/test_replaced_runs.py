@@ -9,7 +9,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.tracking.mlflow_store import NoTracking
 from rgbt.tracking.replaced_runs import replace_finished, runs_dir_of, set_aside, shown_description
-from rgbt.tracking.run_folder import Description, RunFolder, find_run, runs_in
+from rgbt.tracking.run_files import Description, read_description, read_result
+from rgbt.tracking.run_folder import RunFolder, find_run, runs_in
 from rgbt.tracking.sync import Options, folders_of
 
 TAGS = {"rgbt.key": "abc", "rgbt.group": "grbm", "rgbt.seed": "0"}
@@ -35,7 +36,7 @@ def test_set_aside_keeps_every_finished_run(tmp_path: Path) -> None:
         tmp_path / "replaced" / "abc-2",
     ]
     assert not (tmp_path / "abc").exists()
-    assert kept[0].result() == {"key": "abc"}
+    assert read_result(kept[0].path) == {"key": "abc"}
     assert find_run("replaced/abc-1", tmp_path) == kept[0].path
     (kept[1].path / "mlflow.json").write_text('{"run_id": "f00"}')
     assert find_run("f00", tmp_path) == kept[1].path
@@ -46,7 +47,7 @@ def test_set_aside_leaves_an_unfinished_run_and_one_that_trains(tmp_path: Path) 
     folder = finished(tmp_path)
     with folder.lock(), pytest.raises(InputError, match="is being trained"):
         set_aside(folder)
-    assert folder.result() == {"key": "abc"}
+    assert read_result(folder.path) == {"key": "abc"}
 
 
 def test_a_replaced_run_is_no_run_of_the_folder_but_is_sent(tmp_path: Path) -> None:
@@ -70,4 +71,4 @@ def test_a_replaced_run_is_shown_outside_of_its_group(tmp_path: Path) -> None:
         "rgbt.replaced": "true",
     }
     present = finished(tmp_path)
-    assert shown_description(present) == present.description()
+    assert shown_description(present) == read_description(present.path)

@@ -16,7 +16,16 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import is_held, write_atomic
-from rgbt.tracking.run_folder import Description, RunFolder, runs_in
+from rgbt.tracking.run_files import (
+    Description,
+    counts_name,
+    read_description,
+    read_provenance,
+    read_result,
+    read_tables,
+)
+from rgbt.tracking.run_folder import RunFolder, runs_in
+from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 
 def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -44,9 +53,9 @@ def test_failed_write_keeps_the_old_content(
 
 def test_result_exists_only_when_finished(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "runs" / "key")
-    assert folder.result() is None
+    assert read_result(folder.path) is None
     folder.finish({"mIoU": 0.5})
-    assert folder.result() == {"mIoU": 0.5}
+    assert read_result(folder.path) == {"mIoU": 0.5}
 
 
 def test_lines_are_read_as_written(tmp_path: Path) -> None:
@@ -124,23 +133,26 @@ def test_lines_and_files_of_before_check_sums_are_read(tmp_path: Path) -> None:
     (tmp_path / "provenance.json").write_text('[{"command": "a"}]')
     folder = RunFolder(tmp_path)
     assert folder.lines()[0].values == {"mIoU": 0.25}
-    assert folder.result() == {"dataset": "0123", "test": {"mIoU": None}}
+    assert read_result(folder.path) == {"dataset": "0123", "test": {"mIoU": None}}
     folder.add_provenance({"command": "b"})
-    assert [each["command"] for each in folder.provenance()] == ["a", "b"]
+    assert [each["command"] for each in read_provenance(folder.path / "provenance.json")] == [
+        "a",
+        "b",
+    ]
     (tmp_path / "result.json").write_text('{"datasft": "0123"}')
     with pytest.raises(InputError, match="unknown key 'datasft'"):
-        folder.result()
+        read_result(folder.path)
 
 
 def test_json_that_is_nested_or_large_without_end_is_refused(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "result.json"
     path.write_text("[" * 100_000)
     with pytest.raises(InputError, match="is damaged .it is nested too deeply"):
-        RunFolder(tmp_path).result()
+        read_result(tmp_path)
     monkeypatch.setenv("RGBT_MAX_JSON_MB", "1")
     path.write_text('{"skipped": [' + '"a", ' * 300_000 + '"a"]}')
     with pytest.raises(InputError, match="holds 2 million bytes.*set RGBT_MAX_JSON_MB=2"):
-        RunFolder(tmp_path).result()
+        read_result(tmp_path)
 
 
 def test_lock_refuses_a_second_holder_and_names_the_first(tmp_path: Path) -> None:
@@ -189,11 +201,14 @@ def test_lock_is_freed_when_its_process_is_killed_though_a_forked_child_lives_on
 
 def test_provenance_is_a_list_and_the_diff_a_file(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    assert folder.provenance() == []
+    assert read_provenance(folder.path / "provenance.json") == []
     folder.add_provenance({"command": "a", "diff": "--- x\n"})
     folder.add_provenance({"command": "b", "diff": ""})
     folder.add_provenance({"command": "c", "diff": "--- y\n"})
-    assert [(entry["command"], entry["diff"]) for entry in folder.provenance()] == [
+    assert [
+        (entry["command"], entry["diff"])
+        for entry in read_provenance(folder.path / "provenance.json")
+    ] == [
         ("a", "diff.patch"),
         ("b", None),
         ("c", "diff_3.patch"),
@@ -203,15 +218,25 @@ def test_provenance_is_a_list_and_the_diff_a_file(tmp_path: Path) -> None:
 
 def test_small_files_come_back(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "key")
-    assert (folder.description(), folder.tables()) == (None, None)
+    assert (read_description(folder.path), read_tables(folder.path)) == (None, None)
     description = Description("grbm", {"rgbt.seed": "0"}, {"seed": "0"})
     folder.describe(description)
-    folder.write_tables({"split": "test"})
+    tables = ResultTables(
+        split="test",
+        step=5,
+        region_names=("ring_1",),
+        regions=RegionTable("grbm", (0.5,), 0.5, math.nan),
+        classes=ClassTable(("car",), (0.5,), (0.5,), ((0.5,),), {"day": 0.25}),
+    )
+    folder.write_tables(tables)
     folder.write_config("seed: 0\n")
-    assert folder.description() == description
-    assert folder.tables() == {"split": "test"}
+    assert read_description(folder.path) == description
+    found = read_tables(folder.path)
+    assert found is not None
+    assert found.classes == tables.classes
+    assert math.isnan(found.regions.variance)
     assert (folder.path / "config.yaml").read_text() == "seed: 0\n"
-    assert folder.counts_path("test").name == "counts_test.npz"
+    assert counts_name("test") == "counts_test.npz"
     assert folder.figure_path("panel") == folder.path / "figures" / "panel.png"
     assert folder.figure_path("panel").parent.is_dir()
     assert [run.path for run in runs_in(tmp_path)] == [folder.path]
@@ -220,7 +245,7 @@ def test_small_files_come_back(tmp_path: Path) -> None:
 def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("{")
     with pytest.raises(InputError, match=r"result\.json is damaged \(.*\); restore it"):
-        RunFolder(tmp_path).result()
+        read_result(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         runs_in(tmp_path / "missing")
 

@@ -10,7 +10,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, counts_name
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 
 
@@ -32,7 +33,7 @@ def run(tmp_path: Path) -> RunResult:
     folder.describe(Description("a name", {"rgbt.group": "grbm", "rgbt.seed": "3"}, {"k": "v"}))
     folder.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": True, "diff": ""})
     folder.add_provenance({"git_commit": "f" * 16, "diff": ""})
-    counts().save(folder.counts_path("test"))
+    counts().save(folder.path / counts_name("test"))
     scores = {"mIoU": 0.25, "Var": 2.5, "region/1": None}
     folder.finish({"name": "a name", "dataset": "d", "val": {"mIoU": 0.5}, "test": scores})
     return RunResult(folder.path)
@@ -40,11 +41,10 @@ def run(tmp_path: Path) -> RunResult:
 
 def test_run_result_reads_what_the_run_wrote(run: RunResult) -> None:
     assert (run.key, run.run_id, run.dataset, run.is_finished) == ("abc", "", "d", True)
-    assert (run.name, run.params, run.group, run.seed) == ("a name", {"k": "v"}, "grbm", 3)
+    assert (run.description.name, run.description.params) == ("a name", {"k": "v"})
+    assert run.tags == {"rgbt.group": "grbm", "rgbt.seed": "3"}
     assert run.commit == "0123456789+"
     assert [each["git_commit"][0] for each in run.provenance] == ["0", "f"]
-    assert run.tables is None
-    assert run.marker is None
 
 
 def test_scores_are_in_percent_without_missing_ones(run: RunResult) -> None:
@@ -54,7 +54,7 @@ def test_scores_are_in_percent_without_missing_ones(run: RunResult) -> None:
 def test_result_of_unfinished_run_is_refused(tmp_path: Path) -> None:
     run = RunResult(tmp_path / "none")
     assert not run.is_finished
-    assert (run.name, run.group, run.seed, run.commit) == ("", "", None, None)
+    assert (run.tags, run.commit) == ({}, None)
     with pytest.raises(InputError, match=r"result\.json is missing or names no data set"):
         _ = run.dataset
     assert not run.folder.exists(), "reading makes no folder"

@@ -10,7 +10,8 @@ import pytest
 
 from rgbt.engine.checkpoint import State
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, read_description
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.training.train import Run, _show_again
 
 
@@ -63,13 +64,13 @@ def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
     folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
     asked = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
     _show_again(folder, NoTracking(), asked)
-    kept = folder.description()
+    kept = read_description(folder.path)
     assert kept is not None
     assert (kept.name, kept.tags["row"]) == (name, "a")
 
     more = Description("lr=1 · grbm", {"rgbt.group": "grbm sigma_div=2 lr=1"}, {})
     _show_again(folder, NoTracking(), more)
-    kept = folder.description()
+    kept = read_description(folder.path)
     assert kept is not None
     assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
 

@@ -13,9 +13,9 @@ import yaml
 
 from rgbt.config.component import build
 from rgbt.transforms.cmx import CmxTransform, draw_span, padded
-from rgbt.transforms.example import Example, viewed
+from rgbt.transforms.example import viewed
 from rgbt.transforms.joint import whole_view
-from rgbt.types import IGNORE, Sample
+from rgbt.types import IGNORE, Example, Sample
 from tests.models.golden import compose
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "transform" / "cmx_released.yaml"

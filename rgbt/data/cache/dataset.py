@@ -57,14 +57,9 @@ def default_folder() -> Path:
 
 
 def check_cache(key: str, cache: object) -> None:
-    """Refuse words that would name a folder by mistake; "" would be the current folder.
+    """Refuse words such as "none" that would name a folder by mistake, and "", the current folder.
 
-    Args:
-        key: of the configuration; begins the message.
-        cache: see `cached_dataset`.
-
-    Raises:
-        InputError: not a text, an empty one, or a word such as "none".
+    `key` of the configuration begins the message; `cache` is as of `cached_dataset`.
     """
     if cache is None:
         return
@@ -78,12 +73,9 @@ def check_cache(key: str, cache: object) -> None:
 def cached_dataset(
     dataset: LabelledDataset, cache: str | None, *, num_threads: int
 ) -> LabelledDataset:
-    """`dataset`, or a `CachedDataset` of it.
+    """`dataset`, or a `CachedDataset` of it; `num_threads` images are decoded at a time.
 
-    Args:
-        dataset: reads the files.
-        cache: None: no cache; "auto": `default_folder`; otherwise a folder.
-        num_threads: images decoded at a time when the cache is filled.
+    `cache` is None, no cache; "auto", `default_folder`; or a folder.
     """
     if cache is None:
         return dataset
@@ -150,12 +142,9 @@ class CachedDataset(DatasetWrapper):
         self._cached |= {name: cache.samples[name] for name in wanted if name in cache.samples}
 
     def read(self, name: str) -> Sample:
-        """The sample as `source.read` returns it.
+        """The sample as `source.read` returns it, with its InputError.
 
         Samples of `ensure` are read-only views of the cache; all others are decoded.
-
-        Raises:
-            InputError: it could not be decoded, with the message of the data set.
         """
         if name in self._unreadable:
             raise InputError(self._unreadable[name])

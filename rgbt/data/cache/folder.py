@@ -204,13 +204,9 @@ def gigabytes(num_bytes: int) -> str:
 
 
 def caches_like(folder: Path, about: dict[str, Any]) -> list[Path]:
-    """Caches in `folder` of the same data set with the same decoding settings.
+    """Caches in `folder` of the same data set with the same decoding settings as those in `about`.
 
     The data set is the same if its files are equal, or if its root is.
-
-    Args:
-        folder: holds caches.
-        about: of the cache that others are compared with.
     """
     alike = []
     for path in sorted(folder.glob(f"*/{ABOUT}")):

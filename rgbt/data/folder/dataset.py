@@ -19,6 +19,7 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
+from rgbt.data.file_dataset import FileDataset
 from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
@@ -32,22 +33,15 @@ from rgbt.data.folder.values import (
     painted,
 )
 from rgbt.data.images import PairPattern
-from rgbt.data.named_files import (
-    check_lengths,
-    existing_file,
-    existing_root,
-    hash_of_files,
-    with_label,
-)
+from rgbt.data.named_files import existing_file, existing_root, hash_of_files
 from rgbt.data.report.folder import FolderChecks
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
-from rgbt.requirements import Record
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
 
 
-class Folder:
+class Folder(FileDataset):
     """RGB-thermal pairs in any folder whose paths follow patterns.
 
     A pattern is a path below the root with words in braces (`rgbt.data.folder.pattern`): {name}
@@ -83,6 +77,8 @@ class Folder:
         InputError: no such root, patterns that match nothing, or invalid settings.
     """
 
+    images: FolderImages
+
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
         root: Text,
@@ -107,14 +103,12 @@ class Folder:
         thermal_range: Range | None = None,
         night: Text | None = None,
     ) -> None:
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = _palette(num_classes, classes, palette, colours)
+        folder = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
+        palette = _palette(num_classes, classes, palette, colours)
+        super().__init__(folder, name, num_classes, classes, palette)
         self.unscored = unscored
         self.thermal_range = thermal_range
         self.night = night
-        check_lengths(num_classes, classes, self.palette)
         for word in classes:
             if classes.count(word) > 1:
                 raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
@@ -122,7 +116,6 @@ class Folder:
             check_choice("dataset.unscored", word, classes)
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
-        self.root = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
         self.patterns = patterns_of(rgb, thermal, label)
         self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
@@ -137,11 +130,6 @@ class Folder:
             self._check_night()
 
     @property
-    def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
-
-    @property
     def splits(self) -> dict[str, str]:
         """Split -> its pattern, list or share."""
         return self._rule.splits
@@ -152,30 +140,11 @@ class Folder:
         return self._rule.has(split)
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split: in the order of its list, or by their text and numbers.
-
-        Raises:
-            InputError: unknown split, no frame of it, no list.
-        """
+        """Names of a split: in the order of its list, or by their text and numbers."""
         self._check_split(split)
         if split not in self._names:
             self._names[split] = self._rule.names(split)
         return self._names[split]
-
-    def read(self, name: str) -> Sample:
-        """The frame called `name`, decoded, thermal values as grey levels, label values as classes.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W), all uint8; the label is None
-            if the data set, or the split of the frame, has none.
-
-        Raises:
-            InputError: no such name, a file is missing, cut short, outside the root, cannot be
-                decoded, has other channels, bits or size than expected, or a label holds a value
-                that no key names.
-        """
-        frame = self.frame(name)
-        return with_label(self.pair(name), self.label(name), frame.label)
 
     def pair(self, name: str) -> Sample:
         """The images of `read` alone, without the label; InputError as there."""
@@ -184,7 +153,7 @@ class Folder:
         return self.images.read(name, rgb, self._there("thermal image", frame.thermal, name))
 
     def label(self, name: str) -> Array | None:
-        """The label of `read` alone, (H, W) uint8; None if it has none; errors as there."""
+        """The label of `read` alone, (H, W) uint8; None if the data set or the split has none."""
         frame = self.frame(name)
         if frame.label is None or name in self._without_labels:
             return None
@@ -220,11 +189,7 @@ class Folder:
         return tuple(fnmatchcase(name, self.night) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
-
-        It includes the meaning of label values, but not the root, so that equal copies have equal
-        fingerprints. Nothing is decoded; missing files have size -1.
-        """
+        """SHA-256 in hexadecimal over `hash_of_files` and the meaning of label values."""
         listed = {
             split: tuple(name for name in self.names(split) if name in self.frames)
             if self.has(split)

@@ -70,11 +70,7 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
 
 
 def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
-    """Name -> frame, of every RGB image, in the order of the names (9 before 10).
-
-    Args:
-        root: what the patterns are relative to.
-        patterns: of the three images.
+    """Name -> frame, of every RGB image below `root`, in the order of the names (9 before 10).
 
     Raises:
         InputError: no RGB image, no thermal image, two frames of one name, or two that would
@@ -103,16 +99,7 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
 
 
 def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) -> None:
-    """Refuse a pattern by which none of the frames has an existing file.
-
-    Args:
-        pattern: of thermal images or labels.
-        frames: none, or those that should have such a file.
-        root: what the pattern is relative to.
-
-    Raises:
-        InputError: naming the first file and the content of its folder.
-    """
+    """Refuse a pattern by which no frame of `frames`, if there are any, has an existing file."""
     paths = [pattern.path(root, frame.values) for frame in frames]
     if paths and not any(map(os.path.lexists, paths)):
         raise InputError(

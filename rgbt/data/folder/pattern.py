@@ -76,14 +76,9 @@ class Pattern:
     def files(
         self, root: Path, values: WordValues = NO_VALUES, *, any_case: bool = False
     ) -> Iterator[PathMatch]:
-        """The paths below `root` that match.
+        """The paths below `root` that match; words with a value match this one alone.
 
         Names that begin with a dot are left out, as operating systems write such files.
-
-        Args:
-            root: what the pattern is relative to.
-            values: of the known words; the others match any text.
-            any_case: whether case is ignored.
 
         Raises:
             InputError: a folder may not be listed.

@@ -163,8 +163,8 @@ class ByShare:
         block: frames of a unit; None: sequences stay whole.
 
     Raises:
-        InputError: shares that are not positive or not 1 together, a block that is not positive,
-            nothing that can be drawn, or a split that would get no frame.
+        InputError: shares that are not positive or not 1 together, nothing that can be
+            drawn, or a split that would get no frame.
     """
 
     frames: Frames
@@ -180,8 +180,6 @@ class ByShare:
                 "dataset.shares: expected shares above 0 that are 1 together, such as {train: 0.8, "
                 f"val: 0.1, test: 0.1}}, got {self.shares}."
             )
-        if self.block is not None and self.block < 1:
-            raise InputError(f"dataset.block: expected at least 1 frame, got {self.block}.")
         units = self.units
         if len(units) < len(self.shares):
             raise InputError(

@@ -90,16 +90,10 @@ def label_codes(
     colours: Colours | None,
     ignored: tuple[int | Colour, ...],
 ) -> LabelCodes:
-    """What the configuration says of label values.
+    """What the configuration says of label values, see `rgbt.data.folder.dataset.Folder`.
 
     Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
     it a class.
-
-    Args:
-        classes: in the order of their indices.
-        ids: value -> class; several values may be one class.
-        colours: class -> its colour, or several.
-        ignored: values, or colours, that do not count.
 
     Raises:
         InputError: both ids and colours, an unknown class, an invalid value or colour, or one
@@ -155,8 +149,6 @@ def _code(value: int | Colour, *, of_colours: bool) -> int:
         )
     if isinstance(value, int):
         return value
-    if not all(0 <= level <= 255 for level in value):
-        raise InputError(f"dataset.colours: expected levels from 0 to 255, got {_plain(value)}.")
     red, green, blue = value
     return 65536 * red + 256 * green + blue
 
@@ -208,19 +200,11 @@ def read_values(path: Path) -> NDArray[Any]:
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
     """Grey levels of thermal values: round(255 (min(max(v, low), high) - low) / (high - low)).
 
-    Halves go upwards, as in `rgbt.data.freiburg`.
-
-    Args:
-        values: (H, W).
-        limits: (low, high), the values that become black and white; None: they are grey levels.
-        path: where they are from, for messages.
-
-    Returns:
-        (H, W) uint8.
+    Halves go upwards. Without `limits`, (low, high), the values are grey levels.
 
     Raises:
         InputError: values of another depth than 8 bits without limits, or of 8 bits with limits
-            that these cannot reach.
+            that these cannot reach; the message names `path`.
     """
     if limits is None:
         if values.dtype != np.uint8:
@@ -235,7 +219,7 @@ def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
             "8 bits; use the original file, or set dataset.thermal_range=null for grey levels."
         )
     if values.dtype == np.uint16:
-        return np.take(_levels(*limits), values)
+        return np.take(levels_of_16_bits(*limits), values)
     return _stretched(values, *limits)
 
 
@@ -254,7 +238,7 @@ def plain(limits: Range) -> str:
 
 
 @lru_cache(maxsize=4)
-def _levels(low: float, high: float) -> Array:
+def levels_of_16_bits(low: float, high: float) -> Array:
     """(65536,) uint8, the grey level of every value of 16 bits."""
     return _stretched(np.arange(np.iinfo(np.uint16).max + 1), low, high)
 

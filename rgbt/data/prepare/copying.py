@@ -56,14 +56,9 @@ class Item(NamedTuple):
 def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> None:
     """Refuse a folder that this command must not write to; nothing is written yet.
 
-    Args:
-        out: new, empty, or begun by the same command.
-        sources: must not contain `out`.
-        plan: arguments of the command.
-
     Raises:
-        InputError: it is inside one of `sources`, holds other files, or was begun with other
-            arguments.
+        InputError: `out` is inside one of `sources`, holds other files, or was begun with other
+            arguments than those of `plan`.
     """
     for source in sources:
         if out.resolve().is_relative_to(source.resolve()):
@@ -92,11 +87,7 @@ def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> Non
 
 @contextmanager
 def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
-    """Make `out` and lock it until the end.
-
-    Args:
-        out: passed `check_out`.
-        plan: written into it.
+    """Make `out`, which passed `check_out`, write `plan` into it and lock it until the end.
 
     Raises:
         InputError: it is being written by another process, or cannot be written.
@@ -120,12 +111,9 @@ def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
 
 
 def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) -> None:
-    """Write those of `items` that do not exist yet.
+    """Write those of `items`, which have different targets, that do not exist yet in `out`.
 
-    Args:
-        items: with different targets.
-        out: of `claimed`.
-        advance: called with the bytes of every file that exists or has been written.
+    `advance` is called with the bytes of every file that exists or has been written.
 
     Raises:
         InputError: other files in the folders, too little space, or a file of the download that

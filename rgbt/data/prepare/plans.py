@@ -82,10 +82,8 @@ def add_once(found: dict[str, SourceFile], key: str, entry: SourceFile) -> None:
 def base_of(source: SourceFiles, holds: Callable[[Callable[[str], bool]], bool], what: str) -> str:
     """Prefix of the paths in the one folder of least depth for which `holds` is true.
 
-    Args:
-        source: the download.
-        holds: called with a function that returns whether a folder is inside.
-        what: expected content, for the message.
+    `holds` is called with a function that returns whether a folder is inside; `what` is the
+    expected content, for the message.
     """
     folders = source.folders()
     bases = ["" if folder == "" else f"{folder}/" for folder in folders]

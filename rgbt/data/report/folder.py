@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from rgbt.data.folder.values import plain
 from rgbt.data.report.lists import listed_twice, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
-
-if TYPE_CHECKING:
-    from rgbt.data.folder.dataset import Folder
+from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport, ThermalStatistics
 
 MOST_CLIPPED = 0.5
 """Largest share of the thermal values of a split that may be outside `thermal_range`."""
 
 
-class _Clipped(NamedTuple):
-    """Of the thermal values of one image that are not 0: how many, how many outside, their ends."""
+class FolderChecks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    filled: int
-    outside: int
-    lowest: float
-    highest: float
+    dataset: Any  # a Folder, whose module imports this one
 
-
-class FolderChecks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
-
-    def __init__(self, dataset: Folder) -> None:
-        self.dataset = dataset
-        self._clipped: dict[str, _Clipped] = {}
+    def __init__(self, dataset: Any) -> None:
+        super().__init__(dataset)
+        self._statistics: dict[str, ThermalStatistics] = {}
 
     @property
     def title(self) -> str:
@@ -40,35 +28,13 @@ class FolderChecks:
         where = "channel 4" if self.dataset.packed else thermal.text
         return f"RGB {rgb.text}, thermal {where}"
 
-    def repeats(self, split: str) -> bool:
-        """Parts of a split by time of day need not exist."""
-        return split.endswith(("_day", "_night"))
-
-    def times(self, names: tuple[str, ...]) -> DayNight:
-        """By `dataset.night`; zeros if it is not given."""
-        nights = self.dataset.nights(names)
-        return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
-
     def thermal(self, name: str) -> ThermalStatistics | None:
-        """Statistics of the values of the camera; None if the files hold grey levels."""
-        limits = self.dataset.thermal_range
-        if limits is None:
+        """Of the values of the camera; None if the files hold grey levels."""
+        if self.dataset.thermal_range is None:
             return None
         values = self.dataset.values(name)
-        filled = values[values != 0]
-        below, above = (
-            int(np.count_nonzero(each)) for each in (filled < limits[0], filled > limits[1])
-        )
-        lowest, highest = (float(end(filled)) if filled.size else 0.0 for end in (np.min, np.max))
-        self._clipped[name] = _Clipped(filled.size, below + above, lowest, highest)
-        return ThermalStatistics(
-            pixels=values.size,
-            empty=values.size - filled.size,
-            below=below,
-            above=above,
-            lowest=int(np.floor(lowest)),
-            highest=int(np.ceil(highest)),
-        )
+        self._statistics[name] = ThermalStatistics.of(values, *self.dataset.thermal_range)
+        return self._statistics[name]
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice, files without an RGB image, a range that excludes the values."""
@@ -102,14 +68,11 @@ class FolderChecks:
     def _missed(self, lists: SplitNames) -> list[str]:
         problems = []
         for split, names in lists.items():
-            read = [self._clipped[name] for name in set(names) if name in self._clipped]
-            filled = sum(each.filled for each in read)
-            outside = sum(each.outside for each in read)
+            read = [self._statistics[name] for name in set(names) if name in self._statistics]
+            filled = sum(each.pixels - each.empty for each in read)
+            outside = sum(each.below + each.above for each in read)
             if self.dataset.thermal_range is not None and outside > MOST_CLIPPED * filled:
-                lowest, highest = (
-                    min(each.lowest for each in read),
-                    max(each.highest for each in read),
-                )
+                lowest, highest = min(each.lowest for each in read), max(e.highest for e in read)
                 problems.append(
                     f"split {split}: {outside / filled:.2%} of the thermal values other than 0 lie "
                     f"outside dataset.thermal_range={plain(self.dataset.thermal_range)} and become "
@@ -124,11 +87,10 @@ class FolderChecks:
         for split in splits:
             if limits is None or split.thermal is None:
                 continue
-            pixels, empty, below, above, _, _ = split.thermal
+            empty, below, above = split.thermal.shares()
             notes.append(
-                f"split {split.split}: of the thermal pixels {empty / pixels:.2%} are 0, "
-                f"{below / pixels:.2%} lie below and {above / pixels:.2%} above "
-                f"dataset.thermal_range={plain(limits)}."
+                f"split {split.split}: of the thermal pixels {empty} are 0, {below} lie below and "
+                f"{above} above dataset.thermal_range={plain(limits)}."
             )
         return notes
 

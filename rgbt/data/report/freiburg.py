@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import Any
 
 from rgbt.data.freiburg_layout import unused_files
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
-
-if TYPE_CHECKING:
-    from rgbt.data.freiburg import Freiburg
+from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport, ThermalStatistics
 
 
-class FreiburgChecks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
+class FreiburgChecks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    def __init__(self, dataset: Freiburg) -> None:
-        self.dataset = dataset
+    dataset: Any  # a Freiburg, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -28,24 +22,9 @@ class FreiburgChecks:
         """The split "train" is "train_day", and "test" the day followed by the night."""
         return split in ("train", "test")
 
-    def times(self, names: tuple[str, ...]) -> DayNight:
-        """By the folders."""
-        nights = sum(self.dataset.nights(names))
-        return DayNight(len(names) - nights, nights)
-
     def thermal(self, name: str) -> ThermalStatistics:
-        """Statistics of the counts in the crop."""
-        counts = self.dataset.counts(name)
-        low, high = self.dataset.thermal_range
-        filled = counts[counts > 0]
-        return ThermalStatistics(
-            pixels=counts.size,
-            empty=counts.size - filled.size,
-            below=int(np.count_nonzero(filled < low)),
-            above=int(np.count_nonzero(filled > high)),
-            lowest=int(filled.min(initial=np.iinfo(np.uint16).max)) if filled.size else 0,
-            highest=int(counts.max()),
-        )
+        """Of the counts in the crop."""
+        return ThermalStatistics.of(self.dataset.counts(name), *self.dataset.thermal_range)
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Files without an RGB image, and test frames that training has as well."""
@@ -58,12 +37,11 @@ class FreiburgChecks:
         for split in splits:
             if split.thermal is None or self.repeats(split.split):
                 continue
-            pixels, empty, below, above, lowest, highest = split.thermal
+            empty, below, above = split.thermal.shares()
             notes.append(
-                f"split {split.split}: of the thermal pixels {empty / pixels:.2%} are 0, which "
-                f"margins are, {below / pixels:.2%} lie below and {above / pixels:.2%} above "
-                f"dataset.thermal_range=[{low}, {high}]; counts other than 0 run from {lowest} to "
-                f"{highest}."
+                f"split {split.split}: of the thermal pixels {empty} are 0, which margins are, "
+                f"{below} lie below and {above} above dataset.thermal_range=[{low}, {high}]; "
+                f"counts other than 0 run from {split.thermal.lowest} to {split.thermal.highest}."
             )
         return notes
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rgbt.data.kp_layout import NAME, TIMES, is_night, set_of
 from rgbt.data.report.lists import listed_twice, other_sizes, other_times, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport
-
-if TYPE_CHECKING:
-    from rgbt.data.kp import KP
+from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport
 
 OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 """Day and night images of each split of the CRM release: 499, 140 and 311."""
@@ -17,11 +14,10 @@ OFFICIAL_DAY_NIGHT = {"train": (261, 238), "val": (64, 76), "test": (178, 133)}
 HW = (512, 640)
 
 
-class KPChecks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
+class KPChecks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    def __init__(self, dataset: KP) -> None:
-        self.dataset = dataset
+    dataset: Any  # a KP, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -29,18 +25,6 @@ class KPChecks:
         images = "the CRM release" if self.dataset.has_images else "MS-UDA"
         origin = "list files" if self.dataset.lists == "files" else "set numbers"
         return f"KP in the layout of {images}, splits from {origin}"
-
-    def repeats(self, split: str) -> bool:
-        """Splits by time of day only repeat names of others."""
-        return split.endswith(("_day", "_night"))
-
-    def times(self, names: tuple[str, ...]) -> DayNight:
-        """By the sets."""
-        nights = sum(self.dataset.nights(names))
-        return DayNight(len(names) - nights, nights)
-
-    def thermal(self, name: str) -> None:
-        """None: thermal images are grey levels."""
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice, in two splits or at the wrong time; labels that are in no split."""

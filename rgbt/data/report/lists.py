@@ -22,12 +22,7 @@ def listed_twice(lists: SplitNames) -> list[str]:
 def shared(
     lists: SplitNames, may_share: Callable[[str, str], bool] = lambda *_: False
 ) -> list[str]:
-    """Names in two splits, unless one is a part of the other by name.
-
-    Args:
-        lists: split -> names.
-        may_share: whether two splits may have names in common although neither is a part.
-    """
+    """Names in two splits, unless one is a part of the other by name or `may_share` says so."""
     problems = []
     for one, other in combinations(lists, 2):
         if is_part(one, other) or may_share(one, other):
@@ -50,12 +45,7 @@ def is_part(one: str, other: str) -> bool:
 def other_times(
     splits: tuple[SplitReport, ...], official: Mapping[str, tuple[int, int]]
 ) -> list[str]:
-    """Differences from the official numbers of day and night images.
-
-    Args:
-        splits: of the report.
-        official: split -> (day, night) of the splits that are compared.
-    """
+    """Differences from the official numbers, split -> (day, night), of the splits in `official`."""
     notes = []
     for split in splits:
         counts = (split.num_day, split.num_night)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rgbt.data.mfnet_layout import MIRRORED, base_name
 from rgbt.data.report.lists import other_times, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport
-
-if TYPE_CHECKING:
-    from rgbt.data.mfnet import MFNet
+from rgbt.data.report.values import DatasetChecks, DayNight, SplitNames, SplitReport
 
 OFFICIAL_DAY_NIGHT = {"train": (410, 374), "val": (205, 187), "test": (205, 188)}
 """Day and night images of each split of MFNet (784, 392 and 393 names), without mirrored copies."""
@@ -25,11 +22,10 @@ OFFICIAL_COUNTS = {
 NAME = re.compile(rf"\d{{5}}[DN]({MIRRORED})?")
 
 
-class MFNetChecks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
+class MFNetChecks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    def __init__(self, dataset: MFNet) -> None:
-        self.dataset = dataset
+    dataset: Any  # a MFNet, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -45,9 +41,6 @@ class MFNetChecks:
         letters = Counter(name[-1:] for name in names if not name.endswith(MIRRORED))
         return DayNight(letters["D"], letters["N"], sum(name.endswith(MIRRORED) for name in names))
 
-    def thermal(self, name: str) -> None:
-        """None: thermal images are grey levels."""
-
     def problems(self, lists: SplitNames) -> list[str]:
         """Wrong names, names in two splits, files in no list."""
         return [*_name_problems(lists), *shared(lists, self._share_a_list), *self._unlisted(lists)]
@@ -59,7 +52,7 @@ class MFNetChecks:
         return other_times(splits, OFFICIAL_COUNTS)
 
     def _share_a_list(self, one: str, other: str) -> bool:
-        return self.dataset.list_path(one) == self.dataset.list_path(other)
+        return bool(self.dataset.list_path(one) == self.dataset.list_path(other))
 
     def _unlisted(self, lists: SplitNames) -> list[str]:
         unlisted = sorted(self.dataset.names_on_disk() - set().union(*lists.values()))

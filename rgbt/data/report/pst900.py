@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import Any
 
 from rgbt.data.named_files import names_in
 from rgbt.data.pst900_layout import FOLDERS, bag_of
 from rgbt.data.report.lists import listed_twice, other_sizes, shared
-from rgbt.data.report.values import DayNight, SplitNames, SplitReport, ThermalStatistics
-
-if TYPE_CHECKING:
-    from rgbt.data.pst900 import PST900
+from rgbt.data.report.values import DatasetChecks, SplitNames, SplitReport, ThermalStatistics
 
 NUM_TRAIN = 597
 """Pairs of the training part on disk; the data set's page says 606."""
@@ -25,11 +20,10 @@ TEST_BAGS = {21: 40, 22: 59, 23: 28, 24: 72, 25: 89}
 HW = (720, 1280)
 
 
-class PST900Checks:
-    """See `rgbt.data.report.values.DatasetChecks`."""
+class PST900Checks(DatasetChecks):
+    """Overrides what differs from other data sets."""
 
-    def __init__(self, dataset: PST900) -> None:
-        self.dataset = dataset
+    dataset: Any  # a PST900, whose module imports this one
 
     @property
     def title(self) -> str:
@@ -40,22 +34,9 @@ class PST900Checks:
         """The validation split is the test part, unless it has a list or bags of its own."""
         return self._is_test(split) and split != "test"
 
-    def times(self, names: tuple[str, ...]) -> DayNight:  # noqa: ARG002 - as every layout
-        """None: images are taken underground."""
-        return DayNight(0, 0)
-
     def thermal(self, name: str) -> ThermalStatistics:
-        """Grey levels; those of 0 were not measured."""
-        thermal = self.dataset.thermal(name)
-        filled = thermal[thermal > 0]
-        return ThermalStatistics(
-            pixels=thermal.size,
-            empty=thermal.size - filled.size,
-            below=0,
-            above=0,
-            lowest=int(filled.min(initial=np.iinfo(np.uint8).max)) if filled.size else 0,
-            highest=int(thermal.max()),
-        )
+        """Of grey levels; those of 0 were not measured."""
+        return ThermalStatistics.of(self.dataset.thermal(name), 0, 255)
 
     def problems(self, lists: SplitNames) -> list[str]:
         """Names listed twice or in two parts, files that belong to no image of a split."""
@@ -70,7 +51,7 @@ class PST900Checks:
         return [*notes, *(note for split in splits for note in self._holes(split))]
 
     def _is_test(self, split: str) -> bool:
-        return self.dataset.part_of(split) == "test"
+        return bool(self.dataset.part_of(split) == "test")
 
     def _of_val(self) -> str:
         return (
@@ -129,8 +110,8 @@ class PST900Checks:
     def _holes(self, split: SplitReport) -> list[str]:
         if split.thermal is None or self.repeats(split.split):
             return []
-        pixels, empty, _, _, lowest, highest = split.thermal
         return [
-            f"split {split.split}: {empty / pixels:.2%} of the thermal pixels are 0, which those "
-            f"without a measurement are; others run from {lowest} to {highest}."
+            f"split {split.split}: {split.thermal.shares()[0]} of the thermal pixels are 0, which "
+            f"those without a measurement are; others run from {split.thermal.lowest} to "
+            f"{split.thermal.highest}."
         ]

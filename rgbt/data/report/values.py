@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rgbt.dataset import LabelledDataset
 
 PixelCounts = NDArray[np.int64]
 
@@ -52,23 +54,41 @@ class SplitReport:
 
 
 class ThermalStatistics(NamedTuple):
-    """Pixels of thermal images by their counts.
+    """Pixels of thermal images by their values.
 
     Attributes:
         pixels: all.
-        empty: of these, those of count 0, which margins have.
+        empty: of these, those of value 0, which margins have.
         below: others below the range that is read.
         above: above it.
-        lowest: smallest count that is not 0; 0 where there is none.
-        highest: largest count.
+        lowest: smallest value that is not 0; 0 where there is none.
+        highest: largest of them.
     """
 
     pixels: int
     empty: int
     below: int
     above: int
-    lowest: int
-    highest: int
+    lowest: float
+    highest: float
+
+    @classmethod
+    def of(cls, values: NDArray[Any], low: float, high: float) -> ThermalStatistics:
+        """Those of one image (H, W), read from `low` to `high`."""
+        filled = values[values != 0]
+        return cls(
+            pixels=values.size,
+            empty=values.size - filled.size,
+            below=int(np.count_nonzero(filled < low)),
+            above=int(np.count_nonzero(filled > high)),
+            lowest=filled.min().item() if filled.size else 0,
+            highest=filled.max().item() if filled.size else 0,
+        )
+
+    def shares(self) -> tuple[str, str, str]:
+        """Shares of `empty`, `below` and `above` in all pixels, for a message."""
+        empty, below, above = (f"{each / self.pixels:.2%}" for each in self[1:4])
+        return empty, below, above
 
 
 @dataclass(frozen=True)
@@ -84,33 +104,41 @@ SplitNames = dict[str, tuple[str, ...]]
 """Split -> names, of the splits whose names could be read."""
 
 
-class DatasetChecks(Protocol):
-    """The checks of one data set, in addition to those of every data set."""
+class DatasetChecks:
+    """The checks of one data set, in addition to those of every data set; subclasses override them.
+
+    Args:
+        dataset: is checked.
+    """
+
+    def __init__(self, dataset: LabelledDataset) -> None:
+        self.dataset = dataset
 
     @property
     def title(self) -> str:
         """The layout, for a headline."""
-        ...
+        return type(self.dataset).__name__
 
     def repeats(self, split: str) -> bool:
         """Whether a split only repeats images of other splits, and need not exist."""
-        ...
+        return split.endswith(("_day", "_night"))
 
     def times(self, names: tuple[str, ...]) -> DayNight:
-        """Number of day and of night images."""
-        ...
+        """Number of day and of night images; zeros if the data set does not state it."""
+        nights = self.dataset.nights(names)
+        return DayNight(0, 0) if nights is None else DayNight(len(names) - sum(nights), sum(nights))
 
-    def thermal(self, name: str) -> ThermalStatistics | None:
-        """Counts of one thermal image, or None; InputError if it cannot be read."""
-        ...
+    def thermal(self, name: str) -> ThermalStatistics | None:  # noqa: ARG002 - of subclasses
+        """Statistics of one thermal image, or None; InputError if it cannot be read."""
+        return None
 
-    def problems(self, lists: SplitNames) -> list[str]:
+    def problems(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
         """Problems of names and files; no file is opened."""
-        ...
+        return []
 
-    def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:
+    def notes(self, splits: tuple[SplitReport, ...]) -> list[str]:  # noqa: ARG002 - of subclasses
         """Remarks about the samples that were read."""
-        ...
+        return []
 
 
 @runtime_checkable

@@ -49,9 +49,7 @@ NUM_TREES = 5
 def tree(kind: int, near: bool = True) -> Shape:
     """A tree of 6 m: trunk, branches and a crown of ragged blobs, darker below.
 
-    Args:
-        kind: 0 to `NUM_TREES` - 1.
-        near: with branches and six blobs rather than three.
+    Trees that are not `near` have no branches, and three blobs rather than six.
     """
     generator = numpy_generator(0, "synth/tree", kind)
     parts = [Face(upright(tube((0, 0), (0.1, 2.8), 0.30)), "bark", thin=True)]
@@ -131,11 +129,7 @@ NUM_SIGNS = 3
 
 @cache
 def sign(kind: int) -> Shape:
-    """A traffic sign: round and red-rimmed, square and blue, or a white board.
-
-    Args:
-        kind: 0 to `NUM_SIGNS` - 1.
-    """
+    """A traffic sign: round and red-rimmed, square and blue, or a white board."""
     parts = [Face(upright(rectangle(-0.04, 0.0, 0.04, 2.7)), "pole", thin=True)]
     if kind == 0:
         rings = ((0.34, "sign_red"), (0.25, "sign_white"), (0.12, "sign_blue"))

@@ -9,12 +9,14 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from rgbt.checks import InputError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
+Plan = TypeVar("Plan", bound="DataclassInstance")
 
 
 def default_cache() -> Path:
@@ -23,46 +25,40 @@ def default_cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "rgbt"
 
 
-def cache_of(cache_dir: str | None) -> Path:
-    """The folder that the configuration names; None: `default_cache`."""
-    return Path(cache_dir).expanduser() if cache_dir else default_cache()
-
-
-def described(versions: Mapping[str, int], plan: DataclassInstance) -> str:
-    """A plan and the versions of what writes it, as text: what the name of its folder hashes."""
-    everything: dict[str, Any] = {**versions, **asdict(plan)}
-    return json.dumps(everything, sort_keys=True, indent=1)
-
-
-def key_of(text: str) -> str:
-    """12 hexadecimal digits that name what is described."""
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-def written_once(folder: Path, plan: str, write: Callable[[Path], None]) -> Path:
-    """`folder`, written now if it is not there yet.
+def written_once(
+    name: str,
+    versions: Mapping[str, int],
+    plan: Plan,
+    cache_dir: str | Path | None,
+    write: Callable[[Plan, Path], None],
+) -> Path:
+    """The folder of a data set, written now if it is not there yet.
 
     It is written under another name and renamed when complete, so that an interrupted generation
     leaves nothing that looks like a data set, and two at once cannot mix.
 
     Args:
-        folder: named by its content; its parents are made.
+        name: of the data set; begins the name of the folder, which a hash of the next two ends.
+        versions: of what writes it.
         plan: what it is made from, kept in it as plan.json.
+        cache_dir: folder that holds written data sets; None: `default_cache`.
         write: fills the empty folder that it is given.
 
     Raises:
         InputError: the cache cannot be written.
     """
+    text = json.dumps({**versions, **asdict(plan)}, sort_keys=True, indent=1)
+    cache = Path(cache_dir).expanduser() if cache_dir else default_cache()
+    folder = cache / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if folder.is_dir():
         return folder
-    cache = folder.parent
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".synth-", dir=cache) as scratch:
             made = Path(scratch) / "made"
             made.mkdir()
-            write(made)
-            (made / "plan.json").write_text(plan + "\n", encoding="utf-8")
+            write(plan, made)
+            (made / "plan.json").write_text(text + "\n", encoding="utf-8")
             _publish(made, folder)
     except OSError as error:
         raise InputError(

@@ -41,11 +41,7 @@ NUM_CARS = len(_BODIES)
 
 @cache
 def car(kind: int) -> Shape:
-    """A car heading along +z: underside, body, cabin, windows, lights, plate, wheels.
-
-    Args:
-        kind: 0 to `NUM_CARS` - 1.
-    """
+    """A car heading along +z: underside, body, cabin, windows, lights, plate, wheels."""
     body = _BODIES[kind]
     half = body.width / 2
     parts = [*_underside(body, half), *_shell(body, half), *_cabin(body, half - 0.13)]

@@ -7,7 +7,7 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.data.synth.cache import cache_of, described, key_of, written_once
+from rgbt.data.synth.cache import written_once
 from rgbt.data.synth.factors import (
     EgoMotion,
     ForwardMetres,
@@ -71,23 +71,9 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
         factors=factors,
         motion=motion,
     )
-    return MFNet(str(cached(plan, cache_of(cache_dir))), name="synth", num_classes=num_classes)
+    return MFNet(str(cached(plan, cache_dir)), name="synth", num_classes=num_classes)
 
 
-def cached(plan: SynthPlan, cache: Path) -> Path:
-    """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
-
-    Raises:
-        InputError: the cache cannot be written.
-    """
-    folder = cache / f"synth-{plan_key(plan)}"
-    return written_once(folder, _described(plan), lambda made: write(plan, made))
-
-
-def plan_key(plan: SynthPlan) -> str:
-    """12 hexadecimal digits that name the plan: a hash of all its numbers and `VERSION`."""
-    return key_of(_described(plan))
-
-
-def _described(plan: SynthPlan) -> str:
-    return described({"version": VERSION}, plan)
+def cached(plan: SynthPlan, cache_dir: str | Path | None) -> Path:
+    """The folder of `plan`, see `written_once`."""
+    return written_once("synth", {"version": VERSION}, plan, cache_dir, write)

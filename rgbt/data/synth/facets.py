@@ -52,12 +52,7 @@ def sorted_for_drawing(placed: Sequence[Placed]) -> list[Placed]:
 
 
 def facets_of(ground: Quads, placed: Sequence[Placed]) -> Facets:
-    """The ground's quads, then the parts of `placed` in the order given.
-
-    Args:
-        ground: of `ground_quads`.
-        placed: at least one object, in drawing order.
-    """
+    """The ground's quads, then the parts of `placed`, one or more, in the order given."""
     shapes = [thing.shape for thing in placed]
     owner = np.repeat(np.arange(len(placed)), [len(shape.meta) for shape in shapes])
     # One table of numbers per object: many small arrays would cost more than all the arithmetic.

@@ -88,14 +88,12 @@ def with_factors(
     """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
 
     The keys of a data set in the configuration are the arguments of the function that makes it, so
-    its signature shows every factor without naming it a second time.
+    its signature shows every factor without naming it a second time. What is made takes keywords
+    alone.
 
     Args:
         left_out: factors that the data set decides itself; they keep their default.
         defaults: of factors that have another one in this data set.
-
-    Returns:
-        decorator; what it makes takes keywords alone.
     """
 
     def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:

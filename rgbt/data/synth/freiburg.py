@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval
 
 from rgbt.data.freiburg import THERMAL_RANGE, CountRange, Crop, Freiburg
-from rgbt.data.synth.cache import cache_of, described, key_of, written_once
+from rgbt.data.synth.cache import written_once
 from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
 from rgbt.data.synth.freiburg_writer import VAL_SEQUENCE, FreiburgPlan, write
@@ -40,24 +40,18 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     "ignore" is in test labels alone: what the thermal camera does not see.
 
     Args:
-        cache_dir: folder that holds written data sets; None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt.
-        num_classes: the fourteen of Freiburg; other nodes of the configuration interpolate it.
-        unscored: see `rgbt.data.freiburg.Freiburg`, like the three that follow.
+        cache_dir: see `rgbt.data.synth.dataset.synth`, as `seed`, `factors` and the errors.
+        num_classes: see `rgbt.data.freiburg.Freiburg`, like the four that follow.
+        unscored: the same.
         crop: what is read of each frame; it fits the size of the frames.
         thermal_range: counts that become black and white; scenes use the thesis' range.
-        ignored_test: classes that do not count in "val" and "test".
-        seed: of the data set; independent of the seed of a run.
+        ignored_test: the same.
+        seed: of the data set.
         num_train_day: labelled scenes by day.
         num_train_night: unlabelled scenes at night; other scenes than those by day.
         num_val: labelled scenes by day of the sequence that is held out.
         num_test: labelled scenes for testing, half by day and half at night.
-        factors: given as keywords, all but `night_share`; see `SceneFactors`.
-
-    Returns:
-        the reader of the written folder.
-
-    Raises:
-        InputError: a factor out of range, a cache that cannot be written.
+        factors: all but `night_share`.
     """
     plan = FreiburgPlan(
         seed=seed,
@@ -68,7 +62,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
         factors=factors,
     )
     return Freiburg(
-        str(cached(plan, cache_of(cache_dir))),
+        str(cached(plan, cache_dir)),
         name="synth_freiburg",
         num_classes=num_classes,
         unscored=unscored,
@@ -79,13 +73,7 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     )
 
 
-def cached(plan: FreiburgPlan, cache: Path) -> Path:
-    """Folder of the data set `plan` inside `cache`, written now if it is not there yet.
-
-    Raises:
-        InputError: the cache cannot be written.
-    """
-    text = described({"scenes": SCENES_VERSION, "files": VERSION}, plan)
-    return written_once(
-        cache / f"synth_freiburg-{key_of(text)}", text, lambda made: write(plan, made)
-    )
+def cached(plan: FreiburgPlan, cache_dir: str | Path | None) -> Path:
+    """The folder of `plan`, see `written_once`."""
+    versions = {"scenes": SCENES_VERSION, "files": VERSION}
+    return written_once("synth_freiburg", versions, plan, cache_dir, write)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from rgbt.data.freiburg import CLASSES
 from rgbt.data.freiburg_layout import LABEL, RGB, TEST_LABEL, THERMAL
 from rgbt.data.synth.camera import Floats
+from rgbt.data.synth.classes import freiburg_ids
 from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.freiburg_classes import class_ids
 from rgbt.data.synth.scene import Scene, render_scene
-from rgbt.data.synth.writer import write_each, write_png
+from rgbt.data.synth.writer import bgr, write_each, write_image
 
 VAL_SEQUENCE = "seq_04_day"
 _DAY_SEQUENCES, _NIGHT_SEQUENCES = 4, 3
@@ -99,11 +99,7 @@ def _in_sequences(time: str, num: int, sequences: int) -> Iterator[tuple[str, bo
 
 
 def write(plan: FreiburgPlan, folder: Path) -> None:
-    """Write the whole data set into `folder`, which exists.
-
-    Raises:
-        OSError: the files cannot be written.
-    """
+    """Write the whole data set into `folder`, which exists; OSError if that is not possible."""
     shots = plan.shots()
     write_each(partial(_write_numbered, plan, shots, folder), len(shots))
 
@@ -111,11 +107,10 @@ def write(plan: FreiburgPlan, folder: Path) -> None:
 def _write_numbered(
     plan: FreiburgPlan, shots: tuple[FrameToWrite, ...], folder: Path, number: int
 ) -> None:
-    cv2.setNumThreads(1)
     shot = shots[number]
     factors = replace(plan.factors, night_share=float(shot.night))
     scene = render_scene(plan.seed, shot.scene, factors)
-    ids = class_ids(scene.label, scene.material)
+    ids = freiburg_ids(scene.label, scene.material)
     seen = seen_in_thermal(*ids.shape)
     counts = np.where(seen, counts_of(scene.grey), np.uint16(0))
     write_shot = _write_test if shot.part.startswith("test/") else _write_training
@@ -129,13 +124,13 @@ def _write_training(
     ids: NDArray[np.uint8],
     counts: NDArray[np.uint16],
 ) -> None:
-    _write(piece / RGB / f"{RGB}_{shot.stamp}.png", _bgr(scene))
-    _write(piece / THERMAL / f"{THERMAL}_{shot.stamp}.png", counts)
+    write_image(piece / RGB / f"{RGB}_{shot.stamp}.png", bgr(scene))
+    write_image(piece / THERMAL / f"{THERMAL}_{shot.stamp}.png", counts)
     if shot.night:
         return
     if piece.parent.name == _LARGE_LABELS:
         ids = np.repeat(np.repeat(ids, 2, axis=0), 2, axis=1)
-    _write(piece / LABEL / f"{LABEL}_{shot.stamp}.png", ids)
+    write_image(piece / LABEL / f"{LABEL}_{shot.stamp}.png", ids)
 
 
 def _write_test(
@@ -143,23 +138,13 @@ def _write_test(
 ) -> None:
     rgb, thermal = _TEST_FOLDERS[shot.night]
     of_thermal = shot.stamp if shot.night else shot.stamp.removesuffix("0")
-    _write(part / rgb / f"{shot.stamp}_rgb.png", _bgr(scene))
-    _write(part / thermal / f"{of_thermal}_ir.png", counts)
+    write_image(part / rgb / f"{shot.stamp}_rgb.png", bgr(scene))
+    write_image(part / thermal / f"{of_thermal}_ir.png", counts)
     # By hand only that is labelled which both cameras see.
     label = np.where(counts > 0, ids, np.uint8(_IGNORE))
     path = part / TEST_LABEL / f"{shot.stamp}_rgb.npy"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, label)
-
-
-def _bgr(scene: Scene) -> NDArray[np.uint8]:
-    """OpenCV stores blue first."""
-    return np.ascontiguousarray(scene.rgb[..., ::-1])
-
-
-def _write(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, image)
 
 
 def counts_of(grey: Floats) -> NDArray[np.uint16]:

@@ -57,11 +57,7 @@ BOLLARD = 1
 
 @cache
 def car_stop(kind: int) -> Shape:
-    """A car stop, yellow with black bands: a low long block, a bollard, or a heavy cube.
-
-    Args:
-        kind: 0 to `NUM_STOPS` - 1.
-    """
+    """A car stop, yellow with black bands: a low long block, a bollard, or a heavy cube."""
     if kind == BOLLARD:
         return _bollard()
     half, height, depth = ((0.85, 0.30, 0.22), (0.0, 0.0, 0.0), (0.38, 0.58, 0.34))[kind]

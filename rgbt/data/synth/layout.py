@@ -26,11 +26,7 @@ _CARS = frozenset(cars.car(kind) for kind in range(cars.NUM_CARS))
 def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> list[Placed]:
     """All labelled objects of a scene except kerbs.
 
-    Args:
-        seed: of the data set.
-        index: of the scene.
-        road: where the road runs.
-        factors: how many near groups and far objects; the first of each are always the same.
+    `factors` say how many near groups and far objects; the first of each are always the same.
     """
     u = numpy_generator(seed, "synth/structures", index).random(8).tolist()
     near = draw_rows(seed, index, "near", factors.num_objects * _MAX_GROUP)

@@ -22,11 +22,7 @@ NUM_WALKERS = 6
 
 @cache
 def person(kind: int) -> Shape:
-    """A standing or walking person of 1.72 m, facing +z or the camera, some with a bag.
-
-    Args:
-        kind: 0 to `NUM_WALKERS` - 1.
-    """
+    """A standing or walking person of 1.72 m, facing +z or the camera, some with a bag."""
     stride = (0.02, 0.16, 0.24)[kind % 3]
     from_behind = kind >= NUM_WALKERS // 2
     parts = [*_leg(-0.08, -0.06 - stride), *_leg(0.08, 0.06 + stride)]

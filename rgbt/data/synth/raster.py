@@ -88,12 +88,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 def average(values_N4: NDArray[np.uint8], drawing: Drawing) -> NDArray[np.uint8]:
     """Four values per facet, averaged around each pixel (binomial weights, 0.5 pixels wide).
 
-    Args:
-        values_N4: (N + 1, 4) uint8, row 0 for the sky.
-        drawing: which facet is where.
-
-    Returns:
-        (H, W, 4) uint8.
+    From (N + 1, 4) uint8, row 0 for the sky, to (H, W, 4) uint8.
     """
     packed = np.ascontiguousarray(values_N4).view(np.uint32)[:, 0]
     fine = np.take(packed, drawing.fine, mode="clip").view(np.uint8)

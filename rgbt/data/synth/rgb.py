@@ -29,17 +29,9 @@ _TEXTURES = materials.column("rgb_texture")
 def render_rgb(
     surface: Surface, light: Light, lamps: list[Lamp], strength: float, seed: int
 ) -> Floats:
-    """Light that reaches the sensor.
+    """Light that reaches the sensor: (3, H, W) float32 in 0..1, gamma-encoded, without noise.
 
-    Args:
-        surface: what each pixel shows.
-        light: day or night, sun and sky.
-        lamps: that shine by night.
-        strength: factor on texture.
-        seed: of the data set, for the clouds.
-
-    Returns:
-        (3, H, W) float32 in 0..1, gamma-encoded, without noise.
+    `strength` is a factor on texture, `seed` of the data set gives the clouds.
     """
     colour = average(_colour_table(surface, light), surface.drawing)
     glow = average(_glow_table(surface.facets, light), surface.drawing)
@@ -153,20 +145,12 @@ def _exposed(image: Floats, light: Light) -> Floats:
 def develop(
     image: Floats, factors: SceneFactors, generator: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Vignette, noise and eight bits.
+    """Vignette, noise and eight bits of an image (3, H, W) in 0..1: (H, W, 3) uint8.
 
         sd(p) = rgb_noise (1 + radius_gain r(p)^2) (1 + dark_gain (1 - brightness))
 
     with r the distance from the centre (1 at the corners) and the brightness the mean of the image:
     a camera in the dark raises its gain, and its noise.
-
-    Args:
-        image: (3, H, W) float32 in 0..1.
-        factors: the three noise factors.
-        generator: of the noise.
-
-    Returns:
-        (H, W, 3) uint8.
     """
     radius_squared = squared_radius(*image.shape[1:])
     sd = factors.rgb_noise * (1 + factors.rgb_noise_radius_gain * radius_squared)

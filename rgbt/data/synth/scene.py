@@ -78,13 +78,7 @@ class _World(NamedTuple):
 
 
 def render_scene(seed: int, index: int, factors: SceneFactors) -> Scene:
-    """Scene `index` of the endless data set `seed`; the same arguments give the same bytes.
-
-    Args:
-        seed: of the data set, any integer.
-        index: number of the scene, >= 0.
-        factors: what the scene is made of.
-    """
+    """Scene `index` (>= 0) of the endless data set `seed`; equal arguments give equal bytes."""
     return _frame(_world(seed, index, factors), camera_of(factors), factors, (seed, index, 0))
 
 
@@ -93,12 +87,6 @@ def render_pair(seed: int, index: int, factors: SceneFactors, motion: EgoMotion)
 
     The first frame is that of `render_scene`; texture, light and thermal drift stay, sensor noise
     is drawn anew.
-
-    Args:
-        seed: of the data set.
-        index: number of the scene.
-        factors: what the scene is made of.
-        motion: of the camera between the frames.
     """
     world = _world(seed, index, factors)
     camera = camera_of(factors)

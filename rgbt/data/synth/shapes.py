@@ -133,14 +133,9 @@ def box(
     label: int = UNLABELED,
     paint: int = 0,
 ) -> list[Face]:
-    """Five faces of a box without its bottom.
+    """Five faces of a box without its bottom, from its smallest to its largest corner.
 
-    Args:
-        low: smallest x, y, z.
-        high: largest x, y, z.
-        materials: one name, or names for the ends (z), the sides (x) and the top.
-        label: class id.
-        paint: see `Face`.
+    `materials` is one name, or names for the ends (z), the sides (x) and the top.
     """
     ends, sides, top = (materials,) * 3 if isinstance(materials, str) else materials
     (x0, y0, z0), (x1, y1, z1) = low, high

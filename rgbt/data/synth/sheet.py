@@ -46,17 +46,9 @@ class Options(SceneFactors):
 def contact_sheet(
     seed: int, first: int, factors: SceneFactors, columns: int = 5, zoom: int = 2
 ) -> NDArray[np.uint8]:
-    """`columns` scenes by day above the same scenes by night.
+    """`columns` scenes from `first` by day above the same scenes by night, enlarged by `zoom`.
 
-    Args:
-        seed: of the data set.
-        first: index of the first scene.
-        factors: what the scenes are made of; the share of night is not used.
-        columns: scenes per row.
-        zoom: enlargement.
-
-    Returns:
-        (6 zoom H, columns zoom W, 3) uint8, RGB.
+    Returns (6 zoom H, columns zoom W, 3) uint8, RGB. The share of night in `factors` is not used.
     """
     blocks = []
     for share in (0.0, 1.0):

@@ -67,14 +67,9 @@ def surface_of(
     shadow: Floats,
     texture_key: tuple[int, int],
 ) -> Surface:
-    """Surface maps of one frame.
+    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`.
 
-    Args:
-        drawing: which facet is where.
-        facets: the facets.
-        camera: the camera.
-        shadow: (H, W) float32 of `shadow_map`.
-        texture_key: (seed, scene index): textures stay where they are when the camera moves.
+    `texture_key` is (seed, scene index): textures stay where they are when the camera moves.
     """
     rays = camera.rays()
     inverse_depth = drawing.inverse_depth(rays)

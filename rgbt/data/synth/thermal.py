@@ -28,15 +28,9 @@ _TEXTURES = materials.column("heat_texture")
 
 
 def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
-    """Temperature of each pixel.
+    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy.
 
-    Args:
-        surface: what each pixel shows.
-        light: day or night, and the sun.
-        strength: factor on texture.
-
-    Returns:
-        (H, W) float32, degrees above the air, without blur, drift and noise.
+    `strength` is a factor on texture.
     """
     table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
     degrees = np.concatenate([[-34.0], _facet_degrees(surface, light)])
@@ -69,21 +63,12 @@ def _facet_degrees(surface: Surface, light: Light) -> Floats:
 def develop(
     heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
 ) -> Floats:
-    """Contrast, lens, drift and noise.
+    """Contrast, lens, drift and noise of `heat` (H, W): grey levels, some below 0 or above 1.
 
     The noise has three parts of the same strength factor: per pixel, per column, and smeared over
     neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
-    belong to the scene, so two frames of one scene share them.
-
-    Args:
-        heat: (H, W) float32 of `render_thermal`.
-        factors: contrast, drift, noise.
-        seed: of the data set.
-        index: of the scene.
-        generator: of the noise of this frame.
-
-    Returns:
-        (H, W) float32 grey levels, 1 = full scale; some lie below 0 or above 1.
+    belong to the scene (`seed`, `index`), so two frames of one scene share them; `generator` is
+    that of the noise of this frame.
     """
     height, width = heat.shape
     drift = numpy_generator(seed, "synth/drift", index)

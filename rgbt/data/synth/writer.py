@@ -62,6 +62,12 @@ class SynthPlan:
         """Scenes in all splits."""
         return self.num_train + self.num_val + self.num_test
 
+    @property
+    def splits(self) -> dict[str, range]:
+        """Split -> its scenes, which are numbered over all splits: none is in two of them."""
+        val, test = self.num_train, self.num_train + self.num_val
+        return {"train": range(val), "val": range(val, test), "test": range(test, self.num_scenes)}
+
     def name(self, index: int) -> str:
         """Five digits and D (day) or N (night), as in MFNet; indices run on over the splits."""
         night = is_night(self.seed, index, self.factors.night_share)
@@ -69,41 +75,24 @@ class SynthPlan:
 
 
 def write(plan: SynthPlan, folder: Path) -> None:
-    """Write the whole data set into `folder`, which exists.
-
-    Args:
-        plan: what to write.
-        folder: receives images, labels, lists.
-
-    Raises:
-        OSError: the files cannot be written.
-    """
-    roots = [folder, folder / "next"] if plan.motion else [folder]
-    for root in roots:
-        for sub in ("images", "labels", *(["flow"] if root != folder else [])):
-            (root / sub).mkdir(parents=True)
+    """Write the whole data set into `folder`, which exists; OSError if that is not possible."""
     write_each(partial(write_index, plan, folder), plan.num_scenes)
-    for root in roots:
-        _write_lists(plan, root)
+    lists = {split: [plan.name(scene) for scene in own] for split, own in plan.splits.items()}
+    for time in ("day", "night"):
+        letter = time[0].upper()
+        lists[f"test_{time}"] = [name for name in lists["test"] if name.endswith(letter)]
+    for root in [folder, folder / "next"] if plan.motion else [folder]:
+        for split, names in lists.items():
+            write_list(root / f"{split}.txt", names)
 
 
-def _write_lists(plan: SynthPlan, root: Path) -> None:
-    names = [plan.name(index) for index in range(plan.num_scenes)]
-    test = names[plan.num_train + plan.num_val :]
-    lists = {
-        "train": names[: plan.num_train],
-        "val": names[plan.num_train : plan.num_train + plan.num_val],
-        "test": test,
-        "test_day": [name for name in test if name.endswith("D")],
-        "test_night": [name for name in test if name.endswith("N")],
-    }
-    for split, lines in lists.items():
-        (root / f"{split}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+def write_list(path: Path, lines: Sequence[str]) -> None:
+    """Write a split list, one name per line."""
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
 def write_index(plan: SynthPlan, folder: Path, index: int) -> None:
     """Render and write one scene, with its second frame where the plan has a motion."""
-    cv2.setNumThreads(1)
     name = plan.name(index)
     if plan.motion is None:
         _write_scene(render_scene(plan.seed, index, plan.factors), folder, name)
@@ -112,19 +101,26 @@ def write_index(plan: SynthPlan, folder: Path, index: int) -> None:
     _write_scene(pair.first, folder, name)
     _write_scene(pair.second, folder / "next", name)
     flow = np.where(pair.visible[..., None], pair.flow, np.float32(np.nan))
-    np.save(folder / "next" / "flow" / f"{name}.npy", flow)
+    path = folder / "next" / "flow" / f"{name}.npy"
+    path.parent.mkdir(exist_ok=True)
+    np.save(path, flow)
 
 
 def _write_scene(scene: Scene, root: Path, name: str) -> None:
-    # OpenCV stores its first three channels as B, G, R; the fourth, alpha, is thermal.
-    packed = np.dstack([scene.rgb[..., ::-1], scene.thermal])
-    write_png(root / "images" / f"{name}.png", packed)
-    write_png(root / "labels" / f"{name}.png", scene.label)
+    # The fourth channel, alpha, is thermal.
+    write_image(root / "images" / f"{name}.png", np.dstack([bgr(scene), scene.thermal]))
+    write_image(root / "labels" / f"{name}.png", scene.label)
 
 
-def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Write an image as it is (OpenCV's order of channels), compressed for speed."""
-    _, encoded = cv2.imencode(".png", image, _FAST_PNG)
+def bgr(scene: Scene) -> NDArray[np.uint8]:
+    """RGB of a scene in the order in which OpenCV stores channels."""
+    return np.ascontiguousarray(scene.rgb[..., ::-1])
+
+
+def write_image(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write an image as it is (OpenCV's order of channels), a PNG compressed for speed."""
+    _, encoded = cv2.imencode(path.suffix, image, _FAST_PNG if path.suffix == ".png" else ())
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encoded.tobytes())
 
 
@@ -138,11 +134,12 @@ def write_each(work: partial[None], num: int) -> None:
 def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if len(indices) < _WORTH_A_POOL or cores == 1:
+        cv2.setNumThreads(1)
         yield from map(work, indices)
         return
     # Forked workers need not import the caller's main module again; only Linux forks safely.
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
-    with ProcessPoolExecutor(cores, mp_context=context) as pool:
+    with ProcessPoolExecutor(cores, context, cv2.setNumThreads, (1,)) as pool:
         yield from pool.map(work, indices, chunksize=8)
 
 

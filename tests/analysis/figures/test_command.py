@@ -318,7 +318,7 @@ def test_help_does_not_wait_for_heavy_libraries() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip().endswith("[]")
-    assert "figure        name" in done.stdout
+    assert "  figure       name" in done.stdout
 
 
 @pytest.mark.parametrize("figure", ["spatialseg/fig2", "regions/heat", "regions/profile"])

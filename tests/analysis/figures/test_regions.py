@@ -25,7 +25,7 @@ def method(seed: int = 0, regions: int = 2) -> Counts:
 
 
 def known(label: str, *means: float, partition: str = "ring2") -> Profile:
-    return Profile(label, partition, np.array(means), 50.0, None, None, "", 1, 10, float("nan"))
+    return Profile(label, partition, np.array(means), 50.0, 1, 10)
 
 
 def test_means_by_hand_and_over_seeds() -> None:

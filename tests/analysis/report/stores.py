@@ -16,7 +16,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
 from rgbt.randomness import numpy_generator
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.run_folder import Description, RunFolder
+from rgbt.tracking.run_files import Description, counts_name
+from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.rendering.file_formats import tidy_csv
@@ -125,7 +126,7 @@ def write_run(
         }
     )
     counts = counts_of(seed, right)
-    counts.save(run.counts_path("test"))
+    counts.save(run.path / counts_name("test"))
     (run.path / "evaluations").mkdir(exist_ok=True)
     counts_of(seed, right - 0.2).save(run.path / RGB_FILE)
     scores = summary(counts, "released")

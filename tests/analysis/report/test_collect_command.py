@@ -102,5 +102,5 @@ def test_help_does_not_wait_for_libraries() -> None:
         "print({'torch', 'mlflow', 'matplotlib', 'pandas'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "usage: [out=report]" in done.stdout
+    assert "usage: rgbt report [option=value ...]" in done.stdout
     assert done.stdout.strip().endswith("set()")

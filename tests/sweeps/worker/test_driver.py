@@ -15,6 +15,7 @@ import pytest
 
 from rgbt.spec.naming import TAGS
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_files import Description, read_description
 from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.settings import Objective
@@ -477,7 +478,7 @@ def test_a_hopeless_trial_is_stopped_and_booked_as_pruned(tmp_path: Path) -> Non
         return [good, scored(0.5, 0.1), good][len(desk.executor.calls) - 1](call)
 
     def described(call: Call) -> Process:
-        NoTracking().start(RunFolder(call.folder), "fake", {"rgbt.key": "k"}, {})
+        NoTracking().start(RunFolder(call.folder), Description("fake", {"rgbt.key": "k"}, {}))
         return (yield from nth(call))
 
     desk = search_desk(tmp_path, described, pruner=pruner, objectives=UP, trials=3)
@@ -488,7 +489,7 @@ def test_a_hopeless_trial_is_stopped_and_booked_as_pruned(tmp_path: Path) -> Non
     assert pruned.user_attrs[names.REASON] == "pruned at step 4"
     assert trial(desk, 0).values == [75.0]
     assert [call.stops for call in desk.executor.calls] == [0, 1, 0]
-    description = RunFolder(desk.executor.calls[1].folder).description()
+    description = read_description(desk.executor.calls[1].folder)
     assert description is not None
     assert description.tags["rgbt.stopped"] == "pruned at step 4"
     assert ("pruned", "pruned at step 4") in [end[1:] for end in desk.view.ends]

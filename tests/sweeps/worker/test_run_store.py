@@ -11,9 +11,10 @@ import pytest
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names, scores
+from rgbt.metrics.names import in_percent
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import read_upload_state
-from rgbt.tracking.percent import in_percent
+from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
@@ -225,7 +226,7 @@ def test_find_fetches_remote_run_from_mlflow(machines: Machines) -> None:
     assert found is not None
     assert found.folder == here.runs_dir / FETCHED / "a"
     assert found.run_id
-    assert found.result == made.result()
+    assert found.result == read_result(made.path)
     assert found.counts().counts.tolist() == counts().counts.tolist()
     assert found.commit == "0123456789"
     assert not (here.runs_dir / "a").exists(), "a run folder is for runs made here"
@@ -262,7 +263,7 @@ def test_unfinished_runs_and_half_fetched_ones_are_not_taken(machines: Machines)
     (found.folder / "result.json").write_text("{}")  # a copy that was interrupted
     again = here.find("c", DATASET)
     assert again is not None
-    assert again.result == made.result()
+    assert again.result == read_result(made.path)
 
     there = machines.runs("there")
     begun = finish(there.runs_dir / "d")

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rgbt.tracking.mlflow_store import NoTracking
+from rgbt.tracking.run_files import read_description
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
@@ -122,7 +123,7 @@ def test_running_trial_finished_run_gets_tags_only(tmp_path: Path) -> None:
     bench = Bench(tmp_path, plan)
     assert bench.work.advance() is not None, "at once"
     assert bench.executor.calls == []
-    description = RunFolder(tmp_path / plan.key).description()
+    description = read_description(tmp_path / plan.key)
     assert description is not None
     assert description.tags["rgbt.table/one"] == "row"
 

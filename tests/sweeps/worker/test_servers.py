@@ -15,6 +15,7 @@ from mlflow import MlflowClient
 
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.mlflow_store import MlflowTracking
+from rgbt.tracking.run_files import Description, counts_name, read_result
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from sweeps.attributes import DROPPED, KEY, OWNER, REASON, RUNS
@@ -94,8 +95,8 @@ def finished(folder: RunFolder, dataset: str) -> Counts:
     folder.write_config("seed: 0\n")
     folder.add_provenance({"command": "python -m rgbt.run", "git_commit": "0123456789abcdef"})
     folder.append(20, "test", {"mIoU": 0.4, "Var": 156.25})
-    folder.write_tables(TABLES.to_json())
-    counts.save(folder.counts_path("test"))
+    folder.write_tables(TABLES)
+    counts.save(folder.path / counts_name("test"))
     folder.finish({"dataset": dataset, "test": {"mIoU": 0.4, "Var": 156.25}})
     return counts
 
@@ -134,7 +135,7 @@ def test_a_run_of_one_machine_is_found_on_another(servers: Servers, tmp_path: Pa
         )
 
     folder, tracker = RunFolder(here / "0123456789ab"), tracking(here)
-    tracker.start(folder, "grbm seed=0", {"rgbt.key": "0123456789ab"}, {"seed": 0})
+    tracker.start(folder, Description("grbm seed=0", {"rgbt.key": "0123456789ab"}, {"seed": "0"}))
     counts = finished(folder, dataset="feed")
     tracker.finish("FINISHED")
     _, this_run = tracker.links()[0]
@@ -145,7 +146,7 @@ def test_a_run_of_one_machine_is_found_on_another(servers: Servers, tmp_path: Pa
     assert runs.find("0123456789ab", "other data") is None
     found = runs.find("0123456789ab", "feed")
     assert found is not None
-    assert found.result == folder.result()
+    assert found.result == read_result(folder.path)
     assert found.scores() == {"test/mIoU": 40.0, "test/Var": 156.25}
     np.testing.assert_array_equal(found.counts().counts, counts.counts)
     assert found.commit == "0123456789"
@@ -156,7 +157,7 @@ def test_no_password_is_written_into_a_run(servers: Servers, tmp_path: Path) -> 
     url = f"{servers.database.rpartition('/')[0]}/mlflow"
     tracker = MlflowTracking(url, artifact_uri=None, experiment="direct", runs_dir=str(tmp_path))
     folder = RunFolder(tmp_path / "run")
-    tracker.start(folder, "grbm seed=1", {"rgbt.key": "run"}, {"seed": 1})
+    tracker.start(folder, Description("grbm seed=1", {"rgbt.key": "run"}, {"seed": "1"}))
     finished(folder, dataset="feed")
     tracker.finish("FINISHED")
     name, this_run = tracker.links()[0]

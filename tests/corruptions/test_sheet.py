@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.corruptions.__main__ import entry
+from rgbt.corruptions.__main__ import draw, entry, sheet, side_by_side
 from rgbt.corruptions.late import Delayed
-from rgbt.corruptions.noise import Noise
-from rgbt.corruptions.removed import Removed
-from rgbt.evaluation.corruption_sheet import draw, sheet, side_by_side
+from rgbt.corruptions.pixels import Noise, Removed
 from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample
@@ -26,13 +24,16 @@ KINDS = (
 
 def test_a_line_per_corruption_with_the_clean_pair_first() -> None:
     lines = sheet(Recorded(), KINDS, "00004D", "test")
-    assert [[severity for severity, _ in line.pairs] for line in lines] == [
-        *([0.0, 8.0, 16.0], [0.0, 1.0], [0.0, 1.0])
+    assert [[caption for caption, _ in line] for line in lines] == [
+        ["noise, RGB", "8 grey levels (std)", "16 grey levels (std)"],
+        ["delayed thermal", "1 frames"],
+        ["thermal removed (zeroed)", ""],
     ]
-    for line in lines:
-        np.testing.assert_array_equal(line.pairs[0][1].rgb, sample("00004D").rgb)
-    np.testing.assert_array_equal(lines[1].pairs[1][1].thermal, sample("00003D").thermal)
-    assert lines[2].pairs[1][1].thermal.max() == 0
+    clean, corrupted = zip(*((line[0][1], line[1][1]) for line in lines))
+    for each in clean:
+        np.testing.assert_array_equal(each.rgb, sample("00004D").rgb)
+    np.testing.assert_array_equal(corrupted[1].thermal, sample("00003D").thermal)
+    assert corrupted[2].thermal.max() == 0
 
 
 def test_pairs_are_drawn_side_by_side_with_titles() -> None:
