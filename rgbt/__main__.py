@@ -35,8 +35,8 @@ def _answer(name: str, words: Sequence[str]) -> int:
         sys.stdout.write(f"{help_text()}\n")
         return 0
     if name == COMPLETION:
+        from rgbt.config.completion import print_script
         from rgbt.config.reporting import exit_code
-        from rgbt.config.shells import print_script
 
         return exit_code(lambda: print_script(words))
     if name == COMPLETE:

@@ -11,8 +11,8 @@ import torch
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
-from rgbt.config.choices import choices
 from rgbt.config.component import Component
+from rgbt.config.compose import choices
 from rgbt.config.targets import constructor
 from rgbt.requirements import Record, Requirement, record_of
 

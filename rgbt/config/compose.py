@@ -1,10 +1,10 @@
-"""Hydra's composition: where the configuration lies, and what its files may compute."""
+"""Hydra's composition: files and keys of the configuration, and what its files may compute."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -14,6 +14,8 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError, nearest
 
 SEARCH_PATH = "hydra.searchpath"
 """Override that adds folders of a user's own files, as RGBT_CONF does (conf/config.yaml)."""
@@ -33,13 +35,10 @@ def conf_dir() -> Path:
 
 @contextmanager
 def searching(words: Sequence[str]) -> Iterator[None]:
-    """Compose with the search path of a command line, for as long as the command runs.
+    """Compose with the search path in the `words` of a command line, as long as the command runs.
 
-    Upstream runs, defaults and groups of a run that is opened again are composed without the words
-    of the command, and need the folders of its ``hydra.searchpath=...`` too.
-
-    Args:
-        words: of the command line, after the name of the command.
+    Upstream runs, defaults and groups of a run that is opened again are composed without these
+    words, and need the folders of ``hydra.searchpath=...`` too.
     """
     before = list(_of_the_command)
     _of_the_command[:] = [word for word in words if word.startswith(f"{SEARCH_PATH}=")][:1]
@@ -50,11 +49,7 @@ def searching(words: Sequence[str]) -> Iterator[None]:
 
 
 def search_path(overrides: Sequence[str] = ()) -> list[str]:
-    """The override ``hydra.searchpath=...`` that applies: of `overrides`, else of the command.
-
-    Returns:
-        a list of this one word; empty where none was given.
-    """
+    """The word ``hydra.searchpath=...`` of `overrides`, else of the command; empty without any."""
     given = [word for word in overrides if word.startswith(f"{SEARCH_PATH}=")]
     return given or list(_of_the_command)
 
@@ -96,6 +91,45 @@ def _listed(group: str, kind: ObjectType, _own: str | None, *words: str) -> tupl
         return tuple(loader.get_group_options(group, kind, "config", list(words)))
 
 
+def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictConfig]]:
+    """The files of a group: name, and the node that each would be in a configuration.
+
+    Args:
+        plain: the configuration that interpolations of the files refer to, as resolved values.
+        group: key of the node, which is the name of its folder.
+    """
+    names = available(group)
+    scale = plain["scale"]["name"]
+    words = [f"scale={scale}"] if scale in available("scale") else []
+    # Composed all at once, in packages of their own: as fast as one.
+    words += [f"+{group}@choice_{number}={name}" for number, name in enumerate(names)]
+    composed = compose(words)
+    changed = OmegaConf.create(dict(plain))
+    for number, name in enumerate(names):
+        changed[group] = composed[f"choice_{number}"]
+        yield name, changed[group]
+
+
+@cache
+def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Keys that ``conf/config.yaml`` declares: nodes (mappings with `_target_`), plain values."""
+    plain: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))
+    chosen = [key for entry in plain.pop("defaults") if isinstance(entry, dict) for key in entry]
+    own = {key: value for key, value in plain.items() if key != "hydra"}
+    written = [key for key, value in own.items() if isinstance(value, Mapping)]
+    nodes = dict.fromkeys([*(group for group in chosen if " " not in group), *written])
+    return tuple(nodes), tuple(key for key in own if key not in nodes)
+
+
+def check_keys(keys: Iterable[Any]) -> None:
+    """Refuse a key that ``conf/config.yaml`` does not declare, naming the nearest that it does."""
+    known = [key for each in top_level() for key in each]
+    for key in keys:
+        if key not in known:
+            hint = nearest(str(key), known)
+            raise InputError(f"'{key!s}' is not a key of the configuration; {hint}.")
+
+
 @contextmanager
 def own_hydra() -> Iterator[None]:
     """Hydra with our configuration, also inside a command that Hydra runs."""
@@ -129,17 +163,12 @@ def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
-    return scaled_pixels(pixels, float(_root_.scale.pixel_factor))
-
-
-def scaled_pixels(pixels: int, factor: float) -> int:
-    """Value of ``${px:pixels}`` where images are `factor` times as large as the paper's."""
-    return round(pixels * factor)
+    return round(pixels * float(_root_.scale.pixel_factor))
 
 
 def with_pixels(text: str, factor: float) -> str:
-    """`text` with the value of every ``${px:...}`` in it."""
-    return PIXELS.sub(lambda found: str(scaled_pixels(int(found[1]), factor)), text)
+    """`text` with the value of every ``${px:...}`` where images are `factor` times the paper's."""
+    return PIXELS.sub(lambda found: str(round(int(found[1]) * factor)), text)
 
 
 def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:
