@@ -18,10 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 
 SEARCH_PATH = "hydra.searchpath"
-"""Override that adds folders of a user's own files, as RGBT_CONF does (conf/config.yaml)."""
+"""Override that names the folders of a user's own files for one command."""
 
-_of_the_command: list[str] = []
-"""That override as the running command was given it; one at most."""
+OWN_FOLDERS = "RGBT_CONF"
+"""Variable that names them for every composition, with commas (read by conf/config.yaml)."""
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -40,55 +40,42 @@ def searching(words: Sequence[str]) -> Iterator[None]:
     Upstream runs, defaults and groups of a run that is opened again are composed without these
     words, and need the folders of ``hydra.searchpath=...`` too.
     """
-    before = list(_of_the_command)
-    _of_the_command[:] = [word for word in words if word.startswith(f"{SEARCH_PATH}=")][:1]
+    before = own_folders()
+    given = [word.partition("=")[2] for word in words if word.startswith(f"{SEARCH_PATH}=")]
+    os.environ[OWN_FOLDERS] = given[0].strip("[]") if given else before
     try:
         yield
     finally:
-        _of_the_command[:] = before
+        os.environ[OWN_FOLDERS] = before
 
 
-def search_path(overrides: Sequence[str] = ()) -> list[str]:
-    """The word ``hydra.searchpath=...`` of `overrides`, else of the command; empty without any."""
-    given = [word for word in overrides if word.startswith(f"{SEARCH_PATH}=")]
-    return given or list(_of_the_command)
+def own_folders() -> str:
+    """Folders of the user's own files, as they were typed; "": none."""
+    return os.environ.get(OWN_FOLDERS, "")
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that `rgbt.run` would get from these overrides, not checked.
-
-    Files are looked up in ``conf/`` and in the folders of `search_path`.
-    """
-    others = [word for word in overrides if not word.startswith(f"{SEARCH_PATH}=")]
+    """The configuration that `rgbt.run` would get from these overrides, not checked."""
     with own_hydra():
-        return hydra.compose("config", [*others, *search_path(overrides)])
+        return hydra.compose("config", list(overrides))
 
 
-def available(group: str, overrides: Sequence[str] = ()) -> list[str]:
-    """Names of the files of a group, those of `search_path` included.
-
-    Args:
-        group: such as "experiment" or "model/inputs".
-        overrides: of which ``hydra.searchpath=...`` counts.
-    """
-    return list(_listed(group, ObjectType.CONFIG, *_searched(overrides)))
+def available(group: str) -> list[str]:
+    """Names of the files of a group such as "experiment" or "model/inputs", also of the user's."""
+    return list(_listed(group, ObjectType.CONFIG, own_folders()))
 
 
-def groups(overrides: Sequence[str] = ()) -> list[str]:
-    """Names of the groups, those of `search_path` included."""
-    return list(_listed("", ObjectType.GROUP, *_searched(overrides)))
-
-
-def _searched(overrides: Sequence[str]) -> tuple[str | None, *tuple[str, ...]]:
-    return os.environ.get("RGBT_CONF"), *search_path(overrides)
+def groups() -> list[str]:
+    """Names of the groups, also of the user's."""
+    return list(_listed("", ObjectType.GROUP, own_folders()))
 
 
 @cache
-def _listed(group: str, kind: ObjectType, _own: str | None, *words: str) -> tuple[str, ...]:
+def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
     """Names in a group; cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
     with own_hydra():
         loader = GlobalHydra.instance().config_loader()
-        return tuple(loader.get_group_options(group, kind, "config", list(words)))
+        return tuple(loader.get_group_options(group, kind, "config"))
 
 
 def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictConfig]]:

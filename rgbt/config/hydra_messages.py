@@ -5,7 +5,6 @@ Hydra's own messages name neither the key that was meant nor what to type.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from rgbt.config.compose import (
     conf_dir,
     flatten,
     groups,
-    search_path,
+    own_folders,
     top_level,
 )
 
@@ -75,11 +74,11 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
         group, _, name = missing.rpartition("/")
         if error.options:
             what = f"there is no {group or 'configuration'} '{name}'"
-            return f"{what}; {nearest(name, error.options)}.{forgotten(overrides)}"
+            return f"{what}; {nearest(name, error.options)}.{forgotten()}"
         group = group or missing
-        return f"there is no group '{group}'; {nearest(group, groups(overrides))}."
+        return f"there is no group '{group}'; {nearest(group, groups())}."
     if isinstance(error, OverrideParseException):
-        return _no_override(str(error.override), overrides)
+        return _no_override(str(error.override))
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:
@@ -87,21 +86,19 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     return _of_the_defaults(str(error).splitlines()[0].rstrip("."), overrides)
 
 
-def forgotten(overrides: Sequence[str] = ()) -> str:
+def forgotten() -> str:
     """How a file of the user's own is found, where the command names no folder of such files."""
-    if search_path(overrides) or os.environ.get("RGBT_CONF"):
+    if own_folders():
         return ""
     return (
         f" For a file of your own add '{SEARCH_PATH}=[file:///my/conf]', or set RGBT_CONF=/my/conf."
     )
 
 
-def _no_override(word: str, overrides: Sequence[str]) -> str:
+def _no_override(word: str) -> str:
     name = word.lstrip("+~").partition("=")[0]
-    known = groups(overrides)
-    expected = " or ".join(
-        _typed(each, name) for each in known if name in available(each, overrides)
-    )
+    known = groups()
+    expected = " or ".join(_typed(each, name) for each in known if name in available(each))
     if name in known:
         expected = _typed(name, "NAME")
     expected = expected or (

@@ -31,35 +31,26 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         return say(str(error), 1)
     except OSError as error:
         return say(_of_file(error), 2)
-    except Stopped as stop:
+    except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
-        return say(str(stop), stop.code)
-    except KeyboardInterrupt:  # a second Ctrl-C
-        if not catch_interrupt:
-            raise
+        if isinstance(stop, Stopped):
+            return say(str(stop), stop.code)
+        # A second Ctrl-C.
         return say("interrupted; rerun the command to resume from its last checkpoint.", 130)
     except Exception as error:
-        sentence = _of_hydra(error)
-        if sentence is None:
+        if type(error).__module__.partition(".")[0] not in ("hydra", "omegaconf"):
             raise
-        return say(sentence, 2)
+        from rgbt.config.hydra_messages import hydra_sentence  # --help does not wait for Hydra
+
+        words = [word for word in sys.argv[1:] if not word.startswith("-")]
+        return say(hydra_sentence(error, words), 2)
 
 
 def _of_file(error: OSError) -> str:
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"{error.filename}: a file is where a folder is needed; name another path."
     return f"{error.filename or 'a file'}: {error.strerror or error}."
-
-
-def _of_hydra(error: Exception) -> str | None:
-    """What Hydra or OmegaConf refused; None of another error. Neither is imported for this."""
-    package = type(error).__module__.partition(".")[0]
-    if package not in ("hydra", "omegaconf"):
-        return None
-    from rgbt.config.hydra_messages import hydra_sentence
-
-    return hydra_sentence(error, [word for word in sys.argv[1:] if not word.startswith("-")])
 
 
 def say(sentence: str, code: int) -> int:
