@@ -11,9 +11,8 @@ import torch
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component
+from rgbt.config.component import Component, constructor
 from rgbt.config.compose import choices
-from rgbt.config.targets import constructor
 from rgbt.requirements import Record, Requirement, record_of
 
 MOST_CHOICES = 6

@@ -20,8 +20,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, split_list
+from rgbt.config.component import constructor
 from rgbt.config.compose import conf_dir, top_level
-from rgbt.config.targets import constructor
 from rgbt.files.yaml_files import read_yaml
 
 OWN = "rgbt."

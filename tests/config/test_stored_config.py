@@ -51,8 +51,8 @@ OTHERS = [
     *("os.system", "posix.system", "builtins.eval", "subprocess.Popen", "hydra.utils.get_object"),
     *(
         "rgbt.files.atomic.os.system",
-        "rgbt.config.targets.get_object",
-        "rgbt.config.targets.instantiate",
+        "rgbt.config.component.get_object",
+        "rgbt.config.component.instantiate",
     ),
     *("rgbt.files.atomic.write_atomic", "rgbt.tracking.run_folder.RunFolder", "rgbt"),
     *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
