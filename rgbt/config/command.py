@@ -14,7 +14,6 @@ from functools import wraps
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -52,8 +51,8 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
             # argparse takes overrides on one side of an option only, and people write -m anywhere.
             words = readable_paths(sys.argv[1:])
             if not any(word.startswith("hydra/sweeper=") for word in words):
-                places = [n for n, word in enumerate(words) if "=" in word and word[0] != "-"]
-                words.insert(places[0] if places else len(words), f"hydra/sweeper={sweeper}")
+                first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
+                words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
@@ -76,11 +75,6 @@ def _compose(job: Callable[[DictConfig], None], words: Sequence[str]) -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     register_resolvers()
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
-
-
-def task_overrides() -> list[str]:
-    """Overrides of the running job as they were typed, e.g. ``["+experiment=grbm", "seed=1"]``."""
-    return list(HydraConfig.get().overrides.task)
 
 
 @contextmanager

@@ -66,11 +66,7 @@ def print_script(words: Sequence[str]) -> int:
 
 
 def print_candidates(words: Sequence[str]) -> int:
-    """Write what may stand for the last word of a line, one candidate a line.
-
-    Args:
-        words: the line up to the cursor, from ``rgbt`` on, as one argument.
-    """
+    """Write `candidates` of a line, which is one word of `words`, one candidate a line."""
     with suppress(Exception):  # a shell that completes shows nothing of what went wrong
         sys.stdout.write("".join(f"{each}\n" for each in candidates(" ".join(words))))
     return 0

@@ -96,10 +96,10 @@ class Component:
         """Values of JSON, equal for equal settings: 4 and 4.0 are one value where 4.0 is meant."""
         from pydantic_core import to_jsonable_python
 
-        def plain(value: Any) -> Any:
-            return value.canonical() if isinstance(value, Component) else value
-
-        values = {key: plain(value) for key, value in self.values.items()}
+        values = {
+            key: value.canonical() if isinstance(value, Component) else value
+            for key, value in self.values.items()
+        }
         return {"_target_": self.target, **to_jsonable_python(values)}
 
 
@@ -169,21 +169,19 @@ def authorized(target: Any, path: str) -> functools.partial[Any]:
     """
     target = check_value(f"{path}._target_", target, Text)
     try:
-        found = _partial(target)
-        if found.func is not get_object(target):  # its module was imported anew
+        if _partial(target).func is not get_object(target):  # its module was imported anew
             _partial.cache_clear()
-            found = _partial(target)
+        return _partial(target)
     except Exception as error:  # a module of the user's may fail in any way as it is imported
         raise refusal(target, path, error) from error
-    return found
 
 
 @functools.cache
 def _partial(target: str) -> functools.partial[Any]:
     """Cached, because Hydra needs 2 ms and a configuration has 40 targets."""
-    found = instantiate({"_target_": target, "_partial_": True})
-    assert isinstance(found, functools.partial), "Hydra returns a partial where one is requested"
-    return found
+    partial = instantiate({"_target_": target, "_partial_": True})
+    assert isinstance(partial, functools.partial), "Hydra returns a partial where one is requested"
+    return partial
 
 
 def refusal(target: str, path: str, error: Exception) -> InputError:
@@ -192,8 +190,8 @@ def refusal(target: str, path: str, error: Exception) -> InputError:
     if cause is None:  # the policy's own sentences
         reason = " ".join(str(error).partition("full_key:")[0].split()).partition(". ")[0]
         return InputError(f"'{path}._target_': {reason.rstrip('.')}.")
-    said = " ".join(str(cause.__cause__ or cause).split()).rstrip(".")
-    return InputError(f"'{path}._target_': cannot import {target} ({said}).")
+    reason = " ".join(str(cause.__cause__ or cause).split()).rstrip(".")
+    return InputError(f"'{path}._target_': cannot import {target} ({reason}).")
 
 
 @functools.cache

@@ -74,7 +74,7 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
         group, _, name = missing.rpartition("/")
         if error.options:
             what = f"there is no {group or 'configuration'} '{name}'"
-            return f"{what}; {nearest(name, error.options)}.{forgotten()}"
+            return f"{what}; {nearest(name, error.options)}.{own_folder_hint()}"
         group = group or missing
         return f"there is no group '{group}'; {nearest(group, groups())}."
     if isinstance(error, OverrideParseException):
@@ -86,8 +86,8 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     return _of_the_defaults(str(error).splitlines()[0].rstrip("."), overrides)
 
 
-def forgotten() -> str:
-    """How a file of the user's own is found, where the command names no folder of such files."""
+def own_folder_hint() -> str:
+    """How to name a folder of the user's own files, where the command has none."""
     if own_folders():
         return ""
     return (
@@ -146,8 +146,8 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
         config = compose([])
     if full_key == "dataset.root" and "cache_dir" in config.dataset:
         return (
-            "'dataset.root' is not a key of an embedded data set; name the data set that lies "
-            "there: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
+            "'dataset.root' is not a key of an embedded data set; name the data set in that "
+            "folder: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
         )
     known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
     hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)

@@ -177,7 +177,7 @@ def help_text(usage: str, options: type, about: str, given: str = "") -> str:
     Args:
         usage: the command as it is typed, without its options.
         options: dataclass that declares them.
-        about: the first paragraph says what the command does; others stand below the options.
+        about: the first paragraph says what the command does; others follow the options.
         given: an option that `usage` names already.
     """
     summary, _, rest = about.partition("\n\n")

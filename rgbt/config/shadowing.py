@@ -1,7 +1,7 @@
 """A user's own folder ``sweeps/`` or ``analysis/`` in the working directory, and ours.
 
 ``python -m`` looks for modules in the working directory first; the command ``rgbt`` looks there
-last, so that a user's own maskers are found and nothing of ours is hidden.
+last, so that it imports a user's own maskers and nothing of ours is hidden.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def search_working_directory_last() -> None:
-    """Let modules of the working directory be found after all others."""
+    """Let imports look in the working directory after all other folders."""
     here = str(Path.cwd())
     sys.path[:] = [*(path for path in sys.path if path not in ("", here)), here]
 

@@ -87,8 +87,8 @@ def _not_finite(value: Any) -> Location | None:
     """Where NaN or infinity is; None where there is neither."""
     if isinstance(value, float) and not math.isfinite(value):
         return ()
-    found = ((key, _not_finite(part)) for key, part in _parts(value).items())
-    return next(((key, *inner) for key, inner in found if inner is not None), None)
+    inner = ((key, _not_finite(part)) for key, part in _parts(value).items())
+    return next(((key, *rest) for key, rest in inner if rest is not None), None)
 
 
 def _refusal(path: str, value: Any, annotation: Any, location: Location) -> str:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS
 from rgbt.config.compose import available, compose, own_folders
-from rgbt.config.hydra_messages import forgotten
+from rgbt.config.hydra_messages import own_folder_hint
 from rgbt.spec.run_spec import SHARED, WEIGHTS, CheckpointFile
 
 PREFIX = "experiment:"
@@ -40,7 +40,7 @@ def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] |
     if name not in known:
         raise InputError(
             f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. A run can be "
-            f"named by its folder too: runs/<key>/{checkpoint}.{forgotten()}"
+            f"named by its folder too: runs/<key>/{checkpoint}.{own_folder_hint()}"
         )
     return name, cast(CheckpointFile, checkpoint)
 
