@@ -411,7 +411,7 @@ def test_stopped_in_the_critics_phase_and_continued(
     assert not (folder / "result.json").exists()
     code, _, err = stopped.told(*words, *short(6))
     assert code == 0, err
-    assert "continues at step 4" in err
+    assert "resumes at step 4" in err
     assert_same_runs(folder, straight(*words, *short(6)))
     named = {name for line in losses(folder) for name in line}
     assert {"loss/critic/source", "loss/critic/target", "loss/target/adversarial"} <= named
@@ -449,7 +449,7 @@ def test_killed_in_the_critics_phase_and_continued(
     assert process.returncode == -signal.SIGKILL, process.stderr
     code, _, err = killed.told(*words, *short(6))
     assert code == 0, err
-    assert "continues at step 4" in err
+    assert "resumes at step 4" in err
     assert_same_runs(killed.folder(*words, *short(6)), straight(*words, *short(6)))
 
 

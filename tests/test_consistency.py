@@ -319,7 +319,7 @@ REFUSED = {
         ["consistency.view.camera.height=1024", "consistency.view.camera.width=1280"],
         "intrinsics of another image size",
     ),
-    "views of training": (["scheme.view.mode=rotation"], "cannot be changed of a stored run"),
+    "views of training": (["scheme.view.mode=rotation"], "cannot be changed of a finished run"),
 }
 
 

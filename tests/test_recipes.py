@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.build.training_setup import _tell_what_is_not_as_published
+from rgbt.build.training_setup import _report_unpublished_settings
 from rgbt.config.compose import conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
@@ -139,11 +139,9 @@ class Told:
     def session(self) -> Any:
         splits = {"train": ("t",), "val": self.val, "test": ("x", "y")}
         return SimpleNamespace(
-            config=OmegaConf.create(
-                {
-                    "scale": {"name": self.scale, "pretrained": self.scale == "paper"},
-                    "recipe": {"dataset": self.recipe},
-                }
+            spec=SimpleNamespace(
+                scale=SimpleNamespace(name=self.scale, pretrained=self.scale == "paper"),
+                recipe=SimpleNamespace(dataset=self.recipe),
             ),
             dataset=SimpleNamespace(name=self.data, names=splits.__getitem__),
             trainer=SimpleNamespace(selection_split=self.picked, tested=self.tested),
@@ -155,7 +153,7 @@ class Told:
 @pytest.fixture
 def lines(capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
     def of(**changes: Any) -> list[str]:
-        _tell_what_is_not_as_published(Told(**changes).session())
+        _report_unpublished_settings(Told(**changes).session())
         return capsys.readouterr().err.splitlines()
 
     return of

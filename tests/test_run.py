@@ -122,7 +122,7 @@ def test_killed_and_continued_equals_uninterrupted(call: Call, data: Path, tmp_p
 
     code, _, err = train(call, data, tmp_path / "killed", *overrides)
     assert code == 0, err
-    assert "continues at step" in err
+    assert "resumes at step" in err
     train(call, data, tmp_path / "straight", *overrides)
 
     resumed, straight = only_run(tmp_path / "killed"), only_run(tmp_path / "straight")
@@ -361,7 +361,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
         (f"run={folder}", "checkpoint=first"): "'checkpoint' must be 'best' or 'last'",
         (f"run={folder}", "model.num_queries=3"): "'model.num_queries' cannot be changed",
         (f"run={folder}", "data.batch_siz=1"): "did you mean 'data.batch_size'?",
-        (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a stored run",
+        (f"run={folder}", "scale=paper"): "'scale' cannot be changed of a finished run",
         (f"run={folder}", "model=mask2former_swin_t"): "'model' cannot be changed",
         (f"run={folder}", "data.eval_batch_size=[1"): "data.eval_batch_size cannot be read as YAML",
         (): "'run' has no value",
@@ -374,7 +374,7 @@ def test_evaluate_refuses_what_does_not_fit(call: Call, runs: Path) -> None:
     (folder / "best.pt").rename(folder / "kept.pt")
     code, _, err = call(entry, f"run={folder}")
     assert code == 2
-    assert_one_sentence(err, "has no best.pt: the run has not come to its first evaluation")
+    assert_one_sentence(err, "has no best.pt: the run has not reached its first evaluation")
 
 
 def test_a_checkpoint_of_another_model_is_refused(
@@ -455,8 +455,8 @@ def test_real_pairs_train_and_evaluate_like_the_embedded_data(call: Call, tmp_pa
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("+experiment=baseline", "model=cmx_tiny"), "choose loss=cross_entropy"),
-        (("+experiment=mfnet", "model=mask2former_tiny"), "choose loss=set_criterion"),
+        (("+experiment=baseline", "model=cmx_tiny"), "or loss=cross_entropy."),
+        (("+experiment=mfnet", "model=mask2former_tiny"), "or loss=set_criterion, set_"),
         (("+experiment=crm", "model=rtfnet_tiny", "loss=cross_entropy"), "scheme=supervised"),
     ],
 )

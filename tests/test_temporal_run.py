@@ -95,7 +95,7 @@ def test_interrupted_and_continued_equals_uninterrupted(
 
     code, _, err = train(call, data, tmp_path / "stopped", *overrides)
     assert code == 0, err
-    assert "continues at step 4" in err
+    assert "resumes at step 4" in err
     code, _, err = train(call, data, tmp_path / "straight", *overrides)
     assert code == 0, err
     straight = only_run(tmp_path / "straight")

@@ -1,4 +1,4 @@
-"""Everything a training needs, built and looked at before anything is written."""
+"""The objects of a training, built and checked before anything is written."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     check_cells(session, masker)
     check_cameras(session, scheme)
     if upstream_finished:
-        _tell_what_is_not_as_published(session)
+        _report_unpublished_settings(session)
     others, optimizers = _set_up(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     return TrainingSetup(
@@ -154,8 +154,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     )
 
 
-def _tell_what_is_not_as_published(session: Session) -> None:
-    """Remarks on what is no mistake, and yet not what a paper's numbers were made with."""
+def _report_unpublished_settings(session: Session) -> None:
+    """Report settings that are valid, but not those of the published numbers."""
     spec, data = session.spec, session.dataset
     expected: object = spec.scale.pretrained and record_of(session.model).pretrained_parts
     if expected and session.weights is None:
@@ -222,7 +222,7 @@ def _labelled(session: Session, name: str, domain: Domain) -> Dataset:
 
 
 def _check_labelled(session: Session, name: str, domain: Domain) -> None:
-    """Refuse labels that the data set does not have, and tell of those that it is tested on."""
+    """Refuse labels that the data set does not have; report training images of the test split."""
     if domain.labels != GIVEN:
         return
     if first_readable(session, domain.split).label is None:

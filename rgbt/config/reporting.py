@@ -29,8 +29,6 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         return say(str(error), 2)
     except RunError as error:
         return say(str(error), 1)
-    except OSError as error:
-        return say(_of_file(error), 2)
     except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
@@ -39,18 +37,23 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         # A second Ctrl-C.
         return say("interrupted; rerun the command to resume from its last checkpoint.", 130)
     except Exception as error:
-        if type(error).__module__.partition(".")[0] not in ("hydra", "omegaconf"):
+        sentence = _of_library(error)
+        if sentence is None:
             raise
+        return say(sentence, 2)
+
+
+def _of_library(error: Exception) -> str | None:
+    """What Hydra, OmegaConf or the system refused; None of another error."""
+    if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
         from rgbt.config.hydra_messages import hydra_sentence  # --help does not wait for Hydra
 
-        words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        return say(hydra_sentence(error, words), 2)
-
-
-def _of_file(error: OSError) -> str:
+        return hydra_sentence(error, [word for word in sys.argv[1:] if not word.startswith("-")])
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"{error.filename}: a file is where a folder is needed; name another path."
-    return f"{error.filename or 'a file'}: {error.strerror or error}."
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}."
+    return None
 
 
 def say(sentence: str, code: int) -> int:

@@ -129,7 +129,7 @@ def _warn_of_missing_consistency(folder: RunFolder, views: ViewSets) -> None:
 
 @dataclass(frozen=True)
 class Run:
-    """A run that is not finished: trains, evaluates and fills its folder."""
+    """An unfinished run: trains, evaluates and fills its folder."""
 
     setup: TrainingSetup
     folder: RunFolder
@@ -157,7 +157,7 @@ class Run:
             self.tracking.finish("KILLED")
             raise
         except BaseException:
-            # A run that stops on an error is shown as failed, not as running for ever.
+            # The tracker must not show a run that raised as running.
             self.tracking.finish("FAILED")
             raise
         with deferred():  # a signal must not leave a finished run as running in the store
@@ -186,12 +186,10 @@ class Run:
         """What the best checkpoint reached on the selection split and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
         val = lines.get(("val", state.best_step)) or self._validated()
-        found = {"val": val, "test": lines["test", state.step]}
-        found = {
-            kind: {**values, **(consistency_values(pairs[kind]) if kind in pairs else {})}
-            for kind, values in found.items()
-        }
-        return {kind: without_nan(values) for kind, values in found.items()}
+        reached = {"val": val, "test": lines["test", state.step]}
+        for kind, table in pairs.items():
+            reached[kind] = {**reached[kind], **consistency_values(table)}
+        return {kind: without_nan(values) for kind, values in reached.items()}
 
     def _validated(self) -> dict[str, float]:
         """Scores of the best checkpoint from its counts, where their line was damaged."""
@@ -202,17 +200,17 @@ class Run:
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
-        found = {"names": names_key(session), "files": dataset.fingerprint()}
-        before = self.folder.marker() or found
-        if before["names"] != found["names"]:
+        now = {"names": names_key(session), "files": dataset.fingerprint()}
+        before = self.folder.marker() or now
+        if before["names"] != now["names"]:
             raise InputError(
                 f"{self.folder.path} was started on other images than the lists of "
                 f"{dataset.root} name; give the runs another folder (runs_dir=...), or the data "
                 "set another name (dataset.name=...)."
             )
-        if before["files"] != found["files"]:
+        if before["files"] != now["files"]:
             info(f"files of {dataset.root} have changed since this run was started.")
-        self.folder.mark(**found)
+        self.folder.mark(**now)
         config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
         self.folder.write_config(without_passwords(config))
         self.folder.add_provenance({**provenance(), "own_code": session.spec.own_code()})
@@ -223,7 +221,7 @@ class Run:
         if trainer.resume(state):
             if trainer.checkpoints.warning:
                 info(trainer.checkpoints.warning)
-            info(f"{self.description.name} continues at step {state.step} ({self.folder.path}).")
+            info(f"{self.description.name} resumes at step {state.step} ({self.folder.path}).")
         self.folder.begin_at(state.step)
         warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
@@ -231,11 +229,11 @@ class Run:
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
         batches = self.setup.batches(steps)
         trainer.fit(_noting_skipped(batches, state), state)
-        self._tell_waiting(session)
+        self._report_waiting(session)
         return state
 
     def _truncate(self, state: State) -> None:
-        """Prepare ``metrics.jsonl`` for a run that resumes; say what is repeated or lost of it."""
+        """Prepare ``metrics.jsonl`` of a run that resumes; report what is repeated or lost."""
         step = state.step
         before = self.folder.truncate_after(step, state.evaluated_step)
         if before.reached > step:
@@ -256,8 +254,8 @@ class Run:
                 "these lines are left out, metrics.jsonl.damaged holds the file as it was."
             )
 
-    def _tell_waiting(self, session: Session) -> None:
-        """Say so where the training mostly waited for images, and what helps."""
+    def _report_waiting(self, session: Session) -> None:
+        """Report a training that mostly waited for images, and what helps."""
         shares = [
             line.values[WAIT_SHARE]
             for line in self.folder.lines()
@@ -277,13 +275,13 @@ class Run:
         per_epoch = self.setup.steps_per_epoch()
 
         def validate(step: int) -> float:
-            found = evaluate(session, self.setup.model, EvaluationRequest(split=split))
-            place = trainer.checkpoints.begin_evaluation(step)
-            found.counts.save(place / self.folder.counts_path(split).name)
-            values = scores.summary(found.counts, session.regions.absent)
-            values |= self._of_target(session, self.setup.model, split, place)
+            result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
+            folder = trainer.checkpoints.begin_evaluation(step)
+            result.counts.save(folder / self.folder.counts_path(split).name)
+            values = scores.summary(result.counts, session.regions.absent)
+            values |= self._of_target(session, self.setup.model, split, folder)
             self.folder.append(step, "val", values)
-            state.skip(found.skipped)
+            state.skip(result.skipped)
             return values[names.MIOU]
 
         trainer = Trainer(
@@ -310,54 +308,54 @@ class Run:
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
                 request = EvaluationRequest(split=split, keep=keep)
-                found = count_pairs(session, session.model, request, "virtual")
+                pairs = count_pairs(session, session.model, request, "virtual")
             except InputError as error:
-                # The training is done, and is not lost for what is measured beside.
-                info(f"{error} Without consistency: python -m rgbt.consistency measures it later.")
+                # The training is done: an error of an extra evaluation must not lose it.
+                info(f"{error} Consistency is left out; rgbt consistency measures it later.")
                 continue
-            for protocol, counts in found.counts.items():
+            for protocol, counts in pairs.counts.items():
                 path = self.folder.path / file_name(protocol, split, session.consistency.mark)
                 path.parent.mkdir(exist_ok=True)
                 counts.save(path)
-            tables[kind] = consistency_table(found.counts, session.regions.absent)
-            if found.kept:
-                draw_pairs(found.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
+            tables[kind] = consistency_table(pairs.counts, session.regions.absent)
+            if pairs.kept:
+                draw_pairs(pairs.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
         return tables
 
     def _test(self, session: Session, state: State, pairs: ConsistencyTable | None) -> None:
         """Counts, tables and figures of the best checkpoint on the test split."""
         keep = panel_names(session.dataset, "test")
-        found = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
-        state.skip(found.skipped)
-        found.counts.save(self.folder.counts_path("test"))
-        values = scores.summary(found.counts, session.regions.absent)
+        result = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
+        state.skip(result.skipped)
+        result.counts.save(self.folder.counts_path("test"))
+        values = scores.summary(result.counts, session.regions.absent)
         of_target = self._of_target(session, session.model, "test", self.folder.path)
         values |= of_target | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         name = self.description.name
-        tables = result_tables(found.counts, session.regions, name, state.best_step)
+        tables = result_tables(result.counts, session.regions, name, state.best_step)
         subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)
         self.folder.write_tables(tables.to_json())
-        if found.kept:
-            self._draw(session, tables, found.kept)
+        if result.kept:
+            self._draw(session, tables, result.kept)
         else:
             info("none of the images of the panel could be read; no pictures were drawn.")
 
     def _of_target(
-        self, session: Session, model: nn.Module, split: str, place: Path
+        self, session: Session, model: nn.Module, split: str, folder: Path
     ) -> dict[str, float]:
-        """Where the target is seen in another view than the source: its mIoU, named after that.
+        """The mIoU in the view of the target, if that is not the source's, named after the view.
 
-        Its counts are written to the folder `place`.
+        Its counts are written to `folder`.
         """
         target = session.domains.target
         if target is None or target.view in (None, view_of(session)):
             return {}
         request = EvaluationRequest(split=split, view=target.view)
         counts = evaluate(session, model, request).counts
-        counts.save(place / self.folder.counts_path(f"{split}_{target.view}").name)
+        counts.save(folder / self.folder.counts_path(f"{split}_{target.view}").name)
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from analysis.compare import entry
 from rgbt.metrics.counts import Counts
-from tests.analysis.test_compare import ENTRY, FAST, pair
+from tests.analysis.test_compare import FAST, pair
 from tests.analysis.test_results import make_run
 from tests.commands import Call, assert_one_sentence
 
@@ -50,7 +51,7 @@ def test_counts_that_cannot_be_compared(call: Call, tmp_path: Path, kind: str, s
     a, b = pair()
     a.save(tmp_path / "a.npz")
     spoilt(kind, b).save(tmp_path / "b.npz")
-    code, out, err = call(ENTRY, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
+    code, out, err = call(entry, f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", *FAST)
     assert (code, out) == (2, "")
     assert_one_sentence(err, sentence)
 
@@ -63,7 +64,7 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
     a.save(tmp_path / "a.npz")
     spoilt(kind, b).save(tmp_path / "b.npz")
     arguments = f"a={tmp_path}/a.npz", f"b={tmp_path}/b.npz", "missing=leave_out"
-    code, out, err = call(ENTRY, *arguments, *FAST)
+    code, out, err = call(entry, *arguments, *FAST)
     assert (code, out) == (2, "")
     assert sentence in err.splitlines()[-1]
     assert "Traceback" not in err
@@ -100,17 +101,17 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
     ],
 )
 def test_bad_arguments(call: Call, files: tuple[str, str], argument: str, sentence: str):
-    code, out, err = call(ENTRY, *files, *FAST, argument)
+    code, out, err = call(entry, *files, *FAST, argument)
     assert (code, out) == (2, "")
     assert_one_sentence(err, sentence)
 
 
 def test_the_same_file_twice(call: Call, files: tuple[str, str]):
     a = files[0].partition("=")[2]
-    code, _, err = call(ENTRY, f"a={a}", f"b={a}", *FAST)
+    code, _, err = call(entry, f"a={a}", f"b={a}", *FAST)
     assert code == 2
     assert_one_sentence(err, "a and b both hold ")
-    code, _, err = call(ENTRY, f"a={a},{a}", files[1], *FAST)
+    code, _, err = call(entry, f"a={a},{a}", files[1], *FAST)
     assert code == 2
     assert_one_sentence(err, "twice; one training counts once")
 
@@ -128,25 +129,25 @@ def test_no_such_run_group_or_folder(call: Call, files: tuple[str, str], tmp_pat
         ("b=", ": crm."),
         ("b=crm,", "expected runs, files of counts or a group"),
     ):
-        code, out, err = call(ENTRY, files[0], b, place, *FAST)
+        code, out, err = call(entry, files[0], b, place, *FAST)
         assert (code, out) == (2, "")
         assert_one_sentence(err, sentence)
 
 
 def test_both_sides_must_be_given(call: Call, files: tuple[str, str]):
-    code, _, err = call(ENTRY, files[0])
+    code, _, err = call(entry, files[0])
     assert code == 2
     assert_one_sentence(err, "'b' has no value")
 
 
 def test_out_that_is_a_file(call: Call, files: tuple[str, str], tmp_path: Path):
     (tmp_path / "taken").write_text("")
-    code, _, err = call(ENTRY, *files, *FAST, f"out={tmp_path}/taken")
+    code, _, err = call(entry, *files, *FAST, f"out={tmp_path}/taken")
     assert code == 2
     assert_one_sentence(err, "taken")
 
 
 def test_a_file_of_another_split(call: Call, files: tuple[str, str]):
-    code, _, err = call(ENTRY, *files, "split=val")
+    code, _, err = call(entry, *files, "split=val")
     assert code == 2
     assert_one_sentence(err, "is of split 'test', not of split=val")

@@ -29,7 +29,7 @@ def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamesp
 @pytest.fixture
 def warnings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     lines: list[str] = []
-    monkeypatch.setattr(load_run, "tell", lines.append)
+    monkeypatch.setattr(load_run, "warn", lines.append)
     return lines
 
 

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from rgbt.build.requirements import check_requirements
 from rgbt.checks import InputError
 from rgbt.config.component import Component
-from rgbt.config.compose import compose, searching
+from rgbt.config.compose import compose
 from rgbt.requirements import Record, Requirement
 
 
@@ -174,8 +174,8 @@ def test_users_component_with_record_is_a_choice(
     (folder / "unset.yaml").write_text("_target_: own_masks.Settable\nshift: false\n")
     (folder / "broken.yaml").write_text("_target_: own_masks.Broken\n")
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
     asking = Asking(Requirement("masker", "shift", True))
-    with searching([f"hydra.searchpath=[file://{tmp_path / 'conf'}]"]):
-        found = sentence({"asking": asking, "masker": Nothing()})
+    found = sentence({"asking": asking, "masker": Nothing()})
     assert found.endswith("choose masker=set, shifted.")
     sys.modules.pop("own_masks", None)

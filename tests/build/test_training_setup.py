@@ -1,4 +1,4 @@
-"""Before anything is trained or written: whose labels a domain gets, and what is told of them."""
+"""Before anything is trained or written: the labels of the domains, and what is refused."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 
-from rgbt.build import training_setup as prepared_module
+from rgbt.build import training_setup
 from rgbt.build.session import open_session
-from rgbt.build.training_setup import _where_to_augment, prepare, rehearse
+from rgbt.build.training_setup import _where_to_augment, set_up_training, validate
 from rgbt.checks import InputError
-from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, Teacher, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.requirements import Record
+from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
-from rgbt.training import pipeline as earlier
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
 from tests.composed import composed as composed_once
@@ -34,12 +32,12 @@ SIZES = (
     *("dataset.num_val=1", "dataset.num_test=2", "scale.batch_size=1", "scale.critic_width=4"),
     *("trainer.accelerator=cpu", "trainer.threads=1", "data.num_workers=0", "tracking=none"),
 )
-Composed = Callable[..., DictConfig]
+Composed = Callable[..., RunSpec]
 
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("prepared")
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture
@@ -50,17 +48,15 @@ def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
 
 @pytest.fixture
 def composed(words: Callable[..., list[str]]) -> Composed:
-    def make(name: str, *more: str) -> DictConfig:
-        config = compose(words(name, *more))
-        specify(config)
-        return config
+    def make(name: str, *more: str) -> RunSpec:
+        return specify(compose(words(name, *more)))
 
     return make
 
 
-def write_folder(config: DictConfig, folder: Path, split: str, **changes: Any) -> Path:
+def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Path:
     """A folder that says it is finished, with (empty) files of every image of a split."""
-    dataset = build(config.dataset)
+    dataset = spec.dataset.build()
     for name in dataset.names(split):
         (folder / "labels").mkdir(parents=True, exist_ok=True)
         (folder / "labels" / f"{name}.png").touch()
@@ -77,9 +73,9 @@ def write_folder(config: DictConfig, folder: Path, split: str, **changes: Any) -
 
 @pytest.mark.parametrize("name", ["source", "target"])
 def test_given_labels_that_the_data_set_does_not_have(composed: Composed, name: str) -> None:
-    config = composed("sh_both", f"domains.{name}.split=train_night")
+    spec = composed("sh_both", f"domains.{name}.split=train_night")
     with pytest.raises(InputError) as raised:
-        prepare(config)
+        set_up_training(spec)
     assert f"domains.{name}.labels=given, but synth_freiburg has no labels of train_night" in str(
         raised.value
     )
@@ -87,7 +83,7 @@ def test_given_labels_that_the_data_set_does_not_have(composed: Composed, name: 
 
 def test_images_without_labels_are_fine_where_none_are_read(composed: Composed) -> None:
     night = "domains.target.split=train_night"
-    found = prepare(composed("sh_adversarial", "model.weights=null", night))
+    found = set_up_training(composed("sh_adversarial", "model.weights=null", night))
     dataset = found.datasets["target"]
     assert dataset.read(dataset.names("train_night")[0]).label is None
 
@@ -97,7 +93,7 @@ def test_test_images_in_training_are_told(
 ) -> None:
     def told(*more: str) -> list[str]:
         capfd.readouterr()
-        prepare(composed("sh_both", *more))
+        set_up_training(composed("sh_both", *more))
         return [line for line in capfd.readouterr().err.splitlines() if "test images" in line]
 
     assert told() == []
@@ -107,7 +103,9 @@ def test_test_images_in_training_are_told(
     (line,) = told("domains.source.split=test")
     assert "domains.source.split=test: 2 of its images are test images" in line
     # Without their labels they are the images of a target that is adapted to, and may be seen.
-    prepare(composed("sh_adversarial", "model.weights=null", "domains.target.split=test_night"))
+    set_up_training(
+        composed("sh_adversarial", "model.weights=null", "domains.target.split=test_night")
+    )
     assert "test images" not in capfd.readouterr().err
 
 
@@ -136,13 +134,13 @@ def test_pseudo_labels_of_another_split(
     next(iter((folder / "labels").iterdir())).unlink()
     typed = ("sh_both", f"domains.target.labels={folder}")
     with pytest.raises(InputError, match="no pseudo-labels of 1 of the 3 images of train_day"):
-        prepare(composed(*typed))
-    prepare(composed(*typed, "data.on_error=skip"))
+        set_up_training(composed(*typed))
+    set_up_training(composed(*typed, "data.on_error=skip"))
     # ... and without any there is nothing to learn from.
     for path in (folder / "labels").iterdir():
         path.unlink()
     with pytest.raises(InputError, match="no pseudo-labels of 3 of the 3 images of train_day"):
-        prepare(composed(*typed, "data.on_error=skip"))
+        set_up_training(composed(*typed, "data.on_error=skip"))
 
 
 def test_pseudo_labels_of_which_none_was_kept(
@@ -154,28 +152,28 @@ def test_pseudo_labels_of_which_none_was_kept(
     refused(call, words(*typed), sentence, tmp_path / "runs")
 
 
-def finished_teacher(config: DictConfig) -> Path:
-    """The folder of an earlier run that has its result."""
-    (found,) = earlier.earlier_runs(config)
-    found.folder.mkdir(parents=True)
-    (found.folder / "result.json").write_text("{}")
-    return found.folder
+def finished_teacher(spec: RunSpec) -> Path:
+    """The folder of the upstream run, with its result."""
+    (teacher,) = spec.upstream
+    teacher.folder.mkdir(parents=True)
+    (teacher.folder / "result.json").write_text("{}")
+    return teacher.folder
 
 
 def test_predicted_labels_of_other_files(
     call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
 ) -> None:
     """Named by their experiment they follow the data; a folder is taken as it is."""
-    config = composed("multi_head_night_stage1")
-    labels = finished_teacher(config) / "pseudo_labels" / "train_night_thermal_best"
-    write_folder(config, labels, "train_night", fingerprint="of other files")
+    spec = composed("multi_head_night_stage1")
+    labels = finished_teacher(spec) / "pseudo_labels" / "train_night_thermal_best"
+    write_folder(spec, labels, "train_night", fingerprint="of other files")
     sentence = f"{labels} was predicted on other files of synth_freiburg than those of"
     refused(call, words("multi_head_night_stage1"), sentence, tmp_path / "runs")
-    write_folder(config, labels, "train_night")
-    prepare(config)
-    write_folder(config, labels, "train_night", fingerprint="of other files")
+    write_folder(spec, labels, "train_night")
+    set_up_training(spec)
+    write_folder(spec, labels, "train_night", fingerprint="of other files")
     typed = (f"domains.target.labels={labels}", "domains.target.teacher_view=null")
-    prepare(composed("multi_head_night_stage1", *typed))
+    set_up_training(composed("multi_head_night_stage1", *typed))
 
 
 BEFORE_TRAINING = {
@@ -184,10 +182,7 @@ BEFORE_TRAINING = {
         "requires views=rgb of the network of domains.target.labels, PSPNet provides views=thermal",
     ),
     "a confidence that masks do not read": (
-        [
-            *("multi_head_night_stage1", "domains.target.confidence=true"),
-            *("model=mask2former_tiny", "loss=set_criterion"),
-        ],
+        ["heatnet", "model=mask2former_tiny", "loss=set_criterion"],
         "requires outputs=scores of the model, Mask2Former provides outputs=masks",
     ),
     "a confidence that two frames do not read": (
@@ -201,16 +196,16 @@ BEFORE_TRAINING = {
 
 
 @pytest.mark.parametrize(("typed", "sentence"), BEFORE_TRAINING.values(), ids=BEFORE_TRAINING)
-def test_found_before_a_teacher_is_trained(
+def test_validate_finds_errors_before_training(
     call: Call, words: Callable[..., list[str]], tmp_path: Path, typed: list[str], sentence: str
 ) -> None:
     refused(call, words(*typed), sentence, tmp_path / "runs")
 
 
-def test_a_view_that_the_teacher_has_passes_the_rehearsal(composed: Composed) -> None:
+def test_validate_view_of_the_teacher_passes(composed: Composed) -> None:
     for view in ("thermal", "null"):
-        rehearse(composed("multi_head_night_stage1", f"domains.target.teacher_view={view}"))
-    rehearse(composed("multi_head_night_stage1", "domains.target.confidence=true"))
+        validate(composed("multi_head_night_stage1", f"domains.target.teacher_view={view}"))
+    validate(composed("multi_head_night_stage1", "domains.target.confidence=true"))
 
 
 # ---- the folder -----------------------------------------------------------------------------
@@ -242,23 +237,23 @@ def test_another_range_of_thermal_counts_is_another_input(
 
 
 @pytest.fixture
-def cached(data: Path, tmp_path: Path) -> DictConfig:
+def cached(data: Path, tmp_path: Path) -> RunSpec:
     """A small network on MFNet, with a cache."""
     model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
     place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
     words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
-    return composed_once((*words, *place))
+    return specify(composed_once((*words, *place)))
 
 
 def test_all_that_is_read_is_decoded_before_the_first_step(
-    cached: DictConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cached: RunSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that a disk that is full, or may not be written, is told before anything is trained."""
-    prepare(cached, rehearsal=True)
+    validate(cached)
     assert not (tmp_path / "cache").exists(), "a rehearsal leaves nothing behind"
-    prepared = prepare(cached)
-    decode_ahead(prepared.session, *prepared.read_splits())
-    dataset: Any = prepared.session.dataset
+    setup = set_up_training(cached)
+    decode_ahead(setup.session, *setup.read_splits())
+    dataset: Any = setup.session.dataset
 
     def refuses(name: str) -> None:
         raise AssertionError(f"{name} was decoded")
@@ -266,10 +261,10 @@ def test_all_that_is_read_is_decoded_before_the_first_step(
     monkeypatch.setattr(dataset.source, "read", refuses)
     for split, names in SPLITS.items():
         assert [dataset.read(name).name for name in names] == names, split
-    one = next(prepared.batches(range(1)))
+    one = next(setup.batches(range(1)))
     assert isinstance(one, Batch), "no GPU to augment on"
-    monkeypatch.setattr(prepared_module, "_where_to_augment", lambda session: "device")
-    other = next(prepared.batches(range(1)))
+    monkeypatch.setattr(training_setup, "_where_to_augment", lambda session: "device")
+    other = next(setup.batches(range(1)))
     assert not isinstance(other, Batch)
     assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
 

@@ -10,15 +10,16 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.corruptions.noise import Noise
-from rgbt.data.cache.dataset import Decoded
+from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset
 from rgbt.evaluation.prediction import decode_ahead, heads_of, view_of
+from rgbt.requirements import Record
 
 
 class Network:
-    views = ("rgb", "thermal")
+    record = Record(views=("rgb", "thermal"))
 
 
 def session_of(source: dict[str, object], **changes: object) -> SimpleNamespace:
@@ -69,7 +70,7 @@ def test_heads_of_unlisted_images() -> None:
     for requested, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", requested)(("mine", "night")) == (head, head)
     assert session.dataset.calls == 0
-    with pytest.raises(InputError, match=r"night, so that no head can be chosen; say head=source"):
+    with pytest.raises(InputError, match=r"night, so no head can be chosen; set head=source"):
         heads_of(session, "rgb")(("mine",))
     alone = session_of({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
@@ -81,7 +82,7 @@ def test_decode_ahead_decodes_the_requested_splits(
     write_mfnet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, corrupted: bool
 ) -> None:
     splits = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
-    dataset = Decoded(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
+    dataset = CachedDataset(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
     noise = Noise(image="both", severities=(8.0,))
     session = SimpleNamespace(
         dataset=CorruptedDataset(dataset, noise, 8.0, split="val") if corrupted else dataset

@@ -34,6 +34,7 @@ from rgbt.evaluation.pseudo_labels import (
 )
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import holding
+from rgbt.requirements import Record
 from rgbt.spec.specify import specify
 from rgbt.types import Output, View
 from tests.conftest import write_png
@@ -51,8 +52,7 @@ class Fixed(nn.Module):
     """Class (thermal + 2 * red) with the probability `SURE[thermal]`, the rest shared by others."""
 
     num_classes = 9
-    views = ("rgbt", "thermal")
-    predicts = "scores"
+    record = Record(views=("rgbt", "thermal"))
 
     def __init__(self) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class Fixed(nn.Module):
 class Masks(nn.Module):
     """What a network of queries returns in evaluation: sums, not normalised."""
 
-    predicts = "masks"
+    record = Record(outputs="masks")
 
     def __init__(self, scores: list[float]) -> None:
         super().__init__()
@@ -182,8 +182,7 @@ class Half(nn.Module):
     """Two of nine classes with one half each, to the last digit."""
 
     num_classes = 9
-    views = ("rgbt", "thermal")
-    predicts = "scores"
+    record = Record(views=("rgbt", "thermal"))
 
     def forward(self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = ()) -> Output:
         del thermal, views
@@ -208,8 +207,7 @@ class Heads(nn.Module):
     """The head "day" predicts class 1 everywhere, "dark" class 2."""
 
     num_classes = 9
-    views = ("rgbt", "thermal")
-    predicts = "scores"
+    record = Record(views=("rgbt", "thermal"))
     heads = ("day", "dark")
 
     def forward(
@@ -389,7 +387,7 @@ def test_two_processes_do_not_write_at_once(
     out.mkdir()
     said: list[str] = []
     waits = threading.Event()
-    monkeypatch.setattr(pseudo, "tell", lambda sentence: (said.append(sentence), waits.set()))
+    monkeypatch.setattr(pseudo, "info", lambda sentence: (said.append(sentence), waits.set()))
     other = threading.Thread(target=written, args=(session, out))
     with holding(out / ".lock"):
         other.start()

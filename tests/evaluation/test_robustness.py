@@ -19,6 +19,7 @@ from rgbt.evaluation.robustness import Condition, Measured, conditions, measure,
 from rgbt.evaluation.robustness_table import robustness_grid
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.requirements import Record
 from tests.corruptions.recorded import Recorded
 
 EVALUATE = "rgbt.evaluation.robustness.evaluate"
@@ -27,7 +28,7 @@ EVALUATE = "rgbt.evaluation.robustness.evaluate"
 class Network(nn.Module):
     def __init__(self, views: tuple[str, ...] = ("rgbt", "rgb", "thermal")) -> None:
         super().__init__()
-        self.views = views
+        self.record = Record(views=views)
         self.weight = nn.Parameter(torch.arange(4.0))
 
 

@@ -204,7 +204,7 @@ def test_a_training_whose_disk_fills_up_resumes_when_there_is_space(
     assert not (folder / "result.json").exists()
     subprocess.run(["mount", "-o", "remount,size=300m", str(small_disk)], check=True)
     code, _, err = train(call, data, runs, *words)
-    assert (code, "continues at step 2" in err) == (0, True), err
+    assert (code, "resumes at step 2" in err) == (0, True), err
     straight = tmp_path / "straight"
     assert train(call, data, straight, *words)[0] == 0
     first, second = (only_run(each) / "counts_test.npz" for each in (runs, straight))

@@ -213,7 +213,7 @@ OWN = (
 
 
 def test_upstream_overrides_are_those_that_both_runs_share() -> None:
-    model = ["model.base_width=7", "model=deeplabv2_two_heads_tiny"]
+    model = ["model.base_width=7", "model=deeplabv2_two_heads_modified_tiny"]
     (stage,) = spec_of("multi_head_night", *COMMON, *OWN, *model).upstream
     (teacher,) = stage.upstream
     silent = ["tracking=none"]  # no name has it

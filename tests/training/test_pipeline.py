@@ -282,7 +282,7 @@ def another_process(folder: Path, *, finishes: bool, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(pipeline, "POLL_S", 0.01)
     messages: list[str] = []
     waits, holds = threading.Event(), threading.Event()
-    monkeypatch.setattr(pipeline, "tell", lambda text: (messages.append(text), waits.set()))
+    monkeypatch.setattr(pipeline, "info", lambda text: (messages.append(text), waits.set()))
 
     def hold() -> None:
         folder.mkdir(parents=True)

@@ -23,7 +23,7 @@ def told(
     nothing: Any = None
     session: Any = SimpleNamespace(loading=SimpleNamespace(cache=cache))
     capsys.readouterr()
-    Run(nothing, folder, nothing, nothing)._tell_waiting(session)
+    Run(nothing, folder, nothing, nothing)._report_waiting(session)
     return capsys.readouterr().err
 
 
