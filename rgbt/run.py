@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rgbt.config.command import command, task_overrides
+from rgbt.config.command import command
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 def main(config: DictConfig) -> int:
     """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
     # torch is imported here, after --help
+    from hydra.core.hydra_config import HydraConfig
+
     from rgbt.spec.naming import tags_from_environment
     from rgbt.spec.specify import specify
     from rgbt.tracking.terminal import info
     from rgbt.training.pipeline import run_pipeline
 
-    run = specify(config, task_overrides())
+    run = specify(config, list(HydraConfig.get().overrides.task))
     if run.pretrained is not None and not run.uses_pretrained:
         info(f"pretrained={run.pretrained} is ignored: {run.name} does not start from it.")
     run_pipeline(run, tags_from_environment())

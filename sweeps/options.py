@@ -12,8 +12,7 @@ from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.command import composing
 from rgbt.config.common_options import RunsDir
 from rgbt.config.component import Component
-from rgbt.config.options import Help
-from rgbt.config.words import readable_paths
+from rgbt.config.options import Help, readable_paths
 from rgbt.metrics.names import MIOU
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.common_options import RunsDir
-from rgbt.config.options import Help
+from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
-from rgbt.config.words import readable_paths
 from rgbt.tracking.provenance import without_passwords
 from sweeps.worker.storage import JOURNAL, load_study, open_storage, storage_file, study_names
 

@@ -11,8 +11,7 @@ import pytest
 
 from rgbt.__main__ import help_text, main
 from rgbt.config.commands import COMMANDS
-from rgbt.config.completion import OF_HYDRA, candidates
-from rgbt.config.shells import BASH, SCRIPTS
+from rgbt.config.completion import BASH, OF_HYDRA, SCRIPTS, candidates
 from tests.commands import Call, assert_one_sentence
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -52,8 +51,7 @@ def test_help_lists_every_command_and_its_module_exists() -> None:
     for name, entry in COMMANDS.items():
         assert f"\n  {name} " in shown
         assert len(f"  {name:<13}{entry.about}") <= 80
-        path = ROOT / entry.module.replace(".", "/")
-        text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+        text = (ROOT / f"{entry.module.replace('.', '/')}.py").read_text()
         assert 'if __name__ == "__main__"' in text, entry.module
 
 
@@ -162,8 +160,7 @@ def test_completion_offers_nothing_where_nothing_fits(line: str) -> None:
 
 def test_commands_of_hydra_are_those_without_options() -> None:
     for name, entry in COMMANDS.items():
-        path = ROOT / entry.module.replace(".", "/")
-        text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+        text = (ROOT / f"{entry.module.replace('.', '/')}.py").read_text()
         assert ("@command(" in text) == (name in OF_HYDRA), name
 
 

@@ -14,11 +14,10 @@ from typing import Annotated, Any
 
 from analysis.arguments import Resamples, check_out
 from rgbt.config.command import built
-from rgbt.config.options import Help
+from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 from rgbt.config.shadowing import check_not_shadowed
 from rgbt.config.stored_config import parse_trust
-from rgbt.config.words import readable_paths
 
 TOLD = 5
 """Remarks that are printed to stderr; the page has all."""

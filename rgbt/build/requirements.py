@@ -10,9 +10,8 @@ import torch
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError
-from rgbt.config.choices import choices
-from rgbt.config.component import Component
-from rgbt.config.targets import constructor
+from rgbt.config.component import Component, constructor
+from rgbt.config.compose import choices
 from rgbt.requirements import Record, Requirement, record_of
 
 MOST_CHOICES = 6

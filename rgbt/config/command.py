@@ -14,55 +14,52 @@ from functools import wraps
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import compose, conf_dir, register_resolvers, searching
+from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
 from rgbt.config.hydra_messages import check_words, hydra_sentence
-from rgbt.config.keys import check_keys
+from rgbt.config.options import readable_paths
 from rgbt.config.reporting import exit_code
-from rgbt.config.words import readable_paths
 from rgbt.runtime.signals import answered
 
 Main = Callable[[DictConfig], int | None]
 
 
-def command(
-    config_name: str = "config", *, sweeper: str = "basic"
-) -> Callable[[Main], Callable[[], None]]:
+def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     """Make ``main(config)`` a command that is called with Hydra overrides.
 
     The configuration is composed and checked before `main` sees it. With ``-m`` every point runs,
-    also after one that failed.
+    also after one that failed. The decorated function takes no arguments and leaves by
+    ``sys.exit``.
 
     Args:
-        config_name: file of ``conf/`` without extension.
         sweeper: what works off the points of ``-m``, unless ``hydra/sweeper=`` is given.
-
-    Returns:
-        decorator; the decorated function takes no arguments and leaves by ``sys.exit``.
     """
 
     def decorate(main: Main) -> Callable[[], None]:
+        def checked(config: DictConfig) -> int | None:
+            check_keys(config)
+            return main(config)
+
         @wraps(main)
         def entry() -> None:
             codes: list[int] = []
             # argparse takes overrides on one side of an option only, and people write -m anywhere.
             words = readable_paths(sys.argv[1:])
             if not any(word.startswith("hydra/sweeper=") for word in words):
-                places = [n for n, word in enumerate(words) if "=" in word and word[0] != "-"]
-                words.insert(places[0] if places else len(words), f"hydra/sweeper={sweeper}")
+                first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
+                words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
             def job(config: DictConfig) -> None:
-                codes.append(exit_code(lambda: _checked(main, config), catch_interrupt=False))
+                codes.append(exit_code(lambda: checked(config), catch_interrupt=False))
 
             with answered(), searching(words):
-                code = max([exit_code(lambda: _compose(config_name, job, words)), *codes])
+                code = max([exit_code(lambda: _compose(job, words)), *codes])
             sys.exit(code)
 
         return entry
@@ -70,24 +67,14 @@ def command(
     return decorate
 
 
-def task_overrides() -> list[str]:
-    """Overrides of the running job as they were typed, e.g. ``["+experiment=grbm", "seed=1"]``."""
-    return list(HydraConfig.get().overrides.task)
-
-
-def _checked(main: Main, config: DictConfig) -> int | None:
-    check_keys(config)
-    return main(config)
-
-
-def _compose(config_name: str, job: Callable[[DictConfig], None], words: Sequence[str]) -> None:
+def _compose(job: Callable[[DictConfig], None], words: Sequence[str]) -> None:
     check_words(words)
     # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Hydra's root logger shows the INFO lines of every library.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     register_resolvers()
-    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(job)()
+    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
 
 
 @contextmanager

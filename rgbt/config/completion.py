@@ -1,28 +1,72 @@
-"""What may follow on a command line of ``rgbt``: commands, options, groups, keys and values."""
+"""What may follow on a command line of ``rgbt``: commands, options, groups, keys and values.
+
+``eval "$(rgbt --completion bash)"`` makes a shell complete the command ``rgbt`` alone. (Hydra's own
+script takes over ``python``.)
+"""
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from rgbt.checks import InputError, check_choice
 from rgbt.config.commands import COMMANDS
 from rgbt.config.options import choices_of, types_of
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 
-AnyCommand = PlainCommand[Any]
+# Bash cuts words at "=" and ":", and replaces only what follows the last of them.
+BASH = r"""# add to ~/.bashrc:  eval "$(rgbt --completion bash)"
+_rgbt() {
+    local words=${COMP_LINE:0:COMP_POINT}
+    local word=${words##* } cut= IFS=$'\n'
+    [[ $word == *[=:]* ]] && cut=${word%"${word##*[=:]}"}
+    COMPREPLY=($(rgbt --complete "$words" 2>/dev/null))
+    COMPREPLY=("${COMPREPLY[@]#"$cut"}")
+}
+complete -o nospace -o default -F _rgbt rgbt
+"""
+
+ZSH = r"""#compdef rgbt
+# add to ~/.zshrc:  eval "$(rgbt --completion zsh)"
+_rgbt() {
+    local -a candidates
+    candidates=(${(f)"$(rgbt --complete "${(j: :)words[1,CURRENT]}" 2>/dev/null)"})
+    (( ${#candidates} )) && compadd -S '' -a candidates || _files
+}
+(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
+compdef _rgbt rgbt
+"""
+
+FISH = """# type:  rgbt --completion fish > ~/.config/fish/completions/rgbt.fish
+complete -c rgbt -a '(rgbt --complete (commandline -cp | string collect) 2>/dev/null)'
+"""
+
+SCRIPTS = {"bash": BASH, "zsh": ZSH, "fish": FISH}
+
+OF_HYDRA = ("run", "check", "masks")
+"""Commands whose words are all overrides."""
 
 HYDRA_OPTIONS = ("-m", "--multirun", "--help", "--cfg", "--resolve")
 
 
-def print_candidates(words: Sequence[str]) -> int:
-    """Write what may stand for the last word of a line, one candidate a line.
+def print_script(words: Sequence[str]) -> int:
+    """Write the script of the shell that `words` name to stdout.
 
-    Args:
-        words: the line up to the cursor, from ``rgbt`` on, as one argument.
+    Raises:
+        InputError: none, or an unknown one.
     """
+    if len(words) != 1:
+        raise InputError(f"--completion needs the name of a shell: {', '.join(SCRIPTS)}.")
+    check_choice("--completion", words[0], SCRIPTS)
+    sys.stdout.write(SCRIPTS[words[0]])
+    return 0
+
+
+def print_candidates(words: Sequence[str]) -> int:
+    """Write `candidates` of a line, which is one word of `words`, one candidate a line."""
     with suppress(Exception):  # a shell that completes shows nothing of what went wrong
         sys.stdout.write("".join(f"{each}\n" for each in candidates(" ".join(words))))
     return 0
@@ -34,76 +78,55 @@ def candidates(line: str) -> list[str]:
     Args:
         line: from ``rgbt`` up to the cursor; a space at its end begins a new word.
     """
-    _, *words = [*line.split(), *([""] if line.endswith(" ") else [])]
-    if len(words) < 2:
-        return _begin(words[0] if words else "", [*(f"{name} " for name in COMMANDS), "--help "])
-    name, *rest = words
+    name, *words = [*line.split()[1:], *([""] if line.endswith(" ") else [])]
+    if not words:
+        return _begin(name, [*(f"{each} " for each in COMMANDS), "--help "])
     if name not in COMMANDS:
         return []
-    if rest[-1].startswith("-"):
-        return _begin(rest[-1], HYDRA_OPTIONS if name in OF_HYDRA else ("--help",))
+    if words[-1].startswith("-"):
+        return _begin(words[-1], HYDRA_OPTIONS if name in OF_HYDRA else ("--help",))
     if name in OF_HYDRA:
-        return _of_hydra(rest)
-    return _of_command(importlib.import_module(_importable(COMMANDS[name].module)).entry, rest)
-
-
-OF_HYDRA = ("run", "check", "masks")
-"""Commands whose words are all overrides."""
-
-
-def _importable(module: str) -> str:
-    spec = importlib.util.find_spec(module)
-    is_package = spec is not None and spec.submodule_search_locations is not None
-    return f"{module}.__main__" if is_package else module
-
-
-def _of_command(command: AnyCommand | CommandGroup, words: list[str]) -> list[str]:
-    if isinstance(command, PlainCommand):
+        return _of_hydra(words)
+    command = importlib.import_module(COMMANDS[name].module).entry
+    if not isinstance(command, CommandGroup):
         return _of_options(command, words)
-    if words[0] in command.commands and len(words) > 1:
-        return _of_options(command.commands[words[0]], words[1:])
-    named = _begin(words[0], [f"{name} " for name in command.commands]) if len(words) == 1 else []
+    first, *rest = words
+    if rest and first in command.commands:
+        return _of_options(command.commands[first], rest)
+    named = [] if rest else _begin(first, [f"{each} " for each in command.commands])
     return [*named, *(_of_options(command.default, words) if command.default else [])]
 
 
-def _of_options(command: AnyCommand, words: list[str]) -> list[str]:
+def _of_options(command: PlainCommand[Any], words: Sequence[str]) -> list[str]:
+    """Options, their values, and overrides of the configuration that take effect."""
     kinds = types_of(command.options)
-    key, equals, _ = words[-1].partition("=")
+    *others, last = words
+    key, equals, _ = last.partition("=")
     if equals and key in kinds:
-        return _begin(words[-1], [f"{key}={each} " for each in choices_of(kinds[key])])
-    overrides = [word for word in words[:-1] if word.partition("=")[0] not in kinds]
-    given = {word.partition("=")[0] for word in words[:-1]}
-    options = [f"{name}=" for name in kinds if name not in given]
-    return [*_begin(words[-1], options), *_heeded(command, [*overrides, words[-1]])]
-
-
-def _heeded(command: AnyCommand, words: list[str]) -> Iterator[str]:
-    """Overrides of the configuration that the command takes."""
+        return _begin(last, [f"{key}={each} " for each in choices_of(kinds[key])])
+    given = [word.partition("=")[0] for word in others]
+    options = _begin(last, [f"{name}=" for name in kinds if name not in given])
     heeds = command.heeds
-    if heeds == () or (heeds is None and not words[-1]):  # all of them would hide the options
-        return
-    for each in _of_hydra(words):
-        if heeds is None or any(each.startswith(key) for key in heeds):
-            yield each
+    if heeds == () or (heeds is None and not last):  # all of them would hide the options
+        return options
+    overrides = [word for word, key in zip(others, given, strict=True) if key not in kinds]
+    known = _of_hydra([*overrides, last])
+    return [*options, *(each for each in known if each.startswith(tuple(heeds or ("",))))]
 
 
-def _of_hydra(words: list[str]) -> list[str]:
+def _of_hydra(words: Sequence[str]) -> list[str]:
     """What Hydra knows: groups, their files, keys; also behind a comma."""
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-    from hydra._internal.utils import create_config_search_path
-    from hydra.core.plugins import Plugins
+    from hydra.core.global_hydra import GlobalHydra
     from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 
-    from rgbt.config.compose import conf_dir, register_resolvers
+    from rgbt.config.compose import own_hydra
 
-    register_resolvers()
-    Plugins.instance()
-    loader = ConfigLoaderImpl(create_config_search_path(str(conf_dir())))
     *others, last = words
     begun, comma, value = last.rpartition(",")
-    key = begun.partition("=")[0]
-    word = f"{key}={value}" if comma else last
-    known = DefaultCompletionPlugin(loader)._query("config", " ".join([*others, word]))
+    word = f"{begun.partition('=')[0]}={value}" if comma else last
+    with own_hydra():
+        plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
+        known = plugin._query("config", " ".join([*others, word]))
     if comma:
         return [f"{begun},{each.partition('=')[2]}" for each in known]
     # A group that holds a folder beside its files has no "=" in Hydra's answer.

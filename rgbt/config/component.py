@@ -8,17 +8,19 @@ part of the annotations (`rgbt.ranges`).
 
 from __future__ import annotations
 
+import functools
 import inspect
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.targets import authorized, constructor, refusal, setting_types
 from rgbt.config.values import check_value
 from rgbt.ranges import Text
 
@@ -77,7 +79,10 @@ class Component:
             InputError: the constructor needs a value that the node does not have.
         """
         parameters = inspect.signature(constructor(self.target, self.path)).parameters
-        values = {key: _built(value) for key, value in self.values.items()}
+        values = {
+            key: value.build() if isinstance(value, Component) else value
+            for key, value in self.values.items()
+        }
         values |= {key: value for key, value in collaborators.items() if key in parameters}
         for key, parameter in parameters.items():
             if parameter.default is parameter.empty and key not in values:
@@ -91,10 +96,10 @@ class Component:
         """Values of JSON, equal for equal settings: 4 and 4.0 are one value where 4.0 is meant."""
         from pydantic_core import to_jsonable_python
 
-        def plain(value: Any) -> Any:
-            return value.canonical() if isinstance(value, Component) else value
-
-        values = {key: plain(value) for key, value in self.values.items()}
+        values = {
+            key: value.canonical() if isinstance(value, Component) else value
+            for key, value in self.values.items()
+        }
         return {"_target_": self.target, **to_jsonable_python(values)}
 
 
@@ -110,10 +115,6 @@ def target_names(value: Any) -> Iterator[str]:
     children = value.values() if isinstance(value, Mapping) else value
     for child in children if isinstance(value, Mapping | list) else ():
         yield from target_names(child)
-
-
-def _built(value: Any) -> Any:
-    return value.build() if isinstance(value, Component) else value
 
 
 def _typed_values(node: DictConfig, path: str, target: Any) -> Iterator[tuple[str, Any]]:
@@ -145,3 +146,58 @@ def _items(node: DictConfig, path: str) -> Iterator[tuple[str, Any]]:
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"'{path}.{key!s}' cannot be resolved: {reason}") from error
+
+
+def constructor(target: Any, path: str) -> Any:
+    """The class or function that `target` names, unless Hydra's policy refuses it.
+
+    Args:
+        target: dotted path; its module is imported.
+        path: key in the configuration, for messages.
+
+    Raises:
+        InputError: not a dotted path, no such object, or refused (os.system, exec, subprocess.run
+            and the like).
+    """
+    return authorized(target, path).func
+
+
+def authorized(target: Any, path: str) -> functools.partial[Any]:
+    """`target` as Hydra's `instantiate` returns it, which refuses what executes code.
+
+    To be called through: Hydra looks at the arguments as well (get_object(path="os.system")).
+    """
+    target = check_value(f"{path}._target_", target, Text)
+    try:
+        if _partial(target).func is not get_object(target):  # its module was imported anew
+            _partial.cache_clear()
+        return _partial(target)
+    except Exception as error:  # a module of the user's may fail in any way as it is imported
+        raise refusal(target, path, error) from error
+
+
+@functools.cache
+def _partial(target: str) -> functools.partial[Any]:
+    """Cached, because Hydra needs 2 ms and a configuration has 40 targets."""
+    partial = instantiate({"_target_": target, "_partial_": True})
+    assert isinstance(partial, functools.partial), "Hydra returns a partial where one is requested"
+    return partial
+
+
+def refusal(target: str, path: str, error: Exception) -> InputError:
+    """The sentence for a target that cannot be imported, or that Hydra's policy refuses."""
+    cause = error.__cause__
+    if cause is None:  # the policy's own sentences
+        reason = " ".join(str(error).partition("full_key:")[0].split()).partition(". ")[0]
+        return InputError(f"'{path}._target_': {reason.rstrip('.')}.")
+    reason = " ".join(str(cause.__cause__ or cause).split()).rstrip(".")
+    return InputError(f"'{path}._target_': cannot import {target} ({reason}).")
+
+
+@functools.cache
+def setting_types(target: Any) -> dict[str, Any]:
+    """What the settings of a constructor take, by key: types with their ranges."""
+    function = target.__init__ if inspect.isclass(target) else target
+    hints = typing.get_type_hints(function, include_extras=True)
+    hints.pop("return", None)
+    return hints

@@ -1,10 +1,10 @@
-"""Hydra's composition: where the configuration lies, and what its files may compute."""
+"""Hydra's composition: files and keys of the configuration, and what its files may compute."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -15,11 +15,13 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from omegaconf import DictConfig, OmegaConf
 
-SEARCH_PATH = "hydra.searchpath"
-"""Override that adds folders of a user's own files, as RGBT_CONF does (conf/config.yaml)."""
+from rgbt.checks import InputError, nearest
 
-_of_the_command: list[str] = []
-"""That override as the running command was given it; one at most."""
+SEARCH_PATH = "hydra.searchpath"
+"""Override that names the folders of a user's own files for one command."""
+
+OWN_FOLDERS = "RGBT_CONF"
+"""Variable that names them for every composition, with commas (read by conf/config.yaml)."""
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -33,67 +35,86 @@ def conf_dir() -> Path:
 
 @contextmanager
 def searching(words: Sequence[str]) -> Iterator[None]:
-    """Compose with the search path of a command line, for as long as the command runs.
+    """Compose with the search path in the `words` of a command line, as long as the command runs.
 
-    Upstream runs, defaults and groups of a run that is opened again are composed without the words
-    of the command, and need the folders of its ``hydra.searchpath=...`` too.
-
-    Args:
-        words: of the command line, after the name of the command.
+    Upstream runs, defaults and groups of a run that is opened again are composed without these
+    words, and need the folders of ``hydra.searchpath=...`` too.
     """
-    before = list(_of_the_command)
-    _of_the_command[:] = [word for word in words if word.startswith(f"{SEARCH_PATH}=")][:1]
+    before = own_folders()
+    given = [word.partition("=")[2] for word in words if word.startswith(f"{SEARCH_PATH}=")]
+    os.environ[OWN_FOLDERS] = given[0].strip("[]") if given else before
     try:
         yield
     finally:
-        _of_the_command[:] = before
+        os.environ[OWN_FOLDERS] = before
 
 
-def search_path(overrides: Sequence[str] = ()) -> list[str]:
-    """The override ``hydra.searchpath=...`` that applies: of `overrides`, else of the command.
-
-    Returns:
-        a list of this one word; empty where none was given.
-    """
-    given = [word for word in overrides if word.startswith(f"{SEARCH_PATH}=")]
-    return given or list(_of_the_command)
+def own_folders() -> str:
+    """Folders of the user's own files, as they were typed; "": none."""
+    return os.environ.get(OWN_FOLDERS, "")
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that `rgbt.run` would get from these overrides, not checked.
-
-    Files are looked up in ``conf/`` and in the folders of `search_path`.
-    """
-    others = [word for word in overrides if not word.startswith(f"{SEARCH_PATH}=")]
+    """The configuration that `rgbt.run` would get from these overrides, not checked."""
     with own_hydra():
-        return hydra.compose("config", [*others, *search_path(overrides)])
+        return hydra.compose("config", list(overrides))
 
 
-def available(group: str, overrides: Sequence[str] = ()) -> list[str]:
-    """Names of the files of a group, those of `search_path` included.
-
-    Args:
-        group: such as "experiment" or "model/inputs".
-        overrides: of which ``hydra.searchpath=...`` counts.
-    """
-    return list(_listed(group, ObjectType.CONFIG, *_searched(overrides)))
+def available(group: str) -> list[str]:
+    """Names of the files of a group such as "experiment" or "model/inputs", also of the user's."""
+    return list(_listed(group, ObjectType.CONFIG, own_folders()))
 
 
-def groups(overrides: Sequence[str] = ()) -> list[str]:
-    """Names of the groups, those of `search_path` included."""
-    return list(_listed("", ObjectType.GROUP, *_searched(overrides)))
-
-
-def _searched(overrides: Sequence[str]) -> tuple[str | None, *tuple[str, ...]]:
-    return os.environ.get("RGBT_CONF"), *search_path(overrides)
+def groups() -> list[str]:
+    """Names of the groups, also of the user's."""
+    return list(_listed("", ObjectType.GROUP, own_folders()))
 
 
 @cache
-def _listed(group: str, kind: ObjectType, _own: str | None, *words: str) -> tuple[str, ...]:
+def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
     """Names in a group; cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
     with own_hydra():
         loader = GlobalHydra.instance().config_loader()
-        return tuple(loader.get_group_options(group, kind, "config", list(words)))
+        return tuple(loader.get_group_options(group, kind, "config"))
+
+
+def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictConfig]]:
+    """The files of a group: name, and the node that each would be in a configuration.
+
+    Args:
+        plain: the configuration that interpolations of the files refer to, as resolved values.
+        group: key of the node, which is the name of its folder.
+    """
+    names = available(group)
+    scale = plain["scale"]["name"]
+    words = [f"scale={scale}"] if scale in available("scale") else []
+    # Composed all at once, in packages of their own: as fast as one.
+    words += [f"+{group}@choice_{number}={name}" for number, name in enumerate(names)]
+    composed = compose(words)
+    changed = OmegaConf.create(dict(plain))
+    for number, name in enumerate(names):
+        changed[group] = composed[f"choice_{number}"]
+        yield name, changed[group]
+
+
+@cache
+def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Keys that ``conf/config.yaml`` declares: nodes (mappings with `_target_`), plain values."""
+    plain: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))
+    chosen = [key for entry in plain.pop("defaults") if isinstance(entry, dict) for key in entry]
+    own = {key: value for key, value in plain.items() if key != "hydra"}
+    written = [key for key, value in own.items() if isinstance(value, Mapping)]
+    nodes = dict.fromkeys([*(group for group in chosen if " " not in group), *written])
+    return tuple(nodes), tuple(key for key in own if key not in nodes)
+
+
+def check_keys(keys: Iterable[Any]) -> None:
+    """Refuse a key that ``conf/config.yaml`` does not declare, naming the nearest that it does."""
+    known = [key for each in top_level() for key in each]
+    for key in keys:
+        if key not in known:
+            hint = nearest(str(key), known)
+            raise InputError(f"'{key!s}' is not a key of the configuration; {hint}.")
 
 
 @contextmanager
@@ -129,17 +150,12 @@ def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
-    return scaled_pixels(pixels, float(_root_.scale.pixel_factor))
-
-
-def scaled_pixels(pixels: int, factor: float) -> int:
-    """Value of ``${px:pixels}`` where images are `factor` times as large as the paper's."""
-    return round(pixels * factor)
+    return round(pixels * float(_root_.scale.pixel_factor))
 
 
 def with_pixels(text: str, factor: float) -> str:
-    """`text` with the value of every ``${px:...}`` in it."""
-    return PIXELS.sub(lambda found: str(scaled_pixels(int(found[1]), factor)), text)
+    """`text` with the value of every ``${px:...}`` where images are `factor` times the paper's."""
+    return PIXELS.sub(lambda found: str(round(int(found[1]) * factor)), text)
 
 
 def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:

@@ -5,11 +5,12 @@ Hydra's own messages name neither the key that was meant nor what to type.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -22,20 +23,12 @@ from rgbt.config.compose import (
     conf_dir,
     flatten,
     groups,
-    search_path,
+    own_folders,
+    top_level,
 )
-from rgbt.config.keys import top_level
 
 ADDED = ("experiment", "search", "debug")
 """Groups of which the configuration holds no file by itself: they are added with a plus."""
-
-OPTIONS = (
-    *("-m", "--multirun", "-h", "--help", "--hydra-help", "--version", "-r", "--run"),
-    *("-c", "--cfg", "--resolve", "-p", "--package", "-i", "--info", "-sc", "--shell-completion"),
-    *("-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir"),
-    "--experimental-rerun",
-)
-"""Those of Hydra's command line."""
 
 
 def check_words(words: Sequence[str]) -> None:
@@ -47,28 +40,22 @@ def check_words(words: Sequence[str]) -> None:
     Raises:
         InputError: an unknown option, a list of seeds, a folder of configurations that is missing.
     """
+    options = {each for action in get_args_parser()._actions for each in action.option_strings}
     for word in words:
-        key, equals, value = word.partition("=")
-        if word.startswith("-") and key not in OPTIONS:
-            name = key.lstrip("-")
-            raise InputError(
-                f"'{word}' is no option; a setting is written as {_typed(name, value or '...')}."
-            )
+        key, _, value = word.partition("=")
+        if word.startswith("-") and key not in options:
+            typed = _typed(key.lstrip("-"), value or "...")
+            raise InputError(f"'{word}' is no option; a setting is written as {typed}.")
         if key == "seed" and value.startswith("["):
             seeds = ",".join(split_list(value, "seeds"))
             raise InputError(f"'{word}': a run has one seed; several are a grid: -m seed={seeds}.")
-        if key == SEARCH_PATH:
-            _check_folders(word, value)
-
-
-def _check_folders(word: str, value: str) -> None:
-    for place in split_list(value, "folders"):
-        scheme, _, rest = place.strip("'\"").rpartition("://")
-        if scheme in ("", "file") and not Path(rest).is_dir():
-            raise InputError(
-                f"'{word}': there is no folder {rest}; name an existing one with its whole path, "
-                "'hydra.searchpath=[file:///my/conf]'."
-            )
+        for folder in split_list(value, "folders") if key == SEARCH_PATH else ():
+            scheme, _, path = folder.strip("'\"").rpartition("://")
+            if scheme in ("", "file") and not Path(path).is_dir():
+                raise InputError(
+                    f"'{word}': there is no folder {path}; name an existing one "
+                    "with its absolute path, 'hydra.searchpath=[file:///my/conf]'."
+                )
 
 
 def _typed(key: str, value: str) -> str:
@@ -82,42 +69,42 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
         error: as raised.
         overrides: as they were typed.
     """
-    if isinstance(error, MissingConfigException) and error.options:
-        group, _, name = (error.missing_cfg_file or "").rpartition("/")
-        what = f"there is no {group or 'configuration'} '{name}'"
-        return f"{what}; {nearest(name, error.options)}.{forgotten(overrides)}"
     if isinstance(error, MissingConfigException):
-        match = re.search(r"'([^']+?)(?:/[^'/]*)?'", str(error))
-        group = match.group(1) if match else "?"
-        return f"there is no group '{group}'; {nearest(group, groups(overrides))}."
+        missing = error.missing_cfg_file or ""
+        group, _, name = missing.rpartition("/")
+        if error.options:
+            what = f"there is no {group or 'configuration'} '{name}'"
+            return f"{what}; {nearest(name, error.options)}.{own_folder_hint()}"
+        group = group or missing
+        return f"there is no group '{group}'; {nearest(group, groups())}."
     if isinstance(error, OverrideParseException):
-        return _no_override(str(error.override), overrides)
+        return _no_override(str(error.override))
     text = " ".join(str(error.__cause__ or error).split())
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:
-        return _unknown_key(key.group(2), overrides)
+        return _unknown_key(key[2], overrides)
     return _of_the_defaults(str(error).splitlines()[0].rstrip("."), overrides)
 
 
-def forgotten(overrides: Sequence[str] = ()) -> str:
-    """How a file of the user's own is found, where the command names no folder of such files."""
-    if search_path(overrides) or os.environ.get("RGBT_CONF"):
+def own_folder_hint() -> str:
+    """How to name a folder of the user's own files, where the command has none."""
+    if own_folders():
         return ""
     return (
         f" For a file of your own add '{SEARCH_PATH}=[file:///my/conf]', or set RGBT_CONF=/my/conf."
     )
 
 
-def _no_override(word: str, overrides: Sequence[str]) -> str:
+def _no_override(word: str) -> str:
     name = word.lstrip("+~").partition("=")[0]
-    known = groups(overrides)
-    files = [group for group in known if name in available(group, overrides)]
-    expected = "key=value, with quotes around a value that holds commas, brackets or spaces: "
-    expected += "'key=\"a, b\"'"
+    known = groups()
+    expected = " or ".join(_typed(each, name) for each in known if name in available(each))
     if name in known:
         expected = _typed(name, "NAME")
-    elif files:
-        expected = " or ".join(_typed(group, name) for group in files)
+    expected = expected or (
+        "key=value, with quotes around a value that holds commas, brackets or spaces: "
+        "'key=\"a, b\"'"
+    )
     return f"'{word}' is no override; expected {expected}."
 
 
@@ -147,66 +134,54 @@ def _of_the_defaults(first: str, overrides: Sequence[str]) -> str:
     return f"{first}; see `python -m rgbt.run --help`."
 
 
-def _composed_without(full_key: str, overrides: Sequence[str]) -> DictConfig:
-    """The configuration of `overrides`, but for the key that it does not know."""
+def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
+    *parents, last = full_key.split(".")
+    if parents == ["hydra", "sweeper"]:
+        sweeper = OmegaConf.load(conf_dir() / "hydra" / "sweeper" / "study.yaml")
+        return f"'{full_key}' is not a setting of a sweep; {nearest(last, _settings(sweeper))}."
     others = [word for word in overrides if word.lstrip("+~").partition("=")[0] != full_key]
     try:
-        return compose(others)
+        config = compose(others)
     except HydraException:  # a second mistake, or the comma lists of a grid
-        return compose([])
-
-
-def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
-    sweeper = conf_dir() / "hydra" / "sweeper" / "study.yaml"
-    *parents, last = full_key.split(".")
-    if full_key.startswith("hydra.sweeper.") and full_key.count(".") == 2:
-        settings = [str(key) for key in OmegaConf.load(sweeper) if key != "_target_"]
-        return f"'{full_key}' is not a setting of a sweep; {nearest(last, settings)}."
-    config = _composed_without(full_key, overrides)
+        config = compose([])
     if full_key == "dataset.root" and "cache_dir" in config.dataset:
         return (
-            "'dataset.root' is not a key of an embedded data set; name the data set that lies "
-            "there: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
+            "'dataset.root' is not a key of an embedded data set; name the data set in that "
+            "folder: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
         )
-    node: object = config
-    for parent in parents:
-        node = node.get(parent) if isinstance(node, DictConfig) else None
-    known = [str(key) for key in node if key != "_target_"] if isinstance(node, DictConfig) else []
-    inner = [] if parents else _below(config, last)
-    hint = f"did you mean {' or '.join(inner)}?" if inner else f"{nearest(last, known)}."
+    known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
+    hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)
     return f"'{full_key}' is not a key of the configuration; {hint}"
 
 
-def top_level_keys() -> tuple[str, ...]:
-    """What a word without a dot may name: keys of the configuration, and groups that are added."""
-    nodes, values = top_level()
-    return (*nodes, *values, *ADDED)
-
-
-def key_hint(key: str, names: Sequence[str]) -> str:
-    """What may be meant by a word that is neither an option nor a key of the configuration.
+def check_key(word: str, names: Sequence[str]) -> None:
+    """Refuse an override without a dot that is no key of the configuration: an option, misspelt.
 
     Args:
-        key: as typed, without a dot.
+        word: as typed.
         names: options of the command.
     """
-    inner = _below(compose([]), key)
-    return (
-        f"did you mean {' or '.join(inner)}" if inner else nearest(key, [*names, *top_level()[0]])
-    )
+    key = word.lstrip("+~").partition("=")[0]
+    nodes, values = top_level()
+    if key in (*nodes, *values, *ADDED) or word.startswith("+") or set(key) & set("./@"):
+        return
+    hint = _key_hint(compose([]), key, [*names, *nodes])
+    raise InputError(f"'{key}' is no option of this command; {hint}")
 
 
-def _leaves(config: DictConfig) -> list[str]:
+def _settings(node: Any) -> list[str]:
+    return [str(key) for key in node if key != "_target_"] if OmegaConf.is_dict(node) else []
+
+
+def _key_hint(config: DictConfig, name: str, known: Sequence[str]) -> str:
+    """Keys of nodes that end in `name`, other than those of sizes; else the nearest of `known`."""
     try:
-        return list(flatten(config))
+        leaves = list(flatten(config))
     except OmegaConfBaseException:  # values that must be given are missing
-        return []
-
-
-def _below(config: DictConfig, last: str) -> list[str]:
-    """Keys of nodes that end in `last`, other than those of sizes that others take up."""
-    return [
+        leaves = []
+    inner = [
         key
-        for key in _leaves(config)
-        if key.rpartition(".")[2] == last and key.partition(".")[0] not in ("scale", "recipe")
+        for key in leaves
+        if key.rpartition(".")[2] == name and key.partition(".")[0] not in ("scale", "recipe")
     ]
+    return f"did you mean {' or '.join(inner)}?" if inner else f"{nearest(name, known)}."

@@ -16,12 +16,13 @@ import re
 import textwrap
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rgbt.checks import InputError, nearest, split_list
-from rgbt.config.words import with_home
+
+PATHS = ("model.weights", "pretrained", "dataset.root", "runs_dir", "out")
 
 RENAMED = {"degradation": "corruption", "degradations": "corruptions"}
 """Options by the name that they had before, with the name that they have now."""
@@ -58,6 +59,8 @@ def parse(
         InputError: a word of another form, an unknown key, a value of a wrong type, or none where
             one is needed.
     """
+    from rgbt.config.values import check_value
+
     kinds = types_of(options)
     values, overrides = {}, []
     for word in words:
@@ -65,25 +68,19 @@ def parse(
         if not equals:
             raise InputError(f"'{word}': expected key=value; {nearest(key, kinds)}.")
         if key in kinds:
-            values[key] = read_text(key, text, kinds[key])
+            values[key] = check_value(key, _plain(key, text, kinds[key]), kinds[key])
         else:
             _check_override(word, list(kinds), heeds)
             overrides.append(word)
-    for field in dataclasses.fields(options):  # type: ignore[arg-type]  # T is a dataclass
-        if _is_required(field) and field.name not in values:
-            raise InputError(f"'{field.name}' has no value; give one with {field.name}=...")
+    for name in _required(options):
+        if name not in values:
+            raise InputError(f"'{name}' has no value; give one with {name}=...")
     return options(**values), overrides
 
 
-def read_text(key: str, text: str, annotation: Any) -> Any:
-    """The value that a text on the command line stands for, checked against its annotation.
-
-    Raises:
-        InputError: it does not fit the annotation.
-    """
-    from rgbt.config.values import check_value
-
-    return check_value(key, _plain(key, text, annotation), annotation)
+def _required(options: Any) -> list[str]:
+    fields = dataclasses.fields(options)
+    return [each.name for each in fields if each.default is each.default_factory is MISSING]
 
 
 def _plain(key: str, text: str, annotation: Any) -> Any:
@@ -135,74 +132,79 @@ def _as_hydra_reads(key: str, text: str) -> Any:
 
 
 def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None) -> None:
+    """Refuse an override that takes no effect, or an option that is misspelt."""
+    from rgbt.config.hydra_messages import check_key
+
     key = word.lstrip("+~").partition("=")[0]
     option, dot, setting = key.partition(".")
     if option in RENAMED:
         now = f"{RENAMED[option]}{dot}{setting}"
         raise InputError(f"'{key}' is called '{now}' now; give {now}=...")
     if heeds is None:
-        _check_key(word, key, names)
+        check_key(word, names)
         return
     # The search path says where files of a data set of one's own lie.
     known = (*heeds, "hydra.searchpath") if heeds else ()
-    if not any(key == each or key.startswith(f"{each}.") for each in known):
+    if not any(f"{key}.".startswith(f"{each}.") for each in known):
         raise InputError(f"'{key}' has no effect here; {nearest(key, [*names, *heeds])}.")
 
 
-def _check_key(word: str, key: str, names: Sequence[str]) -> None:
-    """Refuse a word without a dot that is no key of a configuration: an option, misspelt."""
-    from rgbt.config.hydra_messages import key_hint, top_level_keys
-
-    known = top_level_keys()
-    if key not in known and not word.startswith("+") and not set(key) & set("./@"):
-        raise InputError(f"'{key}' is no option of this command; {key_hint(key, names)}.")
+def with_home(text: str) -> str:
+    """`text` with ~ at its start as the home folder: shells keep it after "="."""
+    return re.sub(r"^~(?=/|$)", str(Path.home()), text)
 
 
-def _is_required(field: dataclasses.Field[Any]) -> bool:
-    return field.default is field.default_factory is dataclasses.MISSING
+def readable_paths(words: Sequence[str]) -> list[str]:
+    """Arguments as Hydra reads them: shells keep ~ after "=", and file names hold anything.
+
+    A path with "=", spaces or brackets (epoch=299.ckpt) is put in quotes; a comma still makes a
+    grid. Names of upstream runs (experiment:NAME/last.pt) are read as they are.
+    """
+    readable = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        value = with_home(value)
+        is_path = key in PATHS and not value.startswith("experiment:")
+        if is_path and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
+            value = "'" + value.replace("'", "\\'") + "'"
+        readable.append(f"{key}{equals}{value}")
+    return readable
 
 
-def help_text(usage: str, options: type, about: str, given: Sequence[str] = ()) -> str:
+def help_text(usage: str, options: type, about: str, given: str = "") -> str:
     """What ``--help`` shows: the text of a command around its options.
 
     Args:
         usage: the command as it is typed, without its options.
         options: dataclass that declares them.
-        about: the first paragraph says what the command does; others stand below the options.
-        given: options that `usage` names already.
+        about: the first paragraph says what the command does; others follow the options.
+        given: an option that `usage` names already.
     """
     summary, _, rest = about.partition("\n\n")
-    fields = dataclasses.fields(options)
-    needed = [each.name for each in fields if _is_required(each) and each.name not in given]
-    usage = " ".join(["usage:", usage, *(f"{name}=..." for name in needed), "[option=value ...]"])
+    needed = [f"{name}=..." for name in _required(options) if name != given]
+    usage = " ".join(["usage:", usage, *needed, "[option=value ...]"])
     kinds = types_of(options)
     width = 2 + max(map(len, kinds), default=0)
-    lines = [_entry(field, kinds[field.name], width) for field in fields]
+    fields: Any = dataclasses.fields(options)
+    lines = [_entry(each.name, kinds[each.name], each.default, width) for each in fields]
     return "\n\n".join(filter(None, [summary, usage, "\n".join(lines), rest]))
 
 
-def _entry(field: dataclasses.Field[Any], annotation: Any, width: int) -> str:
+def _entry(name: str, annotation: Any, default: Any, width: int) -> str:
     """One option with its meaning, choices and default."""
     notes = [each.text for each in getattr(annotation, "__metadata__", ()) if type(each) is Help]
     text = "; ".join(notes)
     choices = [each for each in choices_of(annotation) if each not in ("true", "false")]
     if not all(re.search(rf"\b{re.escape(each)}\b", text) for each in choices):
         text += f"; one of: {', '.join(choices)}"
-    shown = _shown(field.default)
-    if shown and "default" not in text:
+    if default not in (None, MISSING, "") and "default" not in text:
+        shown = str(default).lower() if isinstance(default, bool) else default
         text += f" (default: {shown})"
     return textwrap.fill(
         text.lstrip("; "),
         WIDTH,
-        initial_indent=f"  {field.name:<{width}}",
+        initial_indent=f"  {name:<{width}}",
         subsequent_indent=" " * (width + 2),
         break_on_hyphens=False,
         break_long_words=False,
     )
-
-
-def _shown(default: Any) -> str:
-    """A default as one types it; "" for none."""
-    if isinstance(default, bool):
-        return str(default).lower()
-    return "" if default is None or default is dataclasses.MISSING else str(default)

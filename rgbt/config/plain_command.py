@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import nearest
 from rgbt.config.commands import typed_as
-from rgbt.config.options import help_text, parse
-from rgbt.config.reporting import exit_code
+from rgbt.config.options import help_text, parse, readable_paths
+from rgbt.config.reporting import exit_code, say
 from rgbt.runtime.signals import answered
 
 T = TypeVar("T")
+HELP = ("-h", "--help")
 
 
 @dataclass(frozen=True)
@@ -40,24 +41,18 @@ class PlainCommand(Generic[T]):
     first: str = ""
 
     def __call__(self) -> None:
-        """Run with the words of ``sys.argv``; leaves by ``sys.exit``."""
+        """Run with the words of ``sys.argv``; a mistake is one sentence on stderr."""
         words = sys.argv[1:]
-        if any(word in ("-h", "--help") for word in words):
-            sys.stdout.write(f"{self.help()}\n")
+        if set(words) & set(HELP):
+            usage = f"{self.name or typed_as(self.main)} {self.first.upper()}".strip()
+            about = inspect.getdoc(self.main) or ""
+            sys.stdout.write(f"{help_text(usage, self.options, about, self.first)}\n")
             sys.exit(0)
-        sys.exit(self.code(words))
-
-    def help(self) -> str:
-        """What ``--help`` shows."""
-        usage = f"{self.name or typed_as(self.main)} {self.first.upper()}".strip()
-        return help_text(usage, self.options, inspect.getdoc(self.main) or "", (self.first,))
-
-    def code(self, words: Sequence[str]) -> int:
-        """The exit code of the command with these words; a mistake is one sentence on stderr."""
-        from rgbt.config.compose import searching
+        from rgbt.config.compose import searching  # --help does not wait for Hydra
 
         with answered(), searching(words):
-            return exit_code(lambda: self.run(words))
+            code = exit_code(lambda: self.run(words))
+        sys.exit(code)
 
     def run(self, words: Sequence[str]) -> int | None:
         """Parse `words` and do it.
@@ -65,8 +60,6 @@ class PlainCommand(Generic[T]):
         Raises:
             InputError: see `rgbt.config.options.parse`.
         """
-        from rgbt.config.words import readable_paths
-
         if self.first and words and "=" not in words[0] and not words[0].startswith("-"):
             words = [f"{self.first}={words[0]}", *words[1:]]
         options, overrides = parse(self.options, words, self.heeds)
@@ -89,16 +82,15 @@ class CommandGroup:
 
     def __call__(self) -> None:
         """Run the command that ``sys.argv`` names; leaves by ``sys.exit``."""
-        name = sys.argv[1] if len(sys.argv) > 1 else ""
-        if name in self.commands:
+        name = "".join(sys.argv[1:2])
+        command = self.commands.get(name)
+        if command is not None:
             del sys.argv[1]
-            self.commands[name]()
-        if self.default is not None:
-            self.default()
-        if name in ("-h", "--help"):
+        command = command or self.default
+        if command is not None:
+            command()
+        elif name in HELP:
             sys.stdout.write(f"{self.about.strip()}\n")
-            sys.exit(0)
-        sys.exit(exit_code(lambda: self._refuse(name)))
-
-    def _refuse(self, name: str) -> int:
-        raise InputError(f"expected a command, got '{name}'; {nearest(name, self.commands)}.")
+        else:
+            known = nearest(name, self.commands)
+            sys.exit(say(f"expected a command, got '{name}'; {known}.", 2))

@@ -29,37 +29,31 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         return say(str(error), 2)
     except RunError as error:
         return say(str(error), 1)
-    except OSError as error:  # Hydra's error of a missing configuration file is one, too
-        return say(_of_hydra(error) or _of_file(error), 2)
-    except Stopped as stop:
+    except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
-        return say(str(stop), stop.code)
-    except KeyboardInterrupt:  # a second Ctrl-C
-        if not catch_interrupt:
-            raise
+        if isinstance(stop, Stopped):
+            return say(str(stop), stop.code)
+        # A second Ctrl-C.
         return say("interrupted; rerun the command to resume from its last checkpoint.", 130)
     except Exception as error:
-        sentence = _of_hydra(error)
+        sentence = _of_library(error)
         if sentence is None:
             raise
         return say(sentence, 2)
 
 
-def _of_file(error: OSError) -> str:
+def _of_library(error: Exception) -> str | None:
+    """What Hydra, OmegaConf or the system refused; None of another error."""
+    if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
+        from rgbt.config.hydra_messages import hydra_sentence  # --help does not wait for Hydra
+
+        return hydra_sentence(error, [word for word in sys.argv[1:] if not word.startswith("-")])
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"{error.filename}: a file is where a folder is needed; name another path."
-    return f"{error.filename or 'a file'}: {error.strerror or error}."
-
-
-def _of_hydra(error: Exception) -> str | None:
-    """What Hydra or OmegaConf refused; None of another error. Neither is imported for this."""
-    package = type(error).__module__.partition(".")[0]
-    if package not in ("hydra", "omegaconf"):
-        return None
-    from rgbt.config.hydra_messages import hydra_sentence
-
-    return hydra_sentence(error, [word for word in sys.argv[1:] if not word.startswith("-")])
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}."
+    return None
 
 
 def say(sentence: str, code: int) -> int:

@@ -1,7 +1,7 @@
 """A user's own folder ``sweeps/`` or ``analysis/`` in the working directory, and ours.
 
 ``python -m`` looks for modules in the working directory first; the command ``rgbt`` looks there
-last, so that a user's own maskers are found and nothing of ours is hidden.
+last, so that it imports a user's own maskers and nothing of ours is hidden.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def search_working_directory_last() -> None:
-    """Let modules of the working directory be found after all others."""
+    """Let imports look in the working directory after all other folders."""
     here = str(Path.cwd())
     sys.path[:] = [*(path for path in sys.path if path not in ("", here)), here]
 
@@ -36,44 +36,32 @@ def searches_working_directory_first() -> bool:
 @contextmanager
 def starting_alike() -> Iterator[None]:
     """Pythons started within search the working directory first only if this process does."""
-    before = os.environ.get(SAFE_PATH)
+    before = os.environ.get(SAFE_PATH, "")
     if not searches_working_directory_first():
         os.environ[SAFE_PATH] = "1"
     try:
         yield
     finally:
-        os.environ.pop(SAFE_PATH, None)
-        if before is not None:
-            os.environ[SAFE_PATH] = before
+        os.environ[SAFE_PATH] = before  # "" is as good as none
 
 
-def check_not_shadowed(package: str) -> None:
+def check_not_shadowed(package: str, *, in_jobs: bool = False) -> None:
     """Refuse a folder or file of the user's that ``python -m`` imports instead of our package.
 
     Args:
         package: top-level name that is imported next.
+        in_jobs: by processes that are started with ``python -m`` in the working directory.
 
     Raises:
         InputError: naming what shadows the package.
     """
-    _check(package, sys.path, "type `rgbt ...` instead of `python -m ...`, ")
-
-
-def check_jobs_import_ours(package: str) -> None:
-    """The same for processes that are started with ``python -m`` in the working directory.
-
-    Raises:
-        InputError: see `check_not_shadowed`.
-    """
-    _check(package, [str(Path.cwd()), *sys.path], "")
-
-
-def _check(package: str, path: list[str], remedy: str) -> None:
+    path = [str(Path.cwd()), *sys.path] if in_jobs else sys.path
     spec = PathFinder.find_spec(package, path)
     origin = Path(spec.origin).resolve() if spec is not None and spec.origin else None
     if origin is None or origin.is_relative_to(ROOT / package):
         return
     shown = origin.parent if origin.name == "__init__.py" else origin
+    remedy = "" if in_jobs else "type `rgbt ...` instead of `python -m ...`, "
     raise InputError(
         f"{shown} is imported instead of rgbt's own package `{package}`, because python -m looks "
         f"in the working directory first; {remedy}rename it, or work in another folder."

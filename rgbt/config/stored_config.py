@@ -1,7 +1,7 @@
 """A stored configuration is data: what is read from a run folder, a store or a stranger's file.
 
 Whoever wrote it can name any callable in a ``_target_``, and building the node would run it. So a
-stored configuration may name what the files of ``conf/`` name inside `rgbt`, and what lies in a
+stored configuration may name what the files of ``conf/`` name inside `rgbt`, and the content of a
 module that the user names with ``trust=``. Everything else is refused before it is imported.
 Classes and functions of `rgbt` that no file of ``conf/`` names are refused as well: some of them
 write files. What a user types or composes now is the user's own and follows Hydra's rules
@@ -20,32 +20,20 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, split_list
-from rgbt.config.compose import conf_dir
-from rgbt.config.keys import top_level
-from rgbt.config.targets import constructor
+from rgbt.config.component import constructor
+from rgbt.config.compose import conf_dir, top_level
 from rgbt.files.yaml_files import read_yaml
 
-OWN = "rgbt."
 NAMED = re.compile(r"_target_:\s*[\"']?(rgbt\.[\w.]+)", re.ASCII)
 DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
 LONGEST_SHOWN = 100
 
 
 def load_config(path: Path, trust: Collection[str] = ()) -> DictConfig:
-    """A stored configuration whose objects may be built.
-
-    Args:
-        path: ``config.yaml`` of a run, or another YAML file with targets.
-        trust: modules (or single targets) that the user trusts, see `parse_trust`.
-
-    Raises:
-        InputError: see `settings_of` and `check_targets`.
-    """
+    """A stored configuration whose objects may be built (see `check_targets`)."""
     settings = read_settings(path)
     check_targets(settings, trust, str(path))
-    config = OmegaConf.create(settings)
-    assert isinstance(config, DictConfig), "settings are a mapping"
-    return config
+    return OmegaConf.create(settings)
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -96,10 +84,12 @@ def check_targets(
     for key, target in targets(settings):
         if isinstance(target, str) and (target in shipped or target in trust):
             continue
-        home = _trusted_home(target, trust)
-        if home is not None and any(_is_inside(home, module) for module in trust):
-            continue
-        raise InputError(_refusal(source, key, target, home, group))
+        home = None  # the module that defines it, where a trusted one is imported for it
+        if isinstance(target, str) and _is_inside(target, trust):
+            named = constructor(target, "_target_")
+            home = str(getattr(named, "__module__", None) or type(named).__module__)
+        if home is None or not _is_inside(home, trust):
+            raise InputError(_refusal(source, key, target, home, group))
 
 
 def targets(settings: Any) -> Iterator[tuple[str, Any]]:
@@ -134,29 +124,17 @@ def shipped_targets(group: str = "") -> frozenset[str]:
 
 def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted key and value of everything below `node`, which is at most 50 levels deep."""
-    entries: Any = ()
-    if isinstance(node, Mapping):
-        entries = node.items()
-    elif isinstance(node, list):
-        entries = enumerate(node)
-    for key, value in entries:
-        if not isinstance(key, str) and isinstance(node, Mapping):
+    parts = dict(enumerate(node)) if isinstance(node, list) else node
+    for key, value in parts.items() if isinstance(parts, Mapping) else ():
+        if not isinstance(key, str) and parts is node:
             raise InputError(f"'{_shown(path)}': {key!r} is not a name; keys are text.")
         dotted = f"{path}.{key}" if path else str(key)
         yield dotted, value
         yield from _walk(value, dotted)
 
 
-def _trusted_home(target: Any, trust: Collection[str]) -> str | None:
-    """The module that defines `target`; None where no trusted module would be imported for it."""
-    if not isinstance(target, str) or not any(_is_inside(target, module) for module in trust):
-        return None
-    found = constructor(target, "_target_")
-    return str(getattr(found, "__module__", None) or type(found).__module__)
-
-
-def _is_inside(name: str, module: str) -> bool:
-    return name == module or name.startswith(f"{module}.")
+def _is_inside(name: str, modules: Collection[str]) -> bool:
+    return any(f"{name}.".startswith(f"{module}.") for module in modules)
 
 
 def _refusal(source: str, key: str, target: Any, home: str | None, group: str) -> str:

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 
-Place = tuple[int | str, ...]
+Location = tuple[int | str, ...]
 """Where in a value: indices of lists and keys of mappings."""
 
 NAMES: dict[Any, str] = {
@@ -29,6 +29,8 @@ NAMES: dict[Any, str] = {
     **{type(None): "null", dict: "a mapping", list: "a list", tuple: "a list", Path: "a path"},
     Any: "a finite value",
 }
+
+BOUNDS: dict[Any, str] = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
 
 SHOWN = 80
 """Characters of a refused value that a sentence quotes."""
@@ -74,50 +76,39 @@ def _adapter(annotation: Any) -> Any:
     return pydantic.TypeAdapter(annotation)
 
 
-def _not_finite(value: Any) -> Place | None:
+def _parts(value: Any) -> dict[Any, Any]:
+    """What a list or mapping holds, by index or key."""
+    if isinstance(value, list):
+        return dict(enumerate(value))
+    return value if isinstance(value, dict) else {}
+
+
+def _not_finite(value: Any) -> Location | None:
     """Where NaN or infinity is; None where there is neither."""
     if isinstance(value, float) and not math.isfinite(value):
         return ()
-    parts = dict(enumerate(value)) if isinstance(value, list) else value
-    items = parts.items() if isinstance(parts, dict) else ()
-    found = ((key, _not_finite(part)) for key, part in items)
-    return next(((key, *place) for key, place in found if place is not None), None)
+    inner = ((key, _not_finite(part)) for key, part in _parts(value).items())
+    return next(((key, *rest) for key, rest in inner if rest is not None), None)
 
 
-def _refusal(path: str, value: Any, annotation: Any, place: Place) -> str:
-    """The sentence about the innermost part at `place` whose type is known."""
-    for step in () if "[key]" in place else place:
+def _refusal(path: str, value: Any, annotation: Any, location: Location) -> str:
+    """The sentence about the innermost part at `location` whose type is known."""
+    for step in () if "[key]" in location else location:
         inner = _part_type(annotation, step)
-        if inner is None or not _holds(value, step):
+        if inner is None or step not in _parts(value):
             break
         annotation, value = inner, value[step]
         path += f"[{step}]" if isinstance(step, int) else f".{step}"
-    return (
-        f"'{path}' must be {expected(annotation)}, got {_shown(value)}{_meant(annotation, value)}"
-    )
-
-
-def _meant(annotation: Any, value: Any) -> str:
-    """The nearest of the texts that an annotation names, as the end of a sentence."""
-    literals = [each for each in _members(_bare(annotation)) if _is_literal(each)]
+    literals = [each for each in _members(annotation) if typing.get_origin(each) is typing.Literal]
     words = [str(word) for each in literals for word in typing.get_args(each)]
     close = difflib.get_close_matches(str(value), words, n=1)
-    return f"; did you mean '{close[0]}'?" if close else "."
-
-
-def _is_literal(annotation: Any) -> bool:
-    return typing.get_origin(annotation) is typing.Literal
-
-
-def _holds(value: Any, step: int | str) -> bool:
-    if isinstance(value, list):
-        return isinstance(step, int) and step < len(value)
-    return isinstance(value, dict) and step in value
+    end = f"; did you mean '{close[0]}'?" if close else "."
+    return f"'{path}' must be {expected(annotation)}, got {_shown(value)}{end}"
 
 
 def _part_type(annotation: Any, step: int | str) -> Any:
     """Annotation of a part of a value; None where the types do not say."""
-    members = [each for each in _members(_bare(annotation)) if each is not type(None)]
+    members = [each for each in _members(annotation) if each is not type(None)]
     if len(members) != 1:
         return None
     kind = _bare(members[0])
@@ -137,8 +128,9 @@ def _bare(annotation: Any) -> Any:
 
 
 def _members(annotation: Any) -> tuple[Any, ...]:
-    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
-    return typing.get_args(annotation) if is_union else (annotation,)
+    bare = _bare(annotation)
+    is_union = typing.get_origin(bare) in (typing.Union, types.UnionType)
+    return typing.get_args(bare) if is_union else (bare,)
 
 
 def expected(annotation: Any) -> str:
@@ -154,7 +146,8 @@ def expected(annotation: Any) -> str:
         return " or ".join(words) + (", or null" if type(None) in members else "")
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Literal:
-        return _one_of([repr(each) for each in args])
+        *others, last = map(repr, args)
+        return f"{', '.join(others)} or {last}" if others else last
     if origin is tuple:
         return _list(args, limits)
     if origin is dict:
@@ -162,10 +155,6 @@ def expected(annotation: Any) -> str:
     if dataclasses.is_dataclass(annotation):
         return "a mapping with " + ", ".join(each.name for each in dataclasses.fields(annotation))
     return f"{NAMES.get(annotation, 'a mapping with `_target_`')}{_range(limits)}{_remarks(limits)}"
-
-
-def _one_of(words: list[str]) -> str:
-    return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 
 def _list(args: tuple[Any, ...], limits: list[Any]) -> str:
@@ -183,19 +172,12 @@ def _range(limits: list[Any]) -> str:
     least, most = bound.get(MinLen), bound.get(MaxLen)
     if least and most:
         return f" of {least.min_length} to {most.max_length}"
-    if Ge in bound and Le in bound:
-        return f" from {_number(bound[Ge].ge)} to {_number(bound[Le].le)}"
-    words = [
-        *(f"at least {_number(each.ge)}" for each in limits if isinstance(each, Ge)),
-        *(f"above {_number(each.gt)}" for each in limits if isinstance(each, Gt)),
-        *(f"at most {_number(each.le)}" for each in limits if isinstance(each, Le)),
-        *(f"below {_number(each.lt)}" for each in limits if isinstance(each, Lt)),
-    ]
-    return f" {' and '.join(words)}" if words else ""
-
-
-def _number(value: Any) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
+    ends = {kind: getattr(bound[kind], kind.__name__.lower()) for kind in BOUNDS if kind in bound}
+    shown = {kind: str(end) if isinstance(end, int) else f"{end:g}" for kind, end in ends.items()}
+    if Ge in shown and Le in shown:
+        return f" from {shown[Ge]} to {shown[Le]}"
+    words = " and ".join(f"{BOUNDS[kind]} {end}" for kind, end in shown.items())
+    return f" {words}" if words else ""
 
 
 def _remarks(limits: list[Any]) -> str:

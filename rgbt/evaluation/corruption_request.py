@@ -19,10 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.build.contracts import check_corruption, check_sample, is_own
 from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice, split_list
-from rgbt.config.component import build
+from rgbt.config.component import build, constructor, setting_types
 from rgbt.config.compose import conf_dir
 from rgbt.config.stored_config import load_config
-from rgbt.config.targets import constructor, setting_types
 from rgbt.corruptions.corruption import Corruption, OfTime
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
 from rgbt.files.yaml_files import parse_yaml

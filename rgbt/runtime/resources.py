@@ -64,9 +64,9 @@ def _sentence(error: BaseException) -> str | None:
 
 def _disk_sentence(error: BaseException, cause: OSError) -> str:
     file = cause.filename
-    place = _existing(Path(file)) if isinstance(file, str) else _fullest()
-    free = f"{_free(place) / 1e6:.1f} MB free, after the unfinished file was removed"
-    left = f"the disk of {place} {DISK[cause.errno or 0]} ({free})"
+    path = _existing(Path(file)) if isinstance(file, str) else _fullest()
+    free = f"{_free(path) / 1e6:.1f} MB free, after the unfinished file was removed"
+    left = f"the disk of {path} {DISK[cause.errno or 0]} ({free})"
     if isinstance(error, InputError):  # says itself what cannot be written, and what to set
         return f"{str(error).rstrip('.')}; {left}."
     return f"{left}; free some space, or name a folder on another disk; {RESUME}."
@@ -75,8 +75,8 @@ def _disk_sentence(error: BaseException, cause: OSError) -> str:
 def _fullest() -> Path:
     """Of the folders that the command may write to, the one whose disk has least space left."""
     named = [word.partition("=")[2] for word in sys.argv[1:] if "=" in word]
-    places = [Path(), Path(tempfile.gettempdir()), *(Path(name).expanduser() for name in named)]
-    return min(map(_existing, places), key=_free).resolve()
+    folders = [Path(), Path(tempfile.gettempdir()), *(Path(name).expanduser() for name in named)]
+    return min(map(_existing, folders), key=_free).resolve()
 
 
 def _existing(path: Path) -> Path:
@@ -90,8 +90,8 @@ def _existing(path: Path) -> Path:
     return Path()
 
 
-def _free(place: Path) -> int:
-    return shutil.disk_usage(place).free
+def _free(path: Path) -> int:
+    return shutil.disk_usage(path).free
 
 
 def _is_memory(error: BaseException) -> bool:
@@ -104,9 +104,9 @@ def _is_memory(error: BaseException) -> bool:
 
 
 def _memory_sentence(error: BaseException) -> str:
-    whose = "the GPU" if "CUDA" in str(error) else "this machine"
-    said = one_line(str(error).partition("\n")[0]) or type(error).__name__
+    device = "the GPU" if "CUDA" in str(error) else "this machine"
+    reason = one_line(str(error).partition("\n")[0]) or type(error).__name__
     return (
-        f"the memory of {whose} is exhausted ({said}); lower scale.batch_size, "
+        f"the memory of {device} is exhausted ({reason}); lower scale.batch_size, "
         f"scale.eval_batch_size, scale.crop_hw or data.num_workers; {RESUME}."
     )

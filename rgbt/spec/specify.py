@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component
-from rgbt.config.keys import check_keys
+from rgbt.config.compose import check_keys
 from rgbt.config.values import check_value
 from rgbt.spec.run_spec import NODES, VALUES, WEIGHTS, Dependency, RunSpec, labels_key
 from rgbt.spec.upstream import parse_reference, shared_overrides, upstream_config

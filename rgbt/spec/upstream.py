@@ -16,8 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS
-from rgbt.config.compose import available, compose, search_path
-from rgbt.config.hydra_messages import forgotten
+from rgbt.config.compose import available, compose, own_folders
+from rgbt.config.hydra_messages import own_folder_hint
 from rgbt.spec.run_spec import SHARED, WEIGHTS, CheckpointFile
 
 PREFIX = "experiment:"
@@ -40,7 +40,7 @@ def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] |
     if name not in known:
         raise InputError(
             f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. A run can be "
-            f"named by its folder too: runs/<key>/{checkpoint}.{forgotten()}"
+            f"named by its folder too: runs/<key>/{checkpoint}.{own_folder_hint()}"
         )
     return name, cast(CheckpointFile, checkpoint)
 
@@ -52,7 +52,7 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
     device, regions, tracking, and the folder of runs; for weights also the network. Everything else
     is the experiment's own.
     """
-    upstream = _composed(experiment, config.scale.name, *search_path()).copy()
+    upstream = _composed(experiment, config.scale.name, own_folders()).copy()
     # Its experiment says whether a network has pretrained weights, the scale says all else.
     shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == WEIGHTS:
@@ -69,9 +69,9 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
 
 
 @cache
-def _composed(experiment: str, scale: str, *search_path: str) -> DictConfig:
+def _composed(experiment: str, scale: str, _own: str) -> DictConfig:
     """Cached, because composing takes long and the seeds of a table share their upstream runs."""
-    return compose([f"+experiment={experiment}", f"scale={scale}", *search_path])
+    return compose([f"+experiment={experiment}", f"scale={scale}"])
 
 
 def shared_overrides(overrides: Sequence[str], key: str) -> list[str]:

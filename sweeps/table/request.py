@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
-from rgbt.config.words import readable_paths
+from rgbt.config.options import readable_paths
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.table.cells import evaluation_of, is_counted

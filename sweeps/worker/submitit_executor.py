@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config.shadowing import check_jobs_import_ours
+from rgbt.config.shadowing import check_not_shadowed
 from sweeps.worker.submitit_command import Command
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class SubmititExecutor:
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
         self._submitit = _submitit()
-        check_jobs_import_ours("sweeps")
+        check_not_shadowed("sweeps", in_jobs=True)
         self._cluster = str(options.get("cluster", "slurm"))
         check_choice("submitit.cluster", self._cluster, CLUSTERS)
         values = self._checked({k: v for k, v in options.items() if k != "cluster"})

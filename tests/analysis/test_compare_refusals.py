@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from analysis.compare import entry
 from rgbt.metrics.counts import Counts
-from tests.analysis.test_compare import FAST, entry, pair
+from tests.analysis.test_compare import FAST, pair
 from tests.analysis.test_results import make_run
 from tests.commands import Call, assert_one_sentence
 
@@ -80,7 +81,7 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
         ("metric=mIoU", "'metric' has no effect here; did you mean 'metrics'?"),
         ("mIoU", "'mIoU': expected key=value"),
         ("level=2", "level must lie in [0.5, 0.999], got 2"),
-        ("level=nan", "'level' must be a number, got NaN"),
+        ("level=nan", "'level' must be a number"),
         ("level=high", "'level' must be a number"),
         ("resamples=5", "'resamples' must be a whole number from 100 to 1000000, got 5"),
         ("resamples=nan", "'resamples' must be a whole number"),
@@ -88,10 +89,10 @@ def test_too_little_in_common(call: Call, tmp_path: Path, kind: str, sentence: s
         ("resamples=200.5", "'resamples' must be a whole number"),
         ("seed=x", "'seed' must be a whole number"),
         ("seed=0.5", "'seed' must be a whole number"),
-        ("blocks=abc", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
+        ("blocks=abc", "'blocks' must be 'auto'"),
         ("seed=-1", "'seed' must be a whole number"),
-        ("blocks=0", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
-        ("blocks=-3", "'blocks' must be 'auto', 'none' or 'sequence' or a whole number from 1"),
+        ("blocks=0", "'blocks' must be 'auto'"),
+        ("blocks=-3", "'blocks' must be 'auto'"),
         ("blocks=20", "blocks=20: 40 images make 2 blocks"),
         ("blocks=sequence", "blocks=sequence: 40 images make 1 sequences"),
         ("method=t", "'method' must be"),

@@ -40,7 +40,7 @@ def test_sigterm_is_answered_by_plain_commands_too(call: Call) -> None:
         ("hydra.sweeper.objectives=[{metric: val/mIou, direction: maximize}]", "val/mIou"),
     ],
 )
-def test_misspelt_settings_of_a_sweep_are_told(
+def test_misspelt_sweep_setting_names_the_nearest(
     call: Call, tmp_path: Path, word: str, sentence: str
 ) -> None:
     from rgbt.run import main

@@ -1,4 +1,4 @@
-"""What a mistake on the command line is told as: what was meant, and what to type."""
+"""What a mistake on the command line says: what was meant, and what to type."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from rgbt.config.hydra_messages import check_words
         (("nothing",), "'nothing' is no override; expected key=value"),
         (("seed=0,1",), "'seed=0,1' names several values, which is a grid: add -m"),
         (("lr=1",), "'lr' is not a key of the configuration; did you mean optimizer.lr?"),
-        (("dataset.root=/x",), "name the data set that lies there: dataset=mfnet (or"),
+        (("dataset.root=/x",), "name the data set in that folder: dataset=mfnet (or"),
         (("dataset.num_trian=1",), "did you mean 'num_train'?"),
     ],
 )
-def test_what_hydra_refuses_says_what_to_type(words: tuple[str, ...], sentence: str) -> None:
-    with pytest.raises(InputError) as told, composing(words):
+def test_word_that_hydra_refuses_says_what_to_type(words: tuple[str, ...], sentence: str) -> None:
+    with pytest.raises(InputError) as caught, composing(words):
         compose(words)
-    assert sentence in str(told.value)
-    assert "\n" not in str(told.value)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -49,13 +49,13 @@ def test_what_hydra_refuses_says_what_to_type(words: tuple[str, ...], sentence: 
         ("hydra.searchpath=[/no/where]", "there is no folder /no/where; name an existing"),
     ],
 )
-def test_what_hydra_would_take_for_something_else_is_refused(word: str, sentence: str) -> None:
-    with pytest.raises(InputError) as told:
+def test_word_that_hydra_would_misread_is_refused(word: str, sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
         check_words([word])
-    assert sentence in str(told.value)
+    assert sentence in str(caught.value)
 
 
-def test_what_hydra_understands_passes(tmp_path: Path) -> None:
+def test_word_that_hydra_understands_passes(tmp_path: Path) -> None:
     check_words(["-m", "--cfg", "job", "seed=0,1", "+experiment=grbm", "--multirun"])
     check_words([f"hydra.searchpath=[file://{tmp_path},pkg://somewhere,{tmp_path}]"])
 

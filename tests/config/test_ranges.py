@@ -14,9 +14,8 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component
+from rgbt.config.component import Component, setting_types
 from rgbt.config.compose import conf_dir
-from rgbt.config.targets import setting_types
 from rgbt.config.values import check_value, expected
 from rgbt.ranges import Pixels, Share
 from rgbt.spec.run_spec import VALUES

@@ -51,8 +51,8 @@ OTHERS = [
     *("os.system", "posix.system", "builtins.eval", "subprocess.Popen", "hydra.utils.get_object"),
     *(
         "rgbt.files.atomic.os.system",
-        "rgbt.config.targets.get_object",
-        "rgbt.config.targets.instantiate",
+        "rgbt.config.component.get_object",
+        "rgbt.config.component.instantiate",
     ),
     *("rgbt.files.atomic.write_atomic", "rgbt.tracking.run_folder.RunFolder", "rgbt"),
     *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
@@ -156,9 +156,9 @@ def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None
 def test_composed_configurations_follow_hydras_policy(target: str, tmp_path: Path) -> None:
     loud = OmegaConf.create({"x": {"_target_": target, "command": f"touch {tmp_path / 'marker'}"}})
     for use in (build, lambda each: Component.from_node(each, "x")):
-        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as said:
+        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as caught:
             use(loud.x)
-        assert_printable(str(said.value))
+        assert_printable(str(caught.value))
     hidden = {"_target_": "hydra.utils.get_object", "path": target}
     with pytest.raises(InputError, match="is blocklisted"):
         build(OmegaConf.create({"x": hidden}).x)
