@@ -123,7 +123,7 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
     _check_exists(uri)
     shown = without_passwords(uri)
     try:
-        client = quiet_client(uri)
+        client = quiet_client()(tracking_uri=uri)
         experiment = client.get_experiment_by_name(tracking.experiment)
         if experiment is None:
             known = [each.name for each in client.search_experiments()]

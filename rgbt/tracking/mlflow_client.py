@@ -74,8 +74,9 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
         Exception: whatever MLflow raises when the store cannot be used.
     """
     check_reachable(uri)
+    make_client = quiet_client()  # imported before others wait for the lock
     with _alone(uri):
-        client = quiet_client(uri)
+        client = make_client(tracking_uri=uri)
         found = _experiment(client, experiment, artifact_uri)
     tags = {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}
     for name, value in tags.items():
@@ -84,8 +85,8 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
     return MlflowStore(client, str(found.experiment_id))
 
 
-def quiet_client(uri: str) -> Any:
-    """MLflow's client, without its messages on the way."""
+def quiet_client() -> Any:
+    """The class of MLflow's client, without the messages of MLflow."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     # Takes seconds, hence not at the top.
@@ -93,7 +94,7 @@ def quiet_client(uri: str) -> Any:
 
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    return MlflowClient(tracking_uri=uri)
+    return MlflowClient
 
 
 def check_reachable(uri: str) -> None:
