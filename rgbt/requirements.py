@@ -117,14 +117,30 @@ class Record:
 PLAIN = Record()
 """Of every component that has no record."""
 
+FORMER = {
+    **{
+        "predicts": "outputs",
+        "hides_nothing": "hides_cells",
+        "reads_confidence": "weighs_confidence",
+    },
+    **{"reads_warped": "frames", "works_on_batches": "works_on_batches"},
+}
+"""Attributes by which components stated what they are before there were records -> key of a record."""
+
 
 def record_of(component: object) -> Record:
     """The record of a component; `PLAIN` where it has none.
 
     Raises:
-        InputError: its attribute `record` is something else.
+        InputError: its attribute `record` is something else, or it has one of `FORMER` instead.
     """
     record = getattr(component, "record", PLAIN)
+    former = [name for name in FORMER if record is PLAIN and hasattr(component, name)]
+    if former:
+        raise InputError(
+            f"{type(component).__name__}.{former[0]} is not read; state it as "
+            f"record = rgbt.requirements.Record({FORMER[former[0]]}=...), see docs/extending.md."
+        )
     if not isinstance(record, Record):
         raise InputError(
             f"{type(component).__name__}.record is {described(record)}; expected "

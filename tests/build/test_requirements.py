@@ -189,3 +189,12 @@ def test_users_component_with_record_is_a_choice(
     found = sentence({"asking": asking, "masker": Nothing()})
     assert found.endswith("choose masker=set, shifted, slow.")
     sys.modules.pop("own_masks", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "key"), [("predicts", "outputs"), ("hides_nothing", "hides_cells")]
+)
+def test_record_of_component_with_former_attribute_is_refused(name: str, key: str) -> None:
+    component = type("Mine", (), {name: True})()
+    with pytest.raises(InputError, match=rf"Mine\.{name} is not read; .*Record\({key}=\.\.\.\)"):
+        record_of(component)
