@@ -125,7 +125,7 @@ FORMER = {
     },
     **{"reads_warped": "frames", "works_on_batches": "works_on_batches"},
 }
-"""Attributes by which components stated what they are before there were records -> key of a record."""
+"""Attributes that records replaced -> key of the record."""
 
 
 def record_of(component: object) -> Record:

@@ -14,7 +14,7 @@ from rgbt.build.requirements import check_requirements
 from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.config.compose import compose
-from rgbt.requirements import Record, Requirement
+from rgbt.requirements import Record, Requirement, record_of
 
 
 def plain_of(*overrides: str) -> dict[str, Any]:
