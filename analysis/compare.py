@@ -1,4 +1,4 @@
-"""Compare two methods: ``python -m analysis.compare a=runs/<key> b=runs/<key>``.
+"""Compare two methods: ``rgbt compare a=runs/<key> b=runs/<key>``.
 
 One table and one sentence: the differences with intervals and p-values, over images and seeds.
 """

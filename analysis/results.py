@@ -98,7 +98,7 @@ def _check_split_and_frames(named: NamedCounts, split: str, frames: Frames) -> N
     if frames and protocol_of(counts.partition) != frames:
         raise InputError(
             f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
-            "or name a run or what python -m rgbt.consistency run=... counted so."
+            "or name a run or what rgbt consistency run=... counted so."
         )
 
 
@@ -164,7 +164,7 @@ def _of_scores(folder: Path) -> NamedCounts:
     if not files:
         raise InputError(
             f"{folder} holds neither a run (config.yaml) nor counts (counts_*.npz); label images "
-            "of a method are counted with: python -m analysis.score predictions=... dataset=..."
+            "of a method are counted with: rgbt score predictions=... dataset=..."
         )
     if len(files) > 1:
         raise InputError(
@@ -212,7 +212,7 @@ def _single_frames(run: RunResult, split: str) -> Path:
         there = [each.stem.removeprefix("counts_") for each in run.folder.glob("counts_*.npz")]
         raise InputError(
             f"{run.folder} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
-            f"'{split}'; python -m rgbt.evaluate run={run.folder} split={split} out={path} makes "
+            f"'{split}'; rgbt evaluate run={run.folder} split={split} out={path} makes "
             "them once it is finished."
         )
     return path
@@ -224,7 +224,7 @@ def _pairs_of_frames(run: RunResult, split: str, protocol: Protocol) -> Path:
         frames = "next" if protocol == "next" else "virtual"
         raise InputError(
             f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
-            f"python -m rgbt.consistency run={run.folder} split={split} frames={frames} makes them "
+            f"rgbt consistency run={run.folder} split={split} frames={frames} makes them "
             "once it is finished."
         )
     return path

@@ -1,4 +1,4 @@
-"""Counts of corrupted images, as ``python -m rgbt.robustness`` leaves them beside a run."""
+"""Counts of corrupted images, as ``rgbt robustness`` leaves them beside a run."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
 
     Args:
         text: runs or groups (see `analysis.results.open_counts`), or folders that
-            ``python -m rgbt.robustness out=...`` wrote, with commas.
+            ``rgbt robustness out=...`` wrote, with commas.
         runs_dir: where runs lie.
         split: "": test.
 
@@ -98,7 +98,7 @@ def folder_of(named: NamedCounts) -> Path:
         what = f"{named.path} is no run" if not named.key else f"{folder} is not there"
         split = "" if named.counts.split == "test" else f" split={named.counts.split}"
         run = named.path.parent if named.key else "..."
-        raise InputError(f"{what}; python -m rgbt.robustness run={run}{split} makes the counts.")
+        raise InputError(f"{what}; rgbt robustness run={run}{split} makes the counts.")
     return folder
 
 
@@ -111,7 +111,7 @@ def levels_of(folder: Path) -> tuple[Level, ...]:
     found = [_level(path) for path in sorted(folder.glob("*.json"))]
     if CLEAN not in {level.row for level in found}:
         raise InputError(
-            f"{folder} holds no counts of clean images ({CLEAN}.json); python -m rgbt.robustness "
+            f"{folder} holds no counts of clean images ({CLEAN}.json); rgbt robustness "
             "measures them first."
         )
     return tuple(sorted(found, key=_place))
@@ -163,17 +163,14 @@ def _level(path: Path) -> Level:
         severity = float(made["severity"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} does not say what was measured ({error}); python -m rgbt.robustness makes it "
-            "again."
+            f"{path} does not say what was measured ({error}); rgbt robustness makes it again."
         ) from error
     counts = Counts.load(path.with_suffix(".npz"))
     return Level(path.stem, severity=severity, counts=counts, **of_level)
 
 
 def _read(path: Path) -> Any:
-    made = read_json(
-        path, dict[str, Any], "remove it, and python -m rgbt.robustness makes it again"
-    )
+    made = read_json(path, dict[str, Any], "remove it, and rgbt robustness makes it again")
     if made.get("format") != FORMAT:
-        raise InputError(f"{path} is not of python -m rgbt.robustness; name another folder.")
+        raise InputError(f"{path} is not of rgbt robustness; name another folder.")
     return made

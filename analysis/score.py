@@ -1,4 +1,4 @@
-"""Results by region of any method: ``python -m analysis.score predictions=folder dataset=...``.
+"""Results by region of any method: ``rgbt score predictions=folder dataset=...``.
 
 From a folder of predicted label images, or from the counts that a run has stored.
 """
@@ -269,7 +269,7 @@ def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     found = open_counts(options.counts, options.runs_dir, options.split)
     info(
         "stored counts hold one partition and no map by pixel; for the others write predictions "
-        "with python -m rgbt.predict run=... input=<split> out=folder, and score that folder."
+        "with rgbt predict run=... input=<split> out=folder, and score that folder."
     )
     labels = [each.label for each in found]
     return [

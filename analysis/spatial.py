@@ -1,6 +1,6 @@
 """Command: what a data set looks like by region, and which claims of SpatialSeg hold on it.
 
-python -m analysis.spatial dataset=mfnet dataset.root=... split=train out=folder
+rgbt spatial dataset=mfnet dataset.root=... split=train out=folder
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The command ``rgbt``, also ``python -m rgbt``: ``rgbt evaluate run=...``.
 
-``rgbt NAME ...`` is ``python -m MODULE ...`` (`rgbt.config.commands`), except that the working
-directory is searched for modules last.
+``rgbt NAME ...`` is ``python -m MODULE ...`` (`rgbt.config.commands`), except that the
+folders of PYTHONPATH and the working directory are searched for modules last.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 
 from rgbt.checks import nearest
 from rgbt.config.commands import COMMANDS
-from rgbt.config.shadowing import search_working_directory_last
+from rgbt.config.shadowing import search_user_folders_last
 
 HELP = """A lab for RGB-thermal semantic segmentation.
 
@@ -27,7 +27,7 @@ Completion of the command line: rgbt --completion bash (zsh, fish).
 def main() -> None:
     """Run the command that the first word names; leaves by ``sys.exit``."""
     name, *words = sys.argv[1:] or ["--help"]
-    search_working_directory_last()
+    search_user_folders_last()
     code = 0
     if name in COMMANDS:
         sys.argv[1:] = words

@@ -1,4 +1,4 @@
-"""Temporal consistency of a run or of released weights: ``python -m rgbt.consistency run=...``.
+"""Temporal consistency of a run or of released weights: ``rgbt consistency run=...``.
 
 TC says how far the predictions of two frames of a scene agree, CA how far both are also right.
 """

@@ -1,4 +1,4 @@
-"""Evaluate a run, or weights from a file: ``python -m rgbt.evaluate run=runs/<key>``.
+"""Evaluate a run, or weights from a file: ``rgbt evaluate run=runs/<key>``.
 
 Counts are written, and the tables that follow from them are shown.
 """

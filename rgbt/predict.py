@@ -1,4 +1,4 @@
-"""Predict images with a trained network: ``python -m rgbt.predict run=... input=... out=folder``.
+"""Predict images with a trained network: ``rgbt predict run=... input=... out=folder``.
 
 For every image a colour overlay and a PNG of class indices are written; with pseudo_labels=true
 labels and confidences of a split instead, to train other networks on

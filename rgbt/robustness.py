@@ -1,4 +1,4 @@
-"""What is left when images are missing or partly wrong: ``python -m rgbt.robustness run=...``.
+"""What is left when images are missing or partly wrong: ``rgbt robustness run=...``.
 
 Every severity of every corruption is evaluated and its counts are kept beside the run, each with a
 file that says what it was made of. Counts that exist are not made again.

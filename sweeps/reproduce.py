@@ -1,4 +1,4 @@
-"""Run what is missing of a table, print it: ``python -m sweeps.reproduce table=spatialseg/table3``.
+"""Run what is missing of a table, print it: ``rgbt reproduce table=spatialseg/table3``.
 
 The same command goes on where it was stopped; any number of machines may give it at once.
 """

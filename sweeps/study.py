@@ -1,4 +1,4 @@
-"""Report of a study: ``python -m sweeps.study name=search/grbm``, also while it runs.
+"""Report of a study: ``rgbt study name=search/grbm``, also while it runs.
 
 Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV with the figures, and
 MLflow a run that holds these files.

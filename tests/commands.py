@@ -79,3 +79,10 @@ def assert_one_sentence(err: str, sentence: str) -> None:
     assert len(told) == 1, err
     assert sentence in told[0]
     assert "Traceback" not in err
+
+
+def code_of(entry: Any, words: list[str]) -> int:
+    """Exit code of a command with options of its own."""
+    from rgbt.config.reporting import exit_code
+
+    return exit_code(lambda: entry.run(words))

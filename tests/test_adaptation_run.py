@@ -403,9 +403,9 @@ def test_stopped_in_the_critics_phase_and_continued(
             raise KeyboardInterrupt
         return phase(self, seen)
 
-    phase = Adversarial._critic_phase
+    phase = Adversarial._discriminator_phase
     with monkeypatch.context() as patch:
-        patch.setattr(Adversarial, "_critic_phase", stop)
+        patch.setattr(Adversarial, "_discriminator_phase", stop)
         assert stopped.told(*words, *short(6))[0] == 130
     folder = stopped.folder(*words, *short(6))
     assert not (folder / "result.json").exists()
@@ -421,13 +421,13 @@ KILL = """
 import os, signal, sys
 from rgbt.run import main
 from rgbt.schemes.adversarial import Adversarial
-phase, calls, at = Adversarial._critic_phase, [], int(sys.argv.pop(1))
+phase, calls, at = Adversarial._discriminator_phase, [], int(sys.argv.pop(1))
 def kill(self, seen):
     calls.append(1)
     if len(calls) == at:
         os.kill(os.getpid(), signal.SIGKILL)
     return phase(self, seen)
-Adversarial._critic_phase = kill
+Adversarial._discriminator_phase = kill
 main()
 """
 

@@ -112,7 +112,7 @@ def test_an_image_of_another_shape_does_not_cost_the_training(
     folder = only_run(tmp_path / "runs")
     assert_one_sentence(err, f"consistency.view, image '{name}': ")
     assert "intrinsics of another image size" in err
-    assert "Without consistency: python -m rgbt.consistency measures it later" in err
+    assert "Consistency is left out; rgbt consistency measures it later" in err
     result = read(folder, "result.json")
     assert result["test"]["mIoU"] is not None
     assert not set(SCORES) & set(result["test"])
@@ -295,7 +295,7 @@ def test_a_finished_run_says_what_was_not_measured(
     assert "is finished; showing its result" in err
     lines = [line for line in err.splitlines() if "has not been measured" in line]
     assert len(lines) == told
-    assert all(f"python -m rgbt.consistency run={folder} split=..." in line for line in lines)
+    assert all(f"rgbt consistency run={folder} split=..." in line for line in lines)
     assert sorted(folder.rglob("*")) == before
     assert read(folder, "run.json") == known
 

@@ -1,4 +1,4 @@
-"""Command that draws a figure of the papers: ``python -m analysis.figures figure=spatialseg/fig5``.
+"""Command that draws a figure of the papers: ``rgbt figures figure=spatialseg/fig5``.
 
 Without ``figure=`` it lists all figures and what each is made from.
 """

@@ -167,7 +167,7 @@ class FigureInput:
         """The pixel maps of ``maps=``, a file or a folder of `analysis.score`."""
         from analysis.predictions.maps import PixelMaps
 
-        what = "the folder (or its maps.npz) that python -m analysis.score wrote"
+        what = "the folder (or its maps.npz) that rgbt score wrote"
         return PixelMaps.load(_file(self.need("maps", what), "maps.npz"))
 
     def statistics(self, *, by_region: bool = False) -> SpatialStatistics:
@@ -241,7 +241,7 @@ class FigureInput:
 
     def counts(self, key: str, partition: str) -> dict[str, Counts]:
         """Label -> counts over a partition, of the folders or files that `key` names."""
-        what = "label:folder of what python -m analysis.score wrote, with commas between methods"
+        what = "label:folder of what rgbt score wrote, with commas between methods"
         named = self.named(key, what)
         found = {label: open_counts_file(_path(place), partition) for label, place in named.items()}
         check_same_images({label: [counts] for label, counts in found.items()})
@@ -299,7 +299,7 @@ def open_counts_file(place: Path, partition: str) -> Counts:
         there = ", ".join(sorted(each.name for each in place.glob("counts*.npz"))) or "no counts"
         raise InputError(
             f"{place} lacks {path.name} (it holds {there}); score the predictions over that "
-            "partition with python -m analysis.score."
+            "partition with rgbt score."
         )
     return Counts.load(path)
 

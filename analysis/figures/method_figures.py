@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 LEAST, MOST_PIXELS = 16, 4096
 """Pixels of a side of ``size=``."""
 
-FAILING = "runs= (run, group or folder of python -m rgbt.robustness, with labels: label:run)"
+FAILING = "runs= (run, group or folder of rgbt robustness, with labels: label:run)"
 
 LONGEST = 8
 """Times that one side of ``size=`` may be the other."""

@@ -42,8 +42,8 @@ def spatialseg_fig1(given: FigureInput) -> Figure:
     has_statistics = "statistics" in given.values or given.has_dataset
     if "maps" not in given.values and not has_statistics:
         raise InputError(
-            f"figure={given.figure} needs maps=... (folder of python -m analysis.score) for the "
-            "IoU, statistics=... (of python -m analysis.spatial) or dataset=... for the sample "
+            f"figure={given.figure} needs maps=... (folder of rgbt score) for the "
+            "IoU, statistics=... (of rgbt spatial) or dataset=... for the sample "
             "occupancy, or both."
         )
     if not has_statistics:
@@ -136,7 +136,7 @@ def spatialseg_fig4(given: FigureInput) -> Figure:
     if len(sources) + given.has_dataset != 1:
         raise InputError(
             f"figure={given.figure} needs one picture: maps=... (folder of python -m "
-            "analysis.score), statistics=... (of python -m analysis.spatial), or dataset=... for "
+            "analysis.score), statistics=... (of rgbt spatial), or dataset=... for "
             "its first image or that of names=..."
         )
     if not given.has_dataset:
@@ -203,7 +203,7 @@ spatialseg_fig9 = qualitative("spatialseg/fig9", "qualitative results on another
 @figure(
     "temporal/fig5",
     "TC and CA of variants by class",
-    f"{RUNS}, with counts of pairs of frames (python -m rgbt.consistency)",
+    f"{RUNS}, with counts of pairs of frames (rgbt consistency)",
     keys=("frames", *OF_RUNS),
 )
 def temporal_fig5(given: FigureInput) -> Figure:

@@ -111,7 +111,7 @@ def panels(
     levels = [level for each in methods.values() for training in each for level in training.levels]
     known = list(dict.fromkeys(level.row for level in levels if level.row != CLEAN))
     if not known:
-        raise InputError("runs: clean images alone were measured; python -m rgbt.robustness does.")
+        raise InputError("runs: clean images alone were measured; rgbt robustness does.")
     rows = [row_name(row) for row in rows]
     for row in rows:
         if row not in known:
@@ -135,9 +135,7 @@ def _panel(methods: Mapping[str, Sequence[Training]], like: Level, absent: Absen
             f"of '{label}' at {' and '.join(str([*ladder]) for ladder in sorted(found))}"
             for label, found in measured.items()
         )
-        raise InputError(
-            f"runs: {like.row} was measured {told}; python -m rgbt.robustness completes them."
-        )
+        raise InputError(f"runs: {like.row} was measured {told}; rgbt robustness completes them.")
     severities = next(iter(next(iter(measured.values()))))
     curves = []
     for label, each in methods.items():

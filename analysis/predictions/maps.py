@@ -16,7 +16,7 @@ from rgbt.metrics.metric import Absent
 ARCHIVE = Archive(
     "rgbt pixel maps 1",
     "pixel maps",
-    "it is the maps.npz that python -m analysis.score writes",
+    "it is the maps.npz that rgbt score writes",
     {
         **{"intersection": "iu K H W", "union": "iu K H W", "images": "iu", "classes": "U K"},
         **{"palette": "iu K 3", "dataset": "U", "split": "U", "name": "U", "unscored": "U L"},

@@ -1,4 +1,4 @@
-"""The report: ``python -m analysis.report out=report/`` makes one page from the MLflow store.
+"""The report: ``rgbt report out=report/`` makes one page from the MLflow store.
 
 Progress goes to stderr; where the page is, how large it is and what it holds to stdout.
 """

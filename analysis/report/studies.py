@@ -53,7 +53,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
     if head is None:
         raise InputError(
             f"study '{name}': its {MARKDOWN_FILE} does not name the objectives; "
-            f"`python -m sweeps.study name={name}` records it again."
+            f"`rgbt study name={name}` records it again."
         )
     wanted = [found for text in head.group(2).split(", ") if (found := OBJECTIVE.fullmatch(text))]
     objectives = tuple(each.group(2) for each in wanted)
@@ -62,7 +62,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
     if text is None:
         raise InputError(
             f"study '{name}' has no {TRIALS_FILE} in the store; "
-            f"`python -m sweeps.study name={name}` records it again."
+            f"`rgbt study name={name}` records it again."
         )
     begun = BEGUN.search(note)
     return StudyEntry(

@@ -31,7 +31,7 @@ LISTS = ("classes", "names", "parts")
 ARCHIVE = Archive(
     "rgbt spatial statistics 1",
     "statistics",
-    "write it with python -m analysis.spatial dataset=... out=...",
+    "write it with rgbt spatial dataset=... out=...",
     {
         **{"palette": "iu K 3", "region_map": "iu H W", "labels": "iu N R K"},
         **{"ignored": "iu N R", "occupied": "iu P K H W", "laplacian": "f N 2 R"},

@@ -105,7 +105,7 @@ def _another_network(model: nn.Module, contents: Contents, facts: Facts) -> str:
             "is none of the networks of rgbt.models; such a network takes files of its own runs."
         )
     fits = " or ".join(" ".join(each) for each in facts.fits)
-    advice = f"it fits {fits}" if fits else "python -m rgbt.weights inspect shows its names"
+    advice = f"it fits {fits}" if fits else "rgbt weights inspect shows its names"
     return (
         f"{contents.path} is no file for {FAMILIES.get(family, family)}: {facts.title}; {advice}."
     )

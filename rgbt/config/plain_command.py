@@ -91,6 +91,7 @@ class CommandGroup:
             command()
         elif name in HELP:
             sys.stdout.write(f"{self.about.strip()}\n")
+            sys.exit(0)
         else:
             known = nearest(name, self.commands)
             sys.exit(say(f"expected a command, got '{name}'; {known}.", 2))

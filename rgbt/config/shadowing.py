@@ -1,14 +1,15 @@
-"""A user's own folder ``sweeps/`` or ``analysis/`` in the working directory, and ours.
+"""A user's own package ``sweeps`` or ``analysis``, and ours.
 
-``python -m`` looks for modules in the working directory first; the command ``rgbt`` looks there
-last, so that it imports a user's own maskers and nothing of ours is hidden.
+``python -m`` looks for modules in the working directory and in the folders of PYTHONPATH first; the
+command ``rgbt`` looks there last, so that it imports a user's own maskers and nothing of ours is
+hidden.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -18,14 +19,21 @@ from rgbt.checks import InputError
 ROOT = Path(__file__).resolve().parents[2]
 """The folder that holds our packages."""
 
+PACKAGES = ("rgbt", "sweeps", "analysis", "hydra_plugins")
+
 SAFE_PATH = "PYTHONSAFEPATH"
 """Variable that keeps a Python from searching the working directory first."""
 
 
-def search_working_directory_last() -> None:
-    """Let imports look in the working directory after all other folders."""
-    here = str(Path.cwd())
-    sys.path[:] = [*(path for path in sys.path if path not in ("", here)), here]
+def search_user_folders_last() -> None:
+    """Let imports look in the folders of PYTHONPATH and the working directory after all others."""
+    users = [path for path in _python_path() if Path(path).resolve() != ROOT]
+    users = list(dict.fromkeys([*users, str(Path.cwd())]))
+    sys.path[:] = [*(path for path in sys.path if path not in ("", *users)), *users]
+
+
+def _python_path() -> list[str]:
+    return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
 
 
 def searches_working_directory_first() -> bool:
@@ -35,14 +43,16 @@ def searches_working_directory_first() -> bool:
 
 @contextmanager
 def starting_alike() -> Iterator[None]:
-    """Pythons started within search the working directory first only if this process does."""
-    before = os.environ.get(SAFE_PATH, "")
+    """Pythons started within search a user's folders first only if this process does."""
+    before = {name: os.environ.get(name, "") for name in (SAFE_PATH, "PYTHONPATH")}
     if not searches_working_directory_first():
         os.environ[SAFE_PATH] = "1"
+        if any(_shadow(package, _python_path()) for package in PACKAGES):
+            os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *_python_path()])
     try:
         yield
     finally:
-        os.environ[SAFE_PATH] = before  # "" is as good as none
+        os.environ.update(before)  # "" is as good as none
 
 
 def check_not_shadowed(package: str, *, in_jobs: bool = False) -> None:
@@ -55,14 +65,23 @@ def check_not_shadowed(package: str, *, in_jobs: bool = False) -> None:
     Raises:
         InputError: naming what shadows the package.
     """
-    path = [str(Path.cwd()), *sys.path] if in_jobs else sys.path
-    spec = PathFinder.find_spec(package, path)
+    shadow = _shadow(package, [str(Path.cwd()), *sys.path] if in_jobs else sys.path)
+    if shadow is None:
+        return
+    is_here = shadow.parent == Path.cwd()
+    first = "in the working directory" if is_here else "in the folders of PYTHONPATH"
+    remedy = "" if in_jobs else "type `rgbt ...` instead of `python -m ...`, "
+    away = "work in another folder" if is_here else f"take {shadow.parent} off PYTHONPATH"
+    raise InputError(
+        f"{shadow} is imported instead of rgbt's own package `{package}`, because python -m looks "
+        f"{first} first; {remedy}rename it, or {away}."
+    )
+
+
+def _shadow(package: str, path: Sequence[str]) -> Path | None:
+    """What `package` is on this search path, if it is not ours."""
+    spec = PathFinder.find_spec(package, list(path))
     origin = Path(spec.origin).resolve() if spec is not None and spec.origin else None
     if origin is None or origin.is_relative_to(ROOT / package):
-        return
-    shown = origin.parent if origin.name == "__init__.py" else origin
-    remedy = "" if in_jobs else "type `rgbt ...` instead of `python -m ...`, "
-    raise InputError(
-        f"{shown} is imported instead of rgbt's own package `{package}`, because python -m looks "
-        f"in the working directory first; {remedy}rename it, or work in another folder."
-    )
+        return None
+    return origin.parent if origin.name == "__init__.py" else origin

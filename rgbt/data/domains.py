@@ -26,7 +26,7 @@ class Domain:
         view: what the network sees of a pair; null leaves it to the network.
         head: the network's head for this domain; null where it has one for all.
         labels: "given", those of the data set; "none", none at all, whatever the data set has; or a
-            folder that `python -m rgbt.predict ... pseudo_labels=true` wrote.
+            folder that `rgbt predict ... pseudo_labels=true` wrote.
             "experiment:NAME/best.pt" predicts them with that checkpoint of the run of the
             experiment NAME, with the same seed and on the same data, which is trained first.
         teacher_view: what the network of "experiment:..." sees; null for all else, and where it
@@ -59,7 +59,7 @@ class Domain:
         if self.confidence and self.labels in (GIVEN, NONE):
             raise InputError(
                 f"domains: confidence=true needs pseudo-labels, but labels={self.labels} carry no "
-                "confidence; name a folder that python -m rgbt.predict ... pseudo_labels=true "
+                "confidence; name a folder that rgbt predict ... pseudo_labels=true "
                 "wrote, or set confidence=false."
             )
 

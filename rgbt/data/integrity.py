@@ -153,7 +153,7 @@ def within(path: Path, root: Path) -> Path:
         return path
     raise InputError(
         f"{path} leads out of dataset.root, to {found}; give dataset.root the folder in which the "
-        "files themselves lie, or copy the files (cp -rL, or python -m rgbt.data.prepare)."
+        "files themselves lie, or copy the files (cp -rL, or rgbt prepare)."
     )
 
 

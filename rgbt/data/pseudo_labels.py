@@ -83,7 +83,7 @@ class PseudoLabels:
             state = "is not complete" if self.folder.is_dir() else "does not exist"
             raise InputError(
                 f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it; "
-                f"write it with python -m rgbt.predict ... out={self.folder} pseudo_labels=true."
+                f"write it with rgbt predict ... out={self.folder} pseudo_labels=true."
             )
         self.manifest: dict[str, Any] = read_json(path, Manifest, "remove it and predict again")
         if self.manifest.get("format") != FORMAT:

@@ -1,4 +1,4 @@
-"""Draw examples of a masker: ``python -m rgbt.maskers.sketch +experiment=grbm out=masks.png``.
+"""Draw examples of a masker: ``rgbt masks +experiment=grbm out=masks.png``.
 
 One column per training sample, augmented as in training: RGB and thermal with their hidden cells
 greyed out; last column: how often each cell is hidden. A picture to look at, not a measurement.

@@ -148,13 +148,13 @@ def check_kind(asked: ParsedMetric, partition: str) -> None:
     if of_pairs and asked.score not in OF_PAIRS:
         raise InputError(
             f"'{asked.metric}' is a score of single frames, but these counts ({partition}, of "
-            "python -m rgbt.consistency run=...) are of pairs of frames; ask for "
+            "rgbt consistency run=...) are of pairs of frames; ask for "
             f"{', '.join(OF_PAIRS)}, or name counts of single frames."
         )
     if not of_pairs and asked.score in OF_PAIRS:
         raise InputError(
             f"'{asked.metric}' is a score of pairs of frames, but these counts ({partition}) are "
-            "of single frames; python -m rgbt.consistency run=... counts the pairs of a run."
+            "of single frames; rgbt consistency run=... counts the pairs of a run."
         )
 
 

@@ -38,7 +38,7 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
         raise InputError(
             f"{key}={folder}: expected given, none, experiment:NAME/best.pt, or a folder of "
             f"pseudo-labels that is finished, but there is no {path}; write it with "
-            "python -m rgbt.predict ... pseudo_labels=true."
+            "rgbt predict ... pseudo_labels=true."
         )
     manifest: dict[str, Any] = read_json(path, dict[str, Any], "remove it and predict again")
     if "digest" not in manifest:

@@ -1,7 +1,7 @@
 """Trackers a run may be given: MLflow, filled from the run folder, or none.
 
 The run folder is the truth. What MLflow could not take while a run trained is sent later by
-``python -m rgbt.tracking.sync``.
+``rgbt sync``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PAUSE_S = 300.0
 
 
 class NoTracking(Tracking):
-    """Keeps the run folder alone; `python -m rgbt.tracking.sync` can send it later."""
+    """Keeps the run folder alone; `rgbt sync` can send it later."""
 
 
 class MlflowTracking(Tracking):

@@ -1,4 +1,4 @@
-"""Sends run folders to MLflow: ``python -m rgbt.tracking.sync runs_dir=runs`` or ``run=runs/KEY``.
+"""Sends run folders to MLflow: ``rgbt sync runs_dir=runs`` or ``run=runs/KEY``.
 
 Safe to repeat: only what a store does not have is sent. ``uri=``, ``artifact_uri=`` and
 ``experiment=`` choose another store than the one the run was started with.

@@ -132,7 +132,7 @@ def _warn_of_missing_consistency(folder: RunFolder, views: ViewSets) -> None:
     if views.sets and not all(path.is_file() for path in paths):
         info(
             "its consistency on these views and splits has not been measured; to add it: "
-            f"python -m rgbt.consistency run={folder.path} split=..."
+            f"rgbt consistency run={folder.path} split=..."
         )
 
 

@@ -1,4 +1,4 @@
-"""Writes an ablation as a table file: ``python -m sweeps.reproduce new table=my/ablation ...``."""
+"""Writes an ablation as a table file: ``rgbt reproduce new table=my/ablation ...``."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ LOG_FROM = 8.0
 
 HEAD = """\
 # {title}
-# Run:  python -m sweeps.reproduce table={name} seeds=3 workers=2
-# Look: python -m sweeps.reproduce table={name} seeds=3 dry_run=true
+# Run:  rgbt reproduce table={name} seeds=3 workers=2
+# Look: rgbt reproduce table={name} seeds=3 dry_run=true
 # A row is `python -m rgbt.run +experiment=<experiment> <overrides>`; add, change and remove rows as
 # you like: what is finished is found again, only what is missing is run.
 """

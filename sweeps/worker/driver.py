@@ -244,7 +244,7 @@ def _finite(name: str, scores: Mapping[str, float]) -> float:
     if value is None or not math.isfinite(value):
         split, _, rest = name.partition("/")
         measure = (
-            f"; python -m rgbt.consistency run=... split={split} measures it"
+            f"; rgbt consistency run=... split={split} measures it"
             if rest.startswith((f"{TC}/", f"{CA}/"))
             else ""
         )

@@ -126,7 +126,7 @@ class RunStore:
             lines = without_passwords(str(error)).splitlines() or [type(error).__name__]
             info(
                 f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched in "
-                f"{self.runs_dir} alone. Send new runs later: `python -m rgbt.tracking.sync`."
+                f"{self.runs_dir} alone. Send new runs later: `rgbt sync`."
             )
             return None
 

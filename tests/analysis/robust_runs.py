@@ -1,4 +1,4 @@
-"""What `python -m rgbt.robustness` leaves beside runs, with scores that are known."""
+"""What `rgbt robustness` leaves beside runs, with scores that are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m analysis.compare`` as a user calls it."""
+"""``rgbt compare`` as a user calls it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``python -m analysis.compare frames=...``: differences in TC and CA from counts of pairs."""
+"""``rgbt compare frames=...``: differences in TC and CA from counts of pairs."""
 
 from __future__ import annotations
 
@@ -121,14 +121,14 @@ def test_files_compare_without_frames(call: Call, runs: Path):
         ),
         (["frames=aligned", "metrics=mIoU"], "'mIoU' is a score of single frames, but these"),
         (["frames=aligned", "metrics=TC,Var"], "'Var' is a score of single frames, but these"),
-        (["frames=aligned", "metrics=region/1"], "python -m rgbt.consistency run=..."),
+        (["frames=aligned", "metrics=region/1"], "rgbt consistency run=..."),
         (["frames=aligned", "metrics=class/cat/TC"], "no class 'cat'; did you mean 'car'?"),
         (["frames=next"], "plain0 split=test frames=next makes them once it is finished"),
         (
             ["frames=aligned", "split=val"],
             "no counts of pairs of frames evaluations/consistency_al",
         ),
-        (["frames=aligned", "b=bare"], "python -m rgbt.consistency run="),
+        (["frames=aligned", "b=bare"], "rgbt consistency run="),
         (["frames=aligned", "b=bare"], "bare0 split=test frames=virtual makes them"),
         (["frames=aligned", "b={runs}/bare0/counts_test.npz"], "is by ring2, not frames=aligned"),
         (

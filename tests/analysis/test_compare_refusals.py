@@ -1,4 +1,4 @@
-"""What ``python -m analysis.compare`` refuses: one sentence, exit code 2."""
+"""What ``rgbt compare`` refuses: one sentence, exit code 2."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
     with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{}")
-    with pytest.raises(InputError, match=r"noise-8.json is not of python -m rgbt.robustness"):
+    with pytest.raises(InputError, match=r"noise-8.json is not of rgbt robustness"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{")
     with pytest.raises(InputError, match=r"noise-8.json is damaged"):

@@ -19,6 +19,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from rgbt.tracking.run_files import counts_name
 from tests.analysis.figures.drawn import statistics, strips, texts
 from tests.analysis.report.stores import counts_of as stored_counts
 from tests.analysis.report.stores import files_of, write_run
@@ -241,7 +242,7 @@ def test_pixel_maps(tmp_path: Path) -> None:
 def test_report_shows_means_of_the_scored_classes(tmp_path: Path) -> None:
     run = write_run(tmp_path, "aa0", "grbm", 0)
     counts = replace(stored_counts(0), unscored=("car",))
-    counts.save(run.counts_path("test"))
+    counts.save(run.path / counts_name("test"))
     entry = open_run(stored(files_of(run.path)), []).entry
     (road, over), (miss, _) = counts.counts.sum((0, 1)).tolist()
     expected = 100 * road / (road + over + miss)
@@ -256,7 +257,7 @@ def test_report_and_comparison_say_which_classes_are_absent(tmp_path: Path) -> N
     array = stored_counts(0).counts.copy()
     array[:, :, 1] = array[..., 1] = 0
     counts = replace(stored_counts(0), counts=array, absent="exclude")
-    counts.save(run.counts_path("test"))
+    counts.save(run.path / counts_name("test"))
     entry = open_run(stored(files_of(run.path)), []).entry
     assert entry.notes[0].startswith("absent from the test split: car (")
     assert absent_classes([counts, counts], None) == (

@@ -1,4 +1,4 @@
-"""``python -m rgbt.weights``: inspect and export, as they are called."""
+"""``rgbt weights``: inspect and export, as they are called."""
 
 from __future__ import annotations
 

@@ -23,6 +23,7 @@ from rgbt.data.synth.scene import Scene, render_pair, render_scene
 from rgbt.data.synth.shapes import CAR, PERSON, box, shape_of
 from rgbt.data.synth.writer import SynthPlan, write
 from rgbt.randomness import numpy_generator
+from tests.commands import code_of
 
 FACTORS = SceneFactors()
 DAY, NIGHT = replace(FACTORS, night_share=0.0), replace(FACTORS, night_share=1.0)
@@ -454,12 +455,12 @@ def test_materials_start_with_the_sky() -> None:
 
 def test_the_sheet_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sheet.png"
-    assert sheet.entry.code([f"out={out}", "columns=2", "zoom=1", "height=48", "width=64"]) == 0
+    assert code_of(sheet.entry, [f"out={out}", "columns=2", "zoom=1", "height=48", "width=64"]) == 0
     assert cv2.imread(str(out)).shape == (6 * 48, 2 * 64, 3)
     assert capsys.readouterr().out.strip() == str(out)
 
 
 @pytest.mark.parametrize("argument", ["rgb_nois=1", "rgb_noise=much", "night_share=3"])
 def test_the_sheet_names_a_mistake(argument: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert sheet.entry.code([argument]) == 2
+    assert code_of(sheet.entry, [argument]) == 2
     assert argument.split("=")[0] in capsys.readouterr().err

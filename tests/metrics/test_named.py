@@ -142,7 +142,7 @@ OF_SINGLE = ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/1", "class/car", "
 @pytest.mark.parametrize("metric", [*OF_SINGLE, "class/car/region/2", "night/mIoU"])
 def test_pairs_have_no_scores_of_single_frames(metric: str) -> None:
     asked, counts = parse(metric), pairs_of()
-    sentence = f"'{metric}' is a score of single frames.*aligned2, of python -m rgbt.consistency"
+    sentence = f"'{metric}' is a score of single frames.*aligned2, of rgbt consistency"
     with pytest.raises(InputError, match=sentence):
         value(metric, counts, "released")
     with pytest.raises(InputError, match=sentence):
@@ -154,7 +154,7 @@ def test_pairs_have_no_scores_of_single_frames(metric: str) -> None:
 @pytest.mark.parametrize("metric", ["TC", "CA", "night/CA_released", "class/car/TC"])
 def test_single_frames_have_no_scores_of_pairs(metric: str) -> None:
     asked, counts = parse(metric), counts_of()
-    sentence = f"'{metric}' is a score of pairs.*ring2.*python -m rgbt.consistency run="
+    sentence = f"'{metric}' is a score of pairs.*ring2.*rgbt consistency run="
     with pytest.raises(InputError, match=sentence):
         value(metric, counts, "released")
     with pytest.raises(InputError, match=sentence):

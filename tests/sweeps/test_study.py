@@ -1,4 +1,4 @@
-"""`python -m sweeps.study` on studies in a journal file, as a user calls it."""
+"""`rgbt study` on studies in a journal file, as a user calls it."""
 
 from __future__ import annotations
 

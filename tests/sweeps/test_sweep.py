@@ -219,4 +219,4 @@ def test_the_command_that_draws_a_study_finds_it(
     runs_dir: str, storage: str | None, rest: str
 ) -> None:
     command = study_command("grbm-1", Path(runs_dir), storage)
-    assert command == f"python -m sweeps.study name=grbm-1{rest}"
+    assert command == f"rgbt study name=grbm-1{rest}"

@@ -33,6 +33,7 @@ from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
+from tests.commands import code_of
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "tracking"
 DEAD = "http://127.0.0.1:9"
@@ -298,8 +299,8 @@ def test_dead_tracker_warns_once_and_a_later_sync_fills_it(
     assert tracker.links()[0][0] == "MLflow later"
 
     uri = f"sqlite:///{runs_dir / 'mlflow.db'}"
-    assert sync.entry.code([f"run={folder.path}", f"uri={uri}"]) == 0
-    assert sync.entry.code([f"run={folder.path}"]) == 0, "the requested store is remembered"
+    assert code_of(sync.entry, [f"run={folder.path}", f"uri={uri}"]) == 0
+    assert code_of(sync.entry, [f"run={folder.path}"]) == 0, "the requested store is remembered"
     sent = read_upload_state(folder)
     assert sent is not None
     assert sent.uri == uri
@@ -318,7 +319,7 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     assert tracker.links() == []
     assert read_upload_state(folder) is None
     shutil.rmtree(runs_dir / "dead", ignore_errors=True)  # has no reachable store if it ran alone
-    assert sync.entry.code([f"runs_dir={runs_dir}"]) == 0
+    assert code_of(sync.entry, [f"runs_dir={runs_dir}"]) == 0
     output = capsys.readouterr().out
     assert f"{folder.path}  ->  MLflow run " in output
     assert "mlflow ui --workers 1 --backend-store-uri sqlite:///" in output
@@ -334,11 +335,11 @@ def test_sync_of_all_folders_goes_on_behind_a_damaged_one(
     for key in ("a", "b"):
         begin(RunFolder(tmp_path / key), NoTracking())
     (tmp_path / "a" / name).write_text("{\n")
-    assert sync.entry.code([f"runs_dir={tmp_path}"]) == 1
+    assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
     output = capsys.readouterr()
     assert f"rgbt: {tmp_path / 'a'} was not sent ({tmp_path / 'a' / name} is damaged" in output.err
     assert f"{tmp_path / 'b'}  ->  MLflow run " in output.out
-    assert sync.entry.code([f"run={tmp_path / 'a'}"]) == 2
+    assert code_of(sync.entry, [f"run={tmp_path / 'a'}"]) == 2
 
 
 def test_a_damaged_log_is_no_failure_of_the_store(
@@ -369,7 +370,7 @@ def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
     assert said.count("cannot be used") == 1
     assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
     assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
-    assert sync.entry.code([f"run={folder.path}"]) == 0
+    assert code_of(sync.entry, [f"run={folder.path}"]) == 0
     assert run_id(folder)
 
 
@@ -438,7 +439,7 @@ def test_artifact_table_has_unique_first_column_and_summaries_first() -> None:
 def test_sync_refuses_in_one_sentence(
     words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert sync.entry.code(words) == 2
+    assert code_of(sync.entry, words) == 2
     error = capsys.readouterr().err
     assert error.startswith("rgbt: ")
     assert sentence in error
@@ -465,7 +466,7 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
         raise ConnectionError(f"API request to {address}/api failed")
 
     monkeypatch.setattr(MlflowTracking, "sync", refuse)
-    assert sync.entry.code([f"run={folder.path}", f"uri={address}"]) == 1
+    assert code_of(sync.entry, [f"run={folder.path}", f"uri={address}"]) == 1
     error = capsys.readouterr().err
     assert "was not sent (API request to http://me:***@127.0.0.1:9/api failed)" in error
     assert "Secret" not in error
@@ -548,7 +549,7 @@ def test_many_runs_wait_once_for_a_store_that_is_busy(
     monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
     monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
     with holding(tmp_path / ".mlflow.db.lock"):
-        assert sync.entry.code([f"runs_dir={tmp_path}"]) == 1
+        assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
     said = capsys.readouterr().err
     assert said.count("waiting for process") == 1
     assert said.count("was not sent") == 3

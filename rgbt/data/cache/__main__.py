@@ -1,7 +1,7 @@
 """Command that fills the image cache, or removes it.
 
-python -m rgbt.data.cache dataset=mfnet dataset.root=... cache=auto    # fill it, show the size
-python -m rgbt.data.cache dataset=mfnet dataset.root=... remove=true   # and remove it
+rgbt cache dataset=mfnet dataset.root=... cache=auto    # fill it, show the size
+rgbt cache dataset=mfnet dataset.root=... remove=true   # and remove it
 """
 
 from __future__ import annotations

@@ -246,7 +246,7 @@ class CachedDataset(DatasetWrapper):
             cache.adopt(latest)
             LOG.warning(
                 "%s has changed: %s takes the unchanged images from %s, which is kept; "
-                "python -m rgbt.data.cache ... remove=true removes such caches.",
+                "rgbt cache ... remove=true removes such caches.",
                 *(self.name, cache.folder, latest),
             )
 

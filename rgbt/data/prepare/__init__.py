@@ -1,1 +1,1 @@
-"""Prepares the files of a data set from a download: ``python -m rgbt.data.prepare``."""
+"""Prepares the files of a data set from a download: ``rgbt prepare``."""

@@ -1,9 +1,9 @@
 """Command that copies the needed files of an official download, then checks them.
 
-    python -m rgbt.data.prepare dataset=mfnet    source=ir_seg_dataset.zip      out=/data/MFNet
-    python -m rgbt.data.prepare dataset=pst900   source=PST900_RGBT_Dataset.zip out=/data/PST900
-    python -m rgbt.data.prepare dataset=kp       source=KAIST labels=labels     out=/data/KP
-    python -m rgbt.data.prepare dataset=freiburg source=downloads               out=/data/Freiburg
+    rgbt prepare dataset=mfnet    source=ir_seg_dataset.zip      out=/data/MFNet
+    rgbt prepare dataset=pst900   source=PST900_RGBT_Dataset.zip out=/data/PST900
+    rgbt prepare dataset=kp       source=KAIST labels=labels     out=/data/KP
+    rgbt prepare dataset=freiburg source=downloads               out=/data/Freiburg
 
 Progress goes to stderr, the report of `rgbt.data.check` to stdout. The download is only read.
 """

@@ -1,4 +1,4 @@
-"""A contact sheet of scenes: ``python -m rgbt.data.synth.sheet out=sheet.png [key=value ...]``.
+"""A contact sheet of scenes: ``rgbt scenes out=sheet.png [key=value ...]``.
 
 Rows RGB, thermal, label by day, then the same scenes by night.
 """

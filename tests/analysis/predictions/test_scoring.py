@@ -174,7 +174,7 @@ def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> 
 
 def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Write) -> None:
     larger = np.zeros((6, 8), np.uint8)
-    cv2.imwrite(str(tiny.label_path("00002N")), larger)
+    cv2.imwrite(str(tiny.files("00002N")[-1]), larger)
     scored = score_folder(write(PREDICTIONS | {"00002N": larger}), tiny, "test", STRIPS)
     assert scored.maps is None
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]

@@ -180,7 +180,7 @@ def table_entry(name: str, runs_by_row: dict[int, list[RunEntry]]) -> TableEntry
         cells=tuple(tuple(row) for row in rows),
         orders={c.name: order([row[i] for row in rows]) for i, c in enumerate(table.columns)},
         notes=tuple(notes),
-        command=f"python -m sweeps.reproduce table={name} scale=demo seeds=0,1,2",
+        command=f"rgbt reproduce table={name} scale=demo seeds=0,1,2",
     )
 
 
@@ -328,7 +328,7 @@ def report(num_rows: int = 20) -> ReportData:
         title="RGB-thermal segmentation: what was run, beside the papers",
         made="2026-11-22T09:30:00+00:00",
         store="sqlite:////data/lab/runs/mlflow.db",
-        command="python -m analysis.report runs_dir=/data/lab/runs out=report/",
+        command="rgbt report runs_dir=/data/lab/runs out=report/",
         runs=tuple(runs),
         tables=tuple(tables),
         studies=(search(runs), grid(runs)) if runs else (),

@@ -42,9 +42,7 @@ def tracker(runs_dir: Path, **changed: Any) -> MlflowTracking:
 
 
 def collected(runs_dir: Path, tracking: Any = None) -> ReportData:
-    asked = ReportRequest(
-        tracking or tracker(runs_dir), runs_dir, RESAMPLES, "python -m analysis.report"
-    )
+    asked = ReportRequest(tracking or tracker(runs_dir), runs_dir, RESAMPLES, "rgbt report")
     return collect(asked, quiet)
 
 
@@ -212,9 +210,7 @@ def test_the_table_has_ranks_orders_and_notes(data: ReportData) -> None:
         "B: Odd.",
         "Every row of ours was run with trainer.max_steps=9.",
     )
-    assert table.command == (
-        "python -m sweeps.reproduce table=own/t seeds=3 scale=paper trainer.max_steps=9"
-    )
+    assert table.command == ("rgbt reproduce table=own/t seeds=3 scale=paper trainer.max_steps=9")
     assert cell_of(data, "A", "TC").reason == "the consistency metrics"
     assert cell_of(data, "C", "mIoU") == CellEntry(
         published=50.0, reason="shown as published only", published_rank=0
@@ -224,7 +220,7 @@ def test_the_table_has_ranks_orders_and_notes(data: ReportData) -> None:
 def test_tables_that_wait_are_listed_with_what_they_need(data: ReportData) -> None:
     table = table_of(data, "spatialseg/table3")
     assert table.scale == ""
-    assert table.command == "python -m sweeps.reproduce table=spatialseg/table3 seeds=3 scale=demo"
+    assert table.command == "rgbt reproduce table=spatialseg/table3 seeds=3 scale=demo"
     cell = table.cells[3][table.columns.index("mIoU")]
     assert (cell.mean, cell.published, cell.runs) == (None, 61.79, ())
     temporal = table_of(data, "temporal/table4")

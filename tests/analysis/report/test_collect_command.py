@@ -1,4 +1,4 @@
-"""`python -m analysis.report` as a user calls it; the store itself is tested in test_collect."""
+"""`rgbt report` as a user calls it; the store itself is tested in test_collect."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_it_says_where_the_page_is_and_what_it_holds(
     assert isinstance(wanted.tracking, MlflowTracking)
     assert wanted.tracking.uri == "http://me:secret@host:5000"
     assert (wanted.runs_dir, wanted.resamples) == (runs, 300)
-    assert wanted.command.startswith("python -m analysis.report out=")
+    assert wanted.command.startswith("rgbt report out=")
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def test_a_damaged_table_is_one_sentence(
 )
 def test_a_table_is_run_with_its_seeds(seeds: tuple[int, ...], words: str) -> None:
     assert reproduce_command("own/t", seeds, "demo") == (
-        f"python -m sweeps.reproduce table=own/t {words} scale=demo"
+        f"rgbt reproduce table=own/t {words} scale=demo"
     )
 
 

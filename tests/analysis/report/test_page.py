@@ -288,9 +288,7 @@ def test_summary_says_where_the_best_published_row_was_not_run(
 
 def test_summary_does_not_judge_by_intervals_of_single_rows(clicked: Any) -> None:
     assert "overlap" not in clicked["legend"]
-    said = (
-        "Intervals of single rows do not answer whether two rows differ; python -m analysis.compare"
-    )
+    said = "Intervals of single rows do not answer whether two rows differ; rgbt compare"
     assert said in clicked["legend"]
 
 

@@ -34,7 +34,7 @@ def collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReportData:
     record_search(tmp_path / "runs", tracking)
     # Reading all published tables takes a second.
     monkeypatch.setattr(tables, "table_names", list)
-    asked = ReportRequest(tracking, tmp_path / "runs", 100, "python -m analysis.report")
+    asked = ReportRequest(tracking, tmp_path / "runs", 100, "rgbt report")
     return collect(asked, quiet)
 
 

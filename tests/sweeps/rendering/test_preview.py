@@ -40,9 +40,9 @@ def test_preview_lists_each_evaluation_command_once() -> None:
     assert summary(wanted, outcomes, 2) == [
         "2 runs: 2 waiting.",
         "Time left with workers=2: known once a run is finished.",
-        "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "
-        "python -m rgbt.consistency frames=next; "
-        "python -m rgbt.evaluate modality=rgb 'regions=as trained'.",
+        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "rgbt consistency frames=next; "
+        "rgbt evaluate modality=rgb 'regions=as trained'.",
     ]
 
 
@@ -69,8 +69,8 @@ def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> N
     outcomes = [replace(first, results=found, keys=("k",)), second]
     assert summary(wanted, outcomes, 1)[1:] == [
         "Time left with workers=1: 10 s.",
-        "Made of every run that lacks it: python -m rgbt.consistency frames=virtual; "
-        "python -m rgbt.consistency frames=next.",
+        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "rgbt consistency frames=next.",
         "Trained already: 1; the time of evaluations is not counted.",
     ]
     rows = cells_grid(wanted, outcomes).rows

@@ -213,7 +213,7 @@ def test_pairs_that_were_not_counted_say_so() -> None:
         "t", table((Row(label="a"),), (column,)), {("a", 0): run}, scale="demo"
     ).cells.values()
     assert cell.mark == "no value"
-    assert "python -m rgbt.consistency run=..." in cell.reason
+    assert "rgbt consistency run=..." in cell.reason
 
 
 def test_score_failed_seed_keeps_reason() -> None:

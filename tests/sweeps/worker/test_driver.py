@@ -135,7 +135,7 @@ def test_driver_missing_consistency_names_command(tmp_path: Path) -> None:
     objectives = (Objective("val/TC/aligned", "maximize"),)
     desk = search_desk(tmp_path, objectives=objectives, trials=1).run()
     assert (
-        "no val/TC/aligned that is a number; python -m rgbt.consistency run=... split=val"
+        "no val/TC/aligned that is a number; rgbt consistency run=... split=val"
         in trial(desk, 0).user_attrs[names.REASON]
     )
 
