@@ -94,12 +94,14 @@ def _candidates(
 def _options(
     failures: list[Failure], records: Mapping[str, Record], candidates: list[Candidate]
 ) -> list[str]:
-    """Files with which the first failure is gone and no other one is new, by group."""
+    """Files with which the first failure is gone and fewest remain, by group."""
     remaining = set(failures[1:])
+    left = [(each, set(_failures({**records, each.group: each.record}))) for each in candidates]
+    helping = [(each, len(rest)) for each, rest in left if rest <= remaining]
+    fewest = min((number for _, number in helping), default=0)
     names: dict[str, list[str]] = {}
-    for group, name, record in candidates:
-        if remaining.issuperset(_failures({**records, group: record})):
-            names.setdefault(group, []).append(name)
+    for each in (each for each, number in helping if number == fewest):
+        names.setdefault(each.group, []).append(each.name)
     return [
         f"{group}={', '.join(each[:MOST_CHOICES])}{', ...' if len(each) > MOST_CHOICES else ''}"
         for group, each in names.items()

@@ -68,7 +68,8 @@ def failure_reason(code: int, log: Path, start: int) -> str:
     if code >= 0:
         # Its output went to a file on the disk that may be the reason.
         is_full = log.parent.exists() and shutil.disk_usage(log.parent).free < FULL
-        hint = f"the disk of {log.parent} is full" if is_full else f"see {log}"
+        where = f"see {log}" if log.exists() else "its error is in the terminal of this command"
+        hint = f"the disk of {log.parent} is full" if is_full else where
         return message or f"it ended with exit code {code} and no output; {hint}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     hint = f" ({OUT_OF_MEMORY})" if name == "SIGKILL" else ""
