@@ -138,7 +138,7 @@ def _label(point: GridPoint) -> str:
 
 def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
     """The command that reports a study, without passwords and default values."""
-    words = ["python", "-m", "sweeps.study", f"name={study}"]
+    words = ["rgbt", "study", f"name={study}"]
     words += [f"runs_dir={runs_dir}"] if runs_dir != Path("runs") else []
     words += [f"storage={without_passwords(storage)}"] if storage else []
     return shlex.join(words)

@@ -196,7 +196,7 @@ def test_a_finished_run_that_is_asked_for_consistency_says_where_to_get_it(
     code, out, err = train(call, data, tmp_path / "runs", *TEMPORAL)
     assert code == 0, err
     assert "is finished" in err
-    assert "TC aligned" in out or "rgbt.consistency" in err
+    assert "TC aligned" in out or "rgbt consistency run=" in err
 
 
 @pytest.mark.slow

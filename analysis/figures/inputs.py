@@ -185,8 +185,8 @@ class FigureInput:
 
         if ("statistics" in self.values) == self.has_dataset:
             raise InputError(
-                f"figure={self.figure} needs statistics=..., the folder that python -m "
-                "analysis.spatial wrote, or dataset=... to measure one now (not both)."
+                f"figure={self.figure} needs statistics=..., the folder that rgbt spatial "
+                "wrote, or dataset=... to measure one now (not both)."
             )
         if self.has_dataset:
             return self._measured()
@@ -197,8 +197,8 @@ class FigureInput:
         if by_region and has_metric and self.regions.name != stored.partition:
             raise InputError(
                 f"metric: {path} was measured over {stored.partition}, not over "
-                f"{self.regions.name}; leave metric= out, or measure again with python -m "
-                "analysis.spatial partition=... regions=..."
+                f"{self.regions.name}; omit metric=, or measure again with "
+                "rgbt spatial partition=... regions=..."
             )
         return stored
 

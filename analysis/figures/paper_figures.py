@@ -135,9 +135,9 @@ def spatialseg_fig4(given: FigureInput) -> Figure:
     sources = [key for key in ("maps", "statistics") if key in given.values]
     if len(sources) + given.has_dataset != 1:
         raise InputError(
-            f"figure={given.figure} needs one picture: maps=... (folder of python -m "
-            "analysis.score), statistics=... (of rgbt spatial), or dataset=... for "
-            "its first image or that of names=..."
+            f"figure={given.figure} needs one picture: maps=... (folder of rgbt score), "
+            "statistics=... (of rgbt spatial), or dataset=... for its first image or that of "
+            "names=..."
         )
     if not given.has_dataset:
         given.refuse(["names"], "dataset=...")

@@ -65,7 +65,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.tracking.provenance import command_line
     from rgbt.tracking.terminal import info, path_lines, print_rich
 
-    typed = command_line(["python", "-m", "analysis.report", *sys.argv[1:]])
+    typed = command_line(["rgbt", "report", *sys.argv[1:]])
     with Progress(console=Console(stderr=True)) as progress:
 
         def track(items: Sequence[Any], what: str) -> Any:

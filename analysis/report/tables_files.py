@@ -145,4 +145,4 @@ def reproduce_command(name: str, seeds: Sequence[int], scale: str, extra: str = 
         listed = ",".join(map(str, seeds))
         text = listed if len(seeds) > 1 else f"[{listed}]"
     words = [f"table={name}", f"seeds={text}", f"scale={scale}"]
-    return shlex.join(["python", "-m", "sweeps.reproduce", *words]) + (f" {extra}" if extra else "")
+    return shlex.join(["rgbt", "reproduce", *words]) + (f" {extra}" if extra else "")

@@ -77,10 +77,13 @@ def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) ->
 
 def _evaluations(request: TableRequest, outcomes: Sequence[Outcome]) -> list[str]:
     """Further evaluations of every run, and the number of runs that lack nothing else."""
-    commands = [shlex.join(evaluation.command) for evaluation in request.evaluations()]
+    commands = [
+        shlex.join(evaluation.command).replace("rgbt.", "rgbt ", 1)
+        for evaluation in request.evaluations()
+    ]
     if not outcomes or not commands:
         return []
-    shown = "; ".join(f"python -m {command}" for command in dict.fromkeys(commands))
+    shown = "; ".join(dict.fromkeys(commands))
     lines = [f"Made of every run that lacks it: {shown}."]
     trained = sum(outcome.is_trained for outcome in outcomes)
     if trained:

@@ -167,9 +167,7 @@ def test_a_folder_of_scores_that_leaves_a_choice(tmp_path: Path, names: tuple[st
 
 def test_a_folder_of_something_else(tmp_path: Path):
     (tmp_path / "labels").mkdir()
-    with pytest.raises(
-        InputError, match=r"neither a run \(config.yaml\) nor counts .*analysis.score"
-    ):
+    with pytest.raises(InputError, match=r"neither a run \(config.yaml\) nor counts .*rgbt score"):
         open_counts(str(tmp_path / "labels"), tmp_path)
 
 

@@ -104,7 +104,7 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
     with pytest.raises(InputError, match=r"holds no counts of clean images"):
         trainings("k0", runs)
     place.rename(place.with_name("gone"))
-    with pytest.raises(InputError, match=r"robustness/test is not there; python -m .* run="):
+    with pytest.raises(InputError, match=r"robustness/test is not there; rgbt robustness run="):
         trainings("k0", runs)
 
 

@@ -240,7 +240,7 @@ def test_bad_input_is_told_in_one_sentence(call: Call, words: list[str], sentenc
         ("spatialseg/fig5", ["split=test"], "statistics.npz is of split 'train' already"),
         ("spatialseg/fig2", ["split=test"], "statistics.npz is of split 'train' already"),
         ("spatialseg/fig1", ["split=test"], "statistics.npz is of split 'train' already"),
-        ("spatialseg/fig5", ["metric=vertical5"], "over ring5, not over vertical5; leave metric="),
+        ("spatialseg/fig5", ["metric=vertical5"], "over ring5, not over vertical5; omit metric="),
         ("spatialseg/fig5", ["metric=ring5", "metric.regions=4"], "over ring5, not over ring4"),
         ("spatialseg/fig3", ["metric=ring9"], "was measured over ring5, not over ring9"),
         ("regions/profile", ["split=val"], "counts_ring5.npz is of split 'test', not of split=val"),

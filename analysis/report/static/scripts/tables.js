@@ -34,7 +34,7 @@ function renderTables(section) {
 /** What intervals of single rows do not say: a paired difference may be clear where they overlap. */
 function comparisonHint() {
   return ["Intervals of single rows do not answer whether two rows differ; ",
-    el("code", {}, "python -m analysis.compare a=... b=..."), " does, image by image."];
+    el("code", {}, "rgbt compare a=... b=..."), " does, image by image."];
 }
 
 function tableTools() {
