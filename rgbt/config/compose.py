@@ -86,15 +86,18 @@ def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictCon
         group: key of the node, which is the name of its folder.
     """
     names = available(group)
-    scale = plain["scale"]["name"]
-    words = [f"scale={scale}"] if scale in available("scale") else []
-    # Composed all at once, in packages of their own: as fast as one.
-    words += [f"+{group}@choice_{number}={name}" for number, name in enumerate(names)]
-    composed = compose(words)
+    composed = _composed_choices(group, plain["scale"]["name"], tuple(names))
     changed = OmegaConf.create(dict(plain))
     for number, name in enumerate(names):
         changed[group] = composed[f"choice_{number}"]
         yield name, changed[group]
+
+
+@cache
+def _composed_choices(group: str, scale: str, names: tuple[str, ...]) -> DictConfig:
+    """The files of a group, composed all at once in packages of their own: as fast as one."""
+    words = [f"scale={scale}"] if scale in available("scale") else []
+    return compose([*words, *(f"+{group}@choice_{n}={name}" for n, name in enumerate(names))])
 
 
 @cache
