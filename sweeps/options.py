@@ -66,7 +66,7 @@ class Options:
         Help("where machines agree on who runs what: file.journal, postgresql://user@host/name"),
     ] = None
     timeout_minutes: Annotated[float | None, Help("of one run")] = None
-    max_failures: Annotated[int | None, Help("failed runs after which no other is begun")] = None
+    max_failures: Annotated[int | None, Help("failed runs after which no other is started")] = None
     executor: Annotated[
         Literal["local", "submitit"], Help("processes of this machine, or jobs of a cluster")
     ] = "local"

@@ -122,13 +122,13 @@ def _of_hydra(words: Sequence[str]) -> list[str]:
     from rgbt.config.compose import own_hydra
 
     *others, last = words
-    begun, comma, value = last.rpartition(",")
-    word = f"{begun.partition('=')[0]}={value}" if comma else last
+    typed, comma, value = last.rpartition(",")
+    word = f"{typed.partition('=')[0]}={value}" if comma else last
     with own_hydra():
         plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
         known = plugin._query("config", " ".join([*others, word]))
     if comma:
-        return [f"{begun},{each.partition('=')[2]}" for each in known]
+        return [f"{typed},{each.partition('=')[2]}" for each in known]
     # A group that holds a folder beside its files has no "=" in Hydra's answer.
     return [each if "=" in word or each[-1] in "=./" else f"{each}=" for each in known]
 

@@ -143,7 +143,7 @@ def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None
     if heeds is None:
         check_key(word, names)
         return
-    # The search path says where files of a data set of one's own lie.
+    # The search path names the folder of a user's own data set files.
     known = (*heeds, "hydra.searchpath") if heeds else ()
     if not any(f"{key}.".startswith(f"{each}.") for each in known):
         raise InputError(f"'{key}' has no effect here; {nearest(key, [*names, *heeds])}.")

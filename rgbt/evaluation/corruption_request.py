@@ -164,7 +164,7 @@ def choose_corruption(
     corruption = build(node)
     if is_own(corruption) and not isinstance(corruption, OfTime):
         check_corruption(corruption)
-    # The image is part of the name of ours, and a change of a file of one's own.
+    # The image is part of the name of a shipped file, and a change of a user's file.
     unnamed = ("severities", SEED) if is_file else ("severities", SEED, "image")
     return CorruptionRequest(
         name=path.stem if is_file else row_name(f"{stem}:{node.get('image', '')}"),

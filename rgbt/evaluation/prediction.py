@@ -74,7 +74,7 @@ def heads_of(
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
         dark = None
         if requested == "own" and session.domains.target_is == "night":
-            with suppress(InputError):  # files of one's own are in no list
+            with suppress(InputError):  # a user's own files are in no list
                 dark = session.dataset.nights(names)
         nights = dark or (None,) * len(names)
         return tuple(session.domains.head_of(view, night, requested) for night in nights)
