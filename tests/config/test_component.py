@@ -34,7 +34,14 @@ def options(group: str) -> list[str]:
     # Small ones are trained in other tests, or composed as rows of the tables.
     [pytest.param("demo", marks=pytest.mark.slow), "paper"],
 )
-@pytest.mark.parametrize("experiment", options("experiment"))
+@pytest.mark.parametrize(
+    "experiment",
+    # tests/test_behaviour.py composes all of them, too.
+    [
+        pytest.param(name, marks=() if index % 4 == 0 else pytest.mark.slow)
+        for index, name in enumerate(options("experiment"))
+    ],
+)
 def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
     rooted = ["dataset.root=unused"] if scale == "paper" else []
     config = compose(f"+experiment={experiment}", f"scale={scale}", *rooted)
