@@ -11,12 +11,11 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from omegaconf import OmegaConf
-
 from rgbt.build.load_run import open_run
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
 from rgbt.config.component import target_names
+from rgbt.config.compose import flatten
 from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
@@ -132,13 +131,12 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     if (folder / MANIFEST).exists():
         return
     # The upstream run may be a copy from another machine, where the data have another path.
-    config = OmegaConf.create(dict(spec.plain))
-    keys = [
-        *(f"data.{each}" for each in config.data if each != "_target_"),
-        *("trainer.accelerator", "trainer.threads"),
-        *(f"dataset.{each}" for each in ("root", "cache_dir") if each in config.dataset),
+    local = ("trainer.accelerator", "trainer.threads", "dataset.root", "dataset.cache_dir")
+    overrides = [
+        f"{key}={json.dumps(value)}"
+        for key, value in flatten(spec.plain).items()
+        if key in local or (key.startswith("data.") and key != "data._target_")
     ]
-    overrides = [f"{key}={json.dumps(OmegaConf.select(config, key))}" for key in keys]
     checkpoint = teacher.checkpoint.removesuffix(".pt")
     # Its configuration was composed by this command, so that its targets are the user's own.
     trust = list(target_names(teacher.run.plain))
