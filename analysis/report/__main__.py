@@ -60,7 +60,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from analysis.report.collect import ReportRequest, collect
+    from analysis.report.collect import collect
     from analysis.report.page import write_page
     from rgbt.tracking.provenance import command_line
     from rgbt.tracking.terminal import info, path_lines, print_rich
@@ -71,7 +71,7 @@ def main(options: Options, overrides: list[str]) -> int:
         def track(items: Sequence[Any], what: str) -> Any:
             return progress.track(items, description=what)
 
-        data = collect(ReportRequest(tracking, runs_dir, options.resamples, typed, trust), track)
+        data = collect(tracking, runs_dir, options.resamples, typed, trust, track)
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
     for remark in data.remarks[:TOLD]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,8 +13,7 @@ from analysis.report.masks import mask_pictures
 from analysis.report.runs import ReportRun, open_run
 from analysis.report.store import MlflowRun, read_store
 from analysis.report.studies import study_entries
-from analysis.report.tables import table_entries
-from analysis.report.tables_intervals import Track
+from analysis.report.tables import Track, table_entries
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced_runs import TAG as REPLACED_TAG
@@ -24,26 +22,23 @@ from rgbt.tracking.tracker import Tracking
 TITLE = "RGB-thermal segmentation: runs and tables"
 
 
-@dataclass(frozen=True)
-class ReportRequest:
-    """What the page is made from.
+def collect(
+    tracking: Tracking,
+    runs_dir: Path,
+    resamples: int,
+    command: str,
+    trust: Collection[str],
+    track: Track,
+) -> ReportData:
+    """Read the store; what cannot be read becomes a remark.
 
-    Attributes:
+    Args:
+        tracking: names the store.
         runs_dir: folder of runs; their files are read there where it has them.
         resamples: of the images, for intervals and p-values.
         command: that makes the page again, without passwords.
         trust: modules of which the report may build maskers and data sets.
-    """
-
-    tracking: Tracking
-    runs_dir: Path
-    resamples: int
-    command: str
-    trust: tuple[str, ...] = ()
-
-
-def collect(request: ReportRequest, track: Track) -> ReportData:
-    """Read the store; what cannot be read becomes a remark.
+        track: shows how far it is.
 
     Raises:
         InputError: there is no store, or no such experiment.
@@ -54,24 +49,25 @@ def collect(request: ReportRequest, track: Track) -> ReportData:
     with tempfile.TemporaryDirectory(prefix="rgbt_report_") as copies:
         stored = [
             each
-            for tracking in track([request.tracking], "store")
-            for each in read_store(tracking, request.runs_dir, Path(copies))
+            for one in track([tracking], "store")
+            for each in read_store(one, runs_dir, Path(copies))
             if REPLACED_TAG not in each.tags
         ]
         runs = _open_all(stored, track, remarks)
         by_key = {run.entry.key: run for run in runs}
         records = {kind: [r for r in stored if r.kind == kind] for kind in ("table", "study")}
-        tables = table_entries(records["table"], by_key, request.resamples, track, remarks)
+        tables = table_entries(records["table"], by_key, resamples, track, remarks)
         studies = study_entries(records["study"], remarks)
-        masks = mask_pictures(runs, track, remarks, request.trust)
-        differences = difference_entries(runs, request.resamples, track)
+        masks = mask_pictures(runs, track, remarks, trust)
+        differences = difference_entries(runs, resamples, track)
+    assert isinstance(tracking, MlflowTracking), "read_store refuses others"
     if not runs:
         remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")
     return ReportData(
         title=TITLE,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
-        store=_address(request.tracking),
-        command=request.command,
+        store=without_passwords(tracking.uri),
+        command=command,
         runs=tuple(run.entry for run in runs),
         tables=tables,
         studies=studies,
@@ -96,8 +92,3 @@ def _open_all(stored: Sequence[MlflowRun], track: Track, remarks: list[str]) -> 
         if known is None or (each.status == "FINISHED" and known.entry.status != "FINISHED"):
             runs[key] = open_run(each, remarks)
     return list(runs.values())
-
-
-def _address(tracking: Tracking) -> str:
-    assert isinstance(tracking, MlflowTracking), "read_store refuses others"
-    return without_passwords(tracking.uri)

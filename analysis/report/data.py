@@ -1,17 +1,15 @@
-"""What the page shows, as plain data: read once from the store, drawn by the page.
+"""What the page shows, as plain data, read once from the store.
 
 Scores are in percent, `Var` in squared percent points, times in seconds. None: there is no value.
-`to_json` of the whole is what the page's script reads; its keys are the names of these fields.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 from rgbt.spec.run_spec import NOT_IN_KEY
-from rgbt.tracking.tables import without_nan
 
 Uncertainty = Literal["images", "seeds", "images and seeds", "none"]
 
@@ -22,7 +20,6 @@ class RunEntry:
 
     Attributes:
         status: "FINISHED", "RUNNING", "FAILED" or "KILLED".
-        experiment: name of the experiment, or "".
         scale: "demo" or "paper".
         group: what seeds of one method share, or "".
         studies: names of the studies that the run is part of.
@@ -30,10 +27,11 @@ class RunEntry:
         split: that the scores are of.
         partition: e.g. "ring5".
         classes: K names.
-        notes: footnotes of the table by class, about absent classes.
-        scores: metric name -> percent (`rgbt.metrics.names`).
-        region_ious: R percents, region 1 first.
-        class_region_ious: K rows of R percents.
+        unscored: those of them that are left out of means.
+        notes: about absent classes.
+        scores: by name of the metric (`rgbt.metrics.names`).
+        region_ious: R values, region 1 first.
+        class_region_ious: K rows of R values.
         commit: git commit, "+" after it for uncommitted changes, or "".
         started: ISO 8601, UTC.
         command: as typed.
@@ -76,12 +74,10 @@ class CellEntry:
     """One cell of a table.
 
     Attributes:
-        mean: over seeds; None where there is no value of ours.
+        mean: over seeds.
         sd: over seeds (n - 1).
-        low: lower end of the 95 % interval of the mean.
-        high: its upper end.
+        low: lower end of the 95 % interval of the mean, `high` its upper end.
         covers: what the interval is over.
-        published: printed value.
         difference: mean less published.
         reason: why there is no value, or seeds are missing.
         rank: 1 best, 2 second best of the column among ours, else 0.
@@ -109,11 +105,9 @@ class TableEntry:
     """One table, ours beside the paper.
 
     Attributes:
-        name: e.g. "spatialseg/table3".
-        number: as printed.
+        name: e.g. "spatialseg/table3"; `number` as printed.
         scale: "demo" or "paper"; "" where nothing was run yet.
         data: what the printed values were measured on.
-        unit: e.g. "percent".
         best: by column, "highest", "lowest" or "none".
         proposed: by row, whether it is the method that the paper proposes.
         cells: by row, then by column.
@@ -184,9 +178,7 @@ class DifferenceEntry:
     """A place where paper and release differ, and what it does where the store holds both.
 
     Attributes:
-        topic: e.g. "GRBM cells".
-        paper: setting and sentence.
-        released: setting and sentence.
+        paper: setting and sentence, as `released`.
         source: paper section, equation or table.
         effect: sentence with the paired difference and its interval, or why there is none.
         runs: keys of the runs behind it.
@@ -236,7 +228,3 @@ class ReportData:
     differences: tuple[DifferenceEntry, ...]
     remarks: tuple[str, ...] = field(default=())
     silent: tuple[str, ...] = NOT_IN_KEY
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; NaN becomes None."""
-        return dict(without_nan(asdict(self)))

@@ -11,8 +11,8 @@ from typing import Any
 
 from analysis.report.data import DifferenceEntry
 from analysis.report.runs import ReportRun
-from analysis.report.tables_intervals import Track
-from analysis.uncertainty import Comparison, Difference, Resampling, compare
+from analysis.report.tables import Track
+from analysis.uncertainty import Comparison, Resampling, compare
 from rgbt.checks import InputError
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
@@ -32,10 +32,6 @@ class Side:
     values: Mapping[str, Any]
     text: str
 
-    def described(self) -> str:
-        """Setting and sentence."""
-        return self.text if self.setting is None else f"{self.setting}: {self.text}"
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -46,13 +42,6 @@ class Choice:
     base: tuple[str, ...]
     paper: Side
     released: Side
-
-    def command(self) -> str:
-        """The grid that makes runs of both sides."""
-        key, _, first = str(self.paper.setting).partition("=")
-        second = str(self.released.setting).partition("=")[2]
-        words = ["python", "-m", "rgbt.run", "-m", *self.base, f"{key}={first},{second}", SEEDS]
-        return shlex.join(words)
 
 
 @dataclass(frozen=True)
@@ -65,14 +54,9 @@ class PairedRuns:
 
 def load_choices(path: Path = FILE) -> tuple[Choice, ...]:
     """The entries of `FILE`, which is part of the package."""
+    sides = ("paper", "released")
     return tuple(
-        Choice(
-            topic=entry["topic"],
-            source=entry["source"],
-            base=tuple(entry["base"]),
-            paper=Side(**entry["paper"]),
-            released=Side(**entry["released"]),
-        )
+        Choice(**{**entry, "base": tuple(entry["base"]), **{s: Side(**entry[s]) for s in sides}})
         for entry in read_yaml(path)
     )
 
@@ -89,10 +73,24 @@ def difference_entries(
     """
     scored = [run for run in runs if run.test_counts is not None and run.config]
     settings = Resampling(resamples=resamples)
-    return tuple(
-        _entry(choice, find_pairs(choice, scored), settings)
-        for choice in track(load_choices(), "paper against release")
-    )
+    entries = []
+    for choice in track(load_choices(), "paper against release"):
+        pairs = find_pairs(choice, scored)
+        sides = [
+            f"{side.setting}: {side.text}" if side.setting else side.text
+            for side in (choice.paper, choice.released)
+        ]
+        compared = [run.entry.key for pair in pairs[:1] for run in (*pair.paper, *pair.released)]
+        entry = DifferenceEntry(
+            topic=choice.topic,
+            paper=sides[0],
+            released=sides[1],
+            source=choice.source,
+            effect=_effect(choice, pairs, settings),
+            runs=tuple(compared),
+        )
+        entries.append(entry)
+    return tuple(entries)
 
 
 def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
@@ -100,7 +98,11 @@ def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
     keys = {*choice.paper.values, *choice.released.values}
     groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
     for run in runs:
-        sides = [_is_side(run.config, side) for side in (choice.paper, choice.released)]
+        sides = [
+            side.setting is not None
+            and all(key in run.config and run.config[key] == v for key, v in side.values.items())
+            for side in (choice.paper, choice.released)
+        ]
         if any(sides):
             group = groups.setdefault(_rest(run, keys), ([], []))
             group[sides.index(True)].append(run)
@@ -112,18 +114,13 @@ def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
     return sorted(pairs, key=lambda pair: -min(len(pair.paper), len(pair.released)))
 
 
-def _is_side(config: Mapping[str, Any], side: Side) -> bool:
-    return side.setting is not None and all(
-        key in config and config[key] == value for key, value in side.values.items()
-    )
-
-
 def _rest(run: ReportRun, keys: set[str]) -> str:
     """All else that makes the run what it is: configuration and images."""
     assert run.test_counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
     same = {
-        key: _number(value)
+        # 4 and 4.0 are one value.
+        key: float(value) if type(value) is int else value
         for key, value in run.config.items()
         if key not in keys and not any(key == out or key.startswith(f"{out}.") for out in left_out)
     }
@@ -131,62 +128,43 @@ def _rest(run: ReportRun, keys: set[str]) -> str:
     return json.dumps([images, same], sort_keys=True, default=str)
 
 
-def _number(value: Any) -> Any:
-    """4 and 4.0 are one value."""
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 def _by_seed(runs: Sequence[ReportRun]) -> tuple[ReportRun, ...]:
     return tuple(sorted(runs, key=lambda run: (run.entry.seed is None, run.entry.seed or 0)))
-
-
-def _entry(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> DifferenceEntry:
-    runs = [run.entry.key for pair in pairs[:1] for run in (*pair.paper, *pair.released)]
-    return DifferenceEntry(
-        topic=choice.topic,
-        paper=choice.paper.described(),
-        released=choice.released.described(),
-        source=choice.source,
-        effect=_effect(choice, pairs, settings),
-        runs=tuple(runs),
-    )
 
 
 def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> str:
     if choice.released.setting is None:
         return "Cannot be compared: one side alone can be run."
     if not pairs:
-        return f"No two runs differ by this alone; these would: {choice.command()}"
+        key, _, first = str(choice.paper.setting).partition("=")
+        both = f"{key}={first},{choice.released.setting.partition('=')[2]}"
+        words = shlex.join(["python", "-m", "rgbt.run", "-m", *choice.base, both, SEEDS])
+        return f"No two runs differ by this alone; these would: {words}"
     best, others = pairs[0], len(pairs) - 1
     # Both sides score alike: `metric.absent` is part of what must be equal.
     as_run = Resampling(resamples=settings.resamples, absent=best.paper[0].absent)
     try:
-        compared = compare(_counts(best.paper), _counts(best.released), METRICS, as_run)
+        sides = [[run.counts() for run in side] for side in (best.paper, best.released)]
+        compared = compare(sides[0], sides[1], METRICS, as_run)
     except InputError as error:
         return f"Runs of both sides cannot be compared: {error}"
     more = f" {others} more pair{'s' * (others > 1)} of runs differ by it." if others else ""
     return sentence(best, compared) + more
 
 
-def _counts(runs: Sequence[ReportRun]) -> list[Any]:
-    return [run.counts() for run in runs]
-
-
 def sentence(pair: PairedRuns, compared: Comparison) -> str:
     """Released less paper in every score, with intervals and p-values."""
-    counts = (len(pair.released), len(pair.paper))
     over = "images and seeds" if all(each.both for each in compared.differences) else "images"
-    shown = "; ".join(_shown(each) for each in compared.differences)
+    shown = []
+    for each in compared.differences:
+        text = f"{each.metric} {each.value:+.2f}"
+        if each.interval is not None:
+            text += f" [{each.interval.low:+.2f}, {each.interval.high:+.2f}], p = {each.p:.2g}"
+        shown.append(text)
+    counts = (len(pair.released), len(pair.paper))
     seeds = " against ".join(f"{count} seed{'s' * (count > 1)}" for count in counts)
     return (
-        f"Released less paper: {shown} ({pair.paper[0].entry.group}; {seeds}; "
+        f"Released less paper: {'; '.join(shown)} ({pair.paper[0].entry.group}; {seeds}; "
         f"{100 * compared.level:g} % intervals over {over}, {compared.said}; p not corrected for "
         "the number of comparisons)."
     )
-
-
-def _shown(each: Difference) -> str:
-    value = f"{each.metric} {each.value:+.2f}"
-    if each.interval is None:
-        return value
-    return f"{value} [{each.interval.low:+.2f}, {each.interval.high:+.2f}], p = {each.p:.2g}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from analysis.report.data import PagePicture
 from analysis.report.runs import ReportRun
-from analysis.report.tables_intervals import Track
+from analysis.report.tables import Track
 from rgbt.checks import InputError
 from rgbt.config.stored_config import check_targets
 
@@ -78,26 +78,21 @@ def maskers_in_use(runs: Iterable[ReportRun]) -> list[MaskerInUse]:
     """Distinct maskers, those of the most runs first."""
     found: dict[str, list[tuple[ReportRun, Mapping[str, Any], Mapping[str, Any]]]] = {}
     for run in runs:
-        masker, dataset = (_node(run.config, name) for name in ("masker", "dataset"))
+        masker, dataset = (
+            {
+                k.removeprefix(f"{name}."): v
+                for k, v in run.config.items()
+                if k.startswith(f"{name}.")
+            }
+            for name in ("masker", "dataset")
+        )
         if masker and dataset and masker.get("sampler") != "none":
             found.setdefault(json.dumps(masker, sort_keys=True), []).append((run, masker, dataset))
-    maskers = [
-        MaskerInUse(
-            masker=users[0][1],
-            dataset=users[0][2],
-            groups=tuple(dict.fromkeys(run.entry.group for run, _, _ in users)),
-            runs=len(users),
-        )
-        for users in found.values()
-    ]
+    maskers = []
+    for users in found.values():
+        groups = tuple(dict.fromkeys(run.entry.group for run, _, _ in users))
+        maskers.append(MaskerInUse(users[0][1], users[0][2], groups, len(users)))
     return sorted(maskers, key=lambda masked: (-masked.runs, masked.groups))
-
-
-def _node(config: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """The settings below `name`, which have no nodes inside."""
-    return {
-        key.removeprefix(f"{name}."): v for key, v in config.items() if key.startswith(f"{name}.")
-    }
 
 
 def picture(masked: MaskerInUse, remarks: list[str], trust: Collection[str] = ()) -> PagePicture:
@@ -121,8 +116,7 @@ def picture(masked: MaskerInUse, remarks: list[str], trust: Collection[str] = ()
     size = masked.masker.get("patch_size")
     multiple = whole_cells([size] if isinstance(size, int) else [])
     examples = mask_examples(sample, draws, multiple, seed=0)
-    columns = [np.vstack([each.rgb, each.thermal]) for each in examples]
-    image = _beside(columns)
+    image = _beside([np.vstack([each.rgb, each.thermal]) for each in examples])
     hidden = [
         np.mean([getattr(each, name).mean() for each in examples])
         for name in ("rgb_hidden", "thermal_hidden")
@@ -145,16 +139,17 @@ def picture(masked: MaskerInUse, remarks: list[str], trust: Collection[str] = ()
 
 def _sample(node: Mapping[str, Any]) -> tuple[Any, str]:
     """A pair of the data set, or of the embedded one where its files are not here."""
+    from omegaconf import OmegaConf
+
     from rgbt.config.compose import compose
 
     try:
         dataset, where = _built("dataset", node), ""
-        name = dataset.names("val")[0]
-        sample = dataset.read(name)
+        sample = dataset.read(name := dataset.names("val")[0])
     except (InputError, OSError):
-        dataset, where = _built("dataset", _plain(compose([]).dataset)), " of the embedded data set"
-        name = dataset.names("val")[0]
-        sample = dataset.read(name)
+        embedded: Any = OmegaConf.to_container(compose([]).dataset, resolve=True)
+        dataset, where = _built("dataset", embedded), " of the embedded data set"
+        sample = dataset.read(name := dataset.names("val")[0])
     return sample, f"'{name}'{where}"
 
 
@@ -163,16 +158,7 @@ def _built(name: str, values: Mapping[str, Any]) -> Any:
 
     from rgbt.config.component import build
 
-    node = OmegaConf.create({name: dict(values)})[name]
-    return build(node)
-
-
-def _plain(node: Any) -> dict[str, Any]:
-    from omegaconf import OmegaConf
-
-    plain = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(plain, dict), "a node is a mapping"
-    return {str(key): value for key, value in plain.items()}
+    return build(OmegaConf.create({name: dict(values)})[name])
 
 
 def _beside(columns: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:

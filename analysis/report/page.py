@@ -1,4 +1,4 @@
-"""The page: one file with its data, style and script inside, which loads nothing."""
+"""The page: one file with its data, style and scripts inside, which loads nothing."""
 
 from __future__ import annotations
 
@@ -6,37 +6,22 @@ import base64
 import hashlib
 import json
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping
+from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from analysis.report.data import ReportData
+from markdown_it import MarkdownIt
+from markupsafe import Markup
+
+from analysis.report import charts, views
+from analysis.report.data import ReportData, RunEntry, StudyEntry, TrialEntry
+from analysis.report.panels import class_records, panels_of, run_records
 from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
 
 STATIC = Path(__file__).with_name("static")
-STYLES = ("style.css", "tables.css", "drawings.css")
-
-EARLY = "early.js"
-"""Runs before the page is painted."""
-
-SCRIPTS = (
-    "base.js",
-    "sorting.js",
-    "axes.js",
-    "panel.js",
-    "cells.js",
-    "tables.js",
-    "table_chart.js",
-    "runs.js",
-    "regions.js",
-    "markdown.js",
-    "studies.js",
-    "summary.js",
-    "start.js",
-)
-"""Joined in this order: `base.js` reads the data, `start.js` draws the page."""
 
 SECTIONS = (
     ("summary", "Summary"),
@@ -47,7 +32,12 @@ SECTIONS = (
     ("masks", "Masks"),
     ("differences", "Paper against release"),
 )
-"""Name behind # and heading, as `RENDER` of `start.js` draws them."""
+"""Name behind #, which is also that of the template, and heading."""
+
+POLICY = (
+    "default-src 'none'; script-src {}; style-src 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
 
 
 def write_page(data: ReportData, out: Path) -> Path:
@@ -68,7 +58,8 @@ def write_page(data: ReportData, out: Path) -> Path:
     text = page_text(data)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_atomic(page, text.encode())
+        # Half of a surrogate pair in a text of the store is no UTF-8.
+        write_atomic(page, text.encode(errors="xmlcharrefreplace"))
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"out={out}: {reason}; give a folder that can be written.") from error
@@ -78,50 +69,128 @@ def write_page(data: ReportData, out: Path) -> Path:
 def page_text(data: ReportData) -> str:
     """The page as HTML.
 
-    Its policy lets the browser run these two scripts by their hashes and load nothing: text from
+    Its policy lets the browser run its own scripts by their hashes and load nothing: text from
     the store that would get into the markup after all could neither run nor call home.
+
+    Raises:
+        ValueError: a picture that is not inside the data.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    _check_pictures(data)
-    folder = FileSystemLoader(STATIC)
-    # Autoescape: the title is text of the store; what is `safe` in the template is ours or JSON.
+    for picture in data.masks:
+        if not picture.address.startswith("data:image/"):
+            raise ValueError(f"picture {picture.title}: {picture.address[:40]} is not in the data.")
+    # Autoescape: what is `safe` in the templates is ours or JSON.
     environment = Environment(
-        loader=folder, autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True
+        loader=FileSystemLoader(STATIC),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    early, script = _joined("scripts", [EARLY]), _joined("scripts", SCRIPTS)
+    texts = (views.fixed, views.signed, views.plural, views.moment, views.duration)
+    environment.filters |= {each.__name__: each for each in (*texts, views.commit_text)}
+    names = ("words", "ranks", "dash", "is_number", "letters", "seed_span")
+    values = (views.KINDS, views.RANKS, views.DASH, views.is_number, views.letters, views.seed_span)
+    environment.globals |= dict(zip(names, values, strict=True))
+    scripts = [(STATIC / "early.js").read_text(), chart_library(), (STATIC / "page.js").read_text()]
+    hashes = (hashlib.sha256(each.encode()).digest() for each in scripts)
+    allowed = " ".join(f"'sha256-{base64.b64encode(each).decode()}'" for each in hashes)
     return environment.get_template("page.html.j2").render(
-        title=data.title,
+        **_context(data),
+        data=data,
         sections=SECTIONS,
-        policy=_policy(early, script),
-        style=_joined("", STYLES),
-        early=early,
-        script=script,
-        payload=embedded(packed(data.to_json())),
+        policy=POLICY.format(allowed),
+        scripts=scripts,
+        style=(STATIC / "style.css").read_text(),
     )
 
 
-def packed(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """`ReportData.to_json` with the configurations of the runs stored by what differs.
+def _context(data: ReportData) -> dict[str, Any]:
+    """What the templates and the script read beside the data."""
+    tables = views.table_views(data)
+    run = [view for view in tables if view.is_run]
+    groups, singles = views.groups_of(data.runs), views.groups_of(data.runs, single=True)
+    measured = views.groups_of(run for run in data.runs if run.region_ious)
+    mapped = [group for group in measured if group.kind]
+    drawn = [group for group in (*groups, *singles) if group.regions]
+    partitions = list(dict.fromkeys(group.runs[0].partition for group in drawn))
+    alike = [group.id for group in groups if group.runs[0].partition in partitions[:1]]
+    places = views.unique_names(f"study {study.name}" for study in data.studies)
+    studies = list(zip(data.studies, places, strict=True))
 
-    Args:
-        plain: is not changed.
+    profile = charts.specification("profile")
+    specs = {f"profile/{each}": {**profile, "title": each} for each in partitions}
+    for view in run:
+        made = charts.table_charts(view)
+        specs |= {f"{view.id}/{index}": spec for index, spec in enumerate(made)}
+    made_of = ((place, charts.study_chart(study, place)) for study, place in studies)
+    specs |= {f"{place}/0": spec for place, spec in made_of if spec is not None}
+    payload = {
+        **run_records(singles),
+        **panels_of(data, run, [*mapped, *groups], studies),
+        "charts": specs,
+        "chart_config": charts.specification("config"),
+        "viridis": [views.Heat((0, 31)).colours(step)[0] for step in range(32)],
+        "profiles": {
+            group.id: {"partition": group.runs[0].partition, "rows": charts.profile_rows(group)}
+            for group in drawn
+        },
+        "classes": {group.id: class_records(group) for group in mapped},
+        "most_chosen": charts.MOST_CHOSEN,
+        "silent": data.silent,
+    }
+    commits: dict[str, list[RunEntry]] = {}
+    for each in data.runs:
+        commits.setdefault(each.commit, []).append(each)
+    return {
+        "payload": embedded(payload),
+        "run": run,
+        "waiting": [view for view in tables if not view.is_run],
+        "specs": specs,
+        "commits": list(commits.items()),
+        "heat": views.Heat(chain.from_iterable(each.region_ious for each in data.runs)),
+        "map_heat": views.Heat(each["mean"] for group in mapped for each in group.regions),
+        "listed": [(each, False) for each in groups] + [(each, True) for each in singles],
+        "chosen": alike[: charts.MOST_CHOSEN],
+        "partitions": partitions,
+        "mapped": mapped,
+        "classes": _class_choices(mapped),
+        "studies": [(study, place, _html(study.note)) for study, place in studies],
+        "sorted_trials": _best_first,
+        "map_size": (views.MAP_WIDTH, views.MAP_HEIGHT),
+    }
 
-    Returns:
-        the same with ``common_config`` (each key's most frequent value), and in each run ``config``
-        (values that differ from it) and ``config_lacks`` (its keys that the run has not).
-    """
-    configs = [run["config"] for run in plain["runs"]]
-    common = _most_frequent(configs)
-    runs = [
-        {
-            **run,
-            "config": {k: v for k, v in run["config"].items() if common[k] != v},
-            "config_lacks": [key for key in common if key not in run["config"]],
-        }
-        for run in plain["runs"]
-    ]
-    return {**plain, "runs": runs, "common_config": common}
+
+def _class_choices(groups: Iterable[views.Group]) -> list[tuple[str, str]]:
+    """Groups with scores by class, each followed by its runs: key in the script's data, name."""
+    choices = []
+    for group in groups:
+        if all(run.class_region_ious for run in group.runs):
+            single = len(group.runs) == 1
+            name = group.runs[0].name if single else f"{group.name} (mean of {len(group.runs)})"
+            choices.append((group.id, name))
+            choices += [] if single else [(run.key, f"\u2003{run.name}") for run in group.runs]
+    return choices
+
+
+def _best_first(study: StudyEntry) -> list[TrialEntry]:
+    """Trials by their objective; of several objectives the front first. Others last."""
+    if len(study.objectives) > 1:
+        return sorted(study.trials, key=lambda trial: not trial.on_front)
+    sign = -1 if study.maximize[0] else 1
+    known = sorted(filter(charts.is_complete, study.trials), key=lambda t: sign * t.values[0])
+    return [*known, *(trial for trial in study.trials if not charts.is_complete(trial))]
+
+
+def _html(markdown: str) -> Markup:
+    """The report of a study as HTML: no markup of its own, nothing that is loaded or linked."""
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+    tokens = reader.disable(["image", "link", "autolink"]).parse(markdown)
+    for token in tokens:
+        if token.type.startswith("heading"):
+            token.tag = "h4"
+    return Markup(reader.renderer.render(tokens, reader.options, {}))
 
 
 def embedded(plain: Any) -> str:
@@ -136,38 +205,18 @@ def embedded(plain: Any) -> str:
     return text
 
 
-def _most_frequent(configs: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Key -> its most frequent value; of equally frequent ones the first."""
-    counts: dict[str, Counter[str]] = {}
-    for config in configs:
-        for key, value in config.items():
-            counts.setdefault(key, Counter())[value] += 1
-    return {key: values.most_common(1)[0][0] for key, values in counts.items()}
-
-
 def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {key: _finite(child) for key, child in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(child) for child in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _joined(folder: str, names: Iterable[str]) -> str:
-    return "".join((STATIC / folder / name).read_text() for name in names)
+@cache
+def chart_library() -> str:
+    """Vega-Lite and what draws its charts, as a script: defines ``vegaEmbed``."""
+    import vl_convert
 
-
-def _policy(*scripts: str) -> str:
-    """Content security policy that allows these scripts, our style, and pictures in the data."""
-    digests = (hashlib.sha256(script.encode()).digest() for script in scripts)
-    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-    return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
-
-
-def _check_pictures(data: ReportData) -> None:
-    for picture in data.masks:
-        if not picture.address.startswith("data:image/"):
-            raise ValueError(f"picture {picture.title}: {picture.address[:40]} is not in the data.")
+    # In a function, as its names would otherwise be those of the page.
+    return f"(() => {{{vl_convert.javascript_bundle('window.vegaEmbed = vegaEmbed;')}}})();"

@@ -20,6 +20,7 @@ from analysis.report.runs_provenance import (
 )
 from analysis.report.store import MlflowRun, RunFiles
 from rgbt.checks import InputError, check_choice
+from rgbt.config.compose import flatten
 from rgbt.config.stored_config import settings_of
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.absent import absent_notes
@@ -35,6 +36,7 @@ from sweeps.table.request import DEFAULT_SCALE, TAG
 STUDY_TAG = "rgbt.study/"
 ABSENT = get_args(Absent)
 
+SCALE = re.compile(r"(?:^|\s)scale=(\w+)")
 ROUNDING = 0.0051
 """MLflow has two decimals: a larger difference is another number."""
 
@@ -102,19 +104,32 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
     first = processes[0] if processes else {}
     command = without_passwords(str(first.get("command") or run.tags.get("rgbt.command", "")))
     group = group_of(run.tags, run.params)
+    counted_fields: dict[str, Any] = {}
+    if counts is not None:
+        matrices, classes, scored = counts.by_region(), counts.classes, counts.scored
+        counted_fields = {
+            "split": counts.split,
+            "partition": counts.partition,
+            "classes": classes,
+            "unscored": counts.unscored,
+            "notes": absent_notes(matrices, classes, scored, counts.split, absent),
+            "region_ious": _percents(miou(matrices, absent, scored)),
+            "class_region_ious": tuple(_percents(row) for row in iou(matrices, absent).T),
+            "images": len(counts.names),
+        }
     entry = RunEntry(
         key=key,
         name=run.name,
         run_id=run.run_id,
         status=run.status,
         experiment=run.tags.get("rgbt.experiment", ""),
-        scale=_scale(group),
-        seed=_seed(run.tags.get("rgbt.seed", "")),
+        scale=(SCALE.findall(group) or [DEFAULT_SCALE])[-1],
+        seed=int(seed) if (seed := run.tags.get("rgbt.seed", "")).isdecimal() else None,
         group=group,
         studies=tuple(_after(run.tags, STUDY_TAG)),
         table_rows=_after(run.tags, TAG),
         scores=scores,
-        **({} if counts is None else _of_counts(counts, absent)),
+        **counted_fields,
         commit=commit_of(first) or run.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
         started=run.started,
         seconds=run.seconds,
@@ -137,7 +152,7 @@ def _config(run: MlflowRun, remarks: list[str]) -> dict[str, Any]:
         text = run.files.text("config.yaml")
         if text is None:
             raise InputError("there is none")
-        settings = dict(_leaves(settings_of(parse_yaml(text, "it"), "it"), ""))
+        settings = flatten(settings_of(parse_yaml(text, "it"), "it"))
         check_choice("metric.absent", settings.setdefault("metric.absent", ABSENT[0]), ABSENT)
         return settings
     except InputError as error:
@@ -146,15 +161,6 @@ def _config(run: MlflowRun, remarks: list[str]) -> dict[str, Any]:
             f"Run '{run.name}': config.yaml cannot be read ({said}); its parameters are shown."
         )
         return {}
-
-
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Values by dotted key, lists as they are."""
-    if not isinstance(value, dict):
-        yield path, value
-        return
-    for key, child in value.items():
-        yield from _leaves(child, f"{path}.{key}" if path else str(key))
 
 
 def _counts(run: MlflowRun, key: str, remarks: list[str]) -> Counts | None:
@@ -195,34 +201,10 @@ def _disagreements(
         )
 
 
-def _scale(group: str) -> str:
-    named = re.findall(r"(?:^|\s)scale=(\w+)", group)
-    return named[-1] if named else DEFAULT_SCALE
-
-
-def _seed(text: str) -> int | None:
-    return int(text) if text.isdecimal() else None
-
-
 def _after(tags: Mapping[str, str], beginning: str) -> dict[str, str]:
     """Tags that begin so, by what follows."""
     found = {n.removeprefix(beginning): v for n, v in tags.items() if n.startswith(beginning)}
     return dict(sorted(found.items()))
-
-
-def _of_counts(counts: Counts, absent: Absent) -> dict[str, Any]:
-    """The fields of a `RunEntry` that come from its counts, beside the scores."""
-    matrices, classes, scored = counts.by_region(), counts.classes, counts.scored
-    return {
-        "split": counts.split,
-        "partition": counts.partition,
-        "classes": classes,
-        "unscored": counts.unscored,
-        "notes": absent_notes(matrices, classes, scored, counts.split, absent),
-        "region_ious": _percents(miou(matrices, absent, scored)),
-        "class_region_ious": tuple(_percents(row) for row in iou(matrices, absent).T),
-        "images": len(counts.names),
-    }
 
 
 def _percents(fractions: Any) -> tuple[float, ...]:

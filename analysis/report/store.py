@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -119,9 +119,14 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
             "the report is made from an MLflow store; give one with tracking=mlflow "
             "tracking.uri=... or runs_dir=..."
         )
-    uri = tracking.uri
-    _check_exists(uri)
-    shown = without_passwords(uri)
+    uri, shown = tracking.uri, without_passwords(tracking.uri)
+    database = Path(uri.removeprefix(SQLITE)) if uri.startswith(SQLITE) else None
+    # Opening a database that is not there would make an empty one.
+    if database is not None and not database.is_file():
+        raise InputError(
+            f"there is no MLflow store {database}; give the folder of runs with runs_dir=..., or "
+            "the store with tracking.uri=..."
+        )
     try:
         client = quiet_client()(tracking_uri=uri)
         experiment = client.get_experiment_by_name(tracking.experiment)
@@ -131,7 +136,16 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
                 f"tracking.experiment={tracking.experiment}: the store {shown} has no such "
                 f"experiment; {nearest(tracking.experiment, known)}."
             )
-        runs = list(_all_runs(client, experiment.experiment_id))
+        runs, token = [], None
+        while token is None or token:
+            page = client.search_runs(
+                [experiment.experiment_id],
+                max_results=PAGE,
+                order_by=["attributes.start_time DESC", "attributes.run_id ASC"],
+                page_token=token,
+            )
+            runs += page
+            token = page.token or ""
     except InputError:
         raise
     except Exception as error:  # The border to a store that may fail in any way.
@@ -139,38 +153,10 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
             f"MLflow at {shown} cannot be read ({_reason(error)}); start its server if it "
             "has one, or name another store with tracking.uri=..."
         ) from error
-    finder = _FileFinder(client, runs_dir, copies, _beside(uri))
+    # A database that was moved with its files has them beside it now.
+    beside = None if database is None else database.parent / "mlartifacts"
+    finder = _FileFinder(client, runs_dir, copies, beside)
     return [_mlflow_run(run, finder) for run in runs]
-
-
-def _check_exists(uri: str) -> None:
-    """Refuse a database that is not there: opening it would make an empty one."""
-    path = Path(uri.removeprefix(SQLITE))
-    if uri.startswith(SQLITE) and not path.is_file():
-        raise InputError(
-            f"there is no MLflow store {path}; give the folder of runs with runs_dir=..., or the "
-            "store with tracking.uri=..."
-        )
-
-
-def _beside(uri: str) -> Path | None:
-    """Where a database that was moved with its files has them now."""
-    return Path(uri.removeprefix(SQLITE)).parent / "mlartifacts" if uri.startswith(SQLITE) else None
-
-
-def _all_runs(client: Any, experiment_id: str) -> Iterator[Any]:
-    token = None
-    while True:
-        page = client.search_runs(
-            [experiment_id],
-            max_results=PAGE,
-            order_by=["attributes.start_time DESC", "attributes.run_id ASC"],
-            page_token=token,
-        )
-        yield from page
-        token = page.token
-        if not token:
-            return
 
 
 @dataclass(frozen=True)
@@ -189,21 +175,15 @@ class _FileFinder:
     def files(self, run: Any) -> RunFiles:
         """The files of an MLflow run."""
         run_id, tags = run.info.run_id, run.data.tags
-        folders = [
-            folder for folder in self._run_folders(tags) if _is_same(folder, tags, run.info.status)
-        ]
+        named = [Path(tags["rgbt.folder"])] if "rgbt.folder" in tags else []
+        own = [self.runs_dir / tags["rgbt.key"]] if "rgbt.key" in tags else []
+        folders = [each for each in (*own, *named) if _is_same(each, tags, run.info.status)]
         if self.beside is not None:
             folders.append(self.beside / run_id / "artifacts")
         address = urlparse(run.info.artifact_uri or "")
         if address.scheme in ("", "file"):
             return RunFiles((*folders, Path(unquote(address.path))))
         return RunFiles(folders, lambda path: self._fetch(run_id, path))
-
-    def _run_folders(self, tags: Mapping[str, str]) -> Iterator[Path]:
-        if "rgbt.key" in tags:
-            yield self.runs_dir / tags["rgbt.key"]
-        if "rgbt.folder" in tags:
-            yield Path(tags["rgbt.folder"])
 
     def _fetch(self, run_id: str, path: str) -> Path | None:
         parent = str(PurePosixPath(path).parent)
@@ -235,7 +215,9 @@ def _mlflow_run(run: Any, finder: _FileFinder) -> MlflowRun:
         run_id=run.info.run_id,
         name=str(run.info.run_name or ""),
         status=str(run.info.status),
-        started=_iso(start),
+        started=datetime.fromtimestamp(start / 1000, UTC).isoformat(timespec="seconds")
+        if start
+        else "",
         seconds=(end - start) / 1000 if start and end else None,
         tags={name: without_passwords(value) for name, value in run.data.tags.items()},
         params={name: without_passwords(value) for name, value in run.data.params.items()},
@@ -244,15 +226,8 @@ def _mlflow_run(run: Any, finder: _FileFinder) -> MlflowRun:
     )
 
 
-def _iso(milliseconds: int | None) -> str:
-    if not milliseconds:
-        return ""
-    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="seconds")
-
-
 def _reason(error: Exception) -> str:
-    first = (without_passwords(str(error)).splitlines() or [""])[0]
-    short = (
-        first if len(first) <= REASON_LENGTH else first[:REASON_LENGTH].rpartition(" ")[0] + " ..."
-    )
-    return f"{type(error).__name__}: {short}".rstrip(".: ")
+    text = (without_passwords(str(error)).splitlines() or [""])[0]
+    if len(text) > REASON_LENGTH:
+        text = text[:REASON_LENGTH].rpartition(" ")[0] + " ..."
+    return f"{type(error).__name__}: {text}".rstrip(".: ")

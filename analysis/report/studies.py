@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
+
+import numpy as np
 
 from analysis.report.data import StudyEntry, TrialEntry
 from analysis.report.store import MlflowRun
@@ -86,36 +88,27 @@ def _trials(
     # Parameters stand between the label and the first score, see `sweeps.report.tables`.
     params = header[len(FIRST) : header.index(objectives[0])]
     try:
-        values = [tuple(_numbers(line, objectives)) for line in lines]
-        return tuple(_entries(lines, values, params, pareto_front(values, maximize)))
+        values = [
+            tuple(float(line[each] or math.nan) for each in objectives)
+            if line["state"] == COMPLETE
+            else ()
+            for line in lines
+        ]
+        front = pareto_front(values, maximize)
+        return tuple(
+            TrialEntry(
+                number=int(line["trial"]),
+                state=line["state"],
+                params={key: line[key] for key in params if line[key] != ""}
+                or {"point": line["label"]},
+                values=values[place],
+                on_front=place in front,
+                runs=tuple(line["runs"].split()),
+            )
+            for place, line in enumerate(lines)
+        )
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"study '{name}': its {TRIALS_FILE} is damaged ({error}).") from error
-
-
-def _numbers(line: Mapping[str, str], objectives: Sequence[str]) -> Iterator[float]:
-    """The objectives of a complete trial, else nothing."""
-    if line["state"] != COMPLETE:
-        return
-    for name in objectives:
-        yield float(line[name] or math.nan)
-
-
-def _entries(
-    lines: Sequence[Mapping[str, str]],
-    values: Sequence[tuple[float, ...]],
-    params: Sequence[str],
-    front: set[int],
-) -> Iterator[TrialEntry]:
-    for place, line in enumerate(lines):
-        chosen = {name: line[name] for name in params if line[name] != ""}
-        yield TrialEntry(
-            number=int(line["trial"]),
-            state=line["state"],
-            params=chosen or {"point": line["label"]},
-            values=values[place],
-            on_front=place in front,
-            runs=tuple(line["runs"].split()),
-        )
 
 
 def pareto_front(values: Sequence[tuple[float, ...]], maximize: Sequence[bool]) -> set[int]:
@@ -125,18 +118,9 @@ def pareto_front(values: Sequence[tuple[float, ...]], maximize: Sequence[bool]) 
         values: of each trial, one per objective; () or with NaN: no point.
         maximize: by objective, whether more is better.
     """
-    signs = [1.0 if up else -1.0 for up in maximize]
-    points = {
-        place: tuple(sign * value for sign, value in zip(signs, each, strict=True))
-        for place, each in enumerate(values)
-        if each and all(map(math.isfinite, each))
-    }
-    return {
-        place
-        for place, point in points.items()
-        if not any(_beats(other, point) for other in points.values())
-    }
-
-
-def _beats(other: Sequence[float], point: Sequence[float]) -> bool:
-    return other != point and all(o >= p for o, p in zip(other, point, strict=True))
+    places = [place for place, each in enumerate(values) if each and all(map(math.isfinite, each))]
+    points = np.array([values[place] for place in places]).reshape(-1, len(maximize))
+    points = np.where(maximize, points, -points)
+    as_good = (points[:, None] >= points).all(-1)
+    beaten = np.any(as_good & (points[:, None] > points).any(-1), axis=0)
+    return {places[index] for index in np.flatnonzero(~beaten)}

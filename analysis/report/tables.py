@@ -3,28 +3,52 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from analysis.report.data import CellEntry, TableEntry
+from analysis.report.data import CellEntry, TableEntry, Uncertainty
 from analysis.report.runs import ReportRun
 from analysis.report.store import MlflowRun
-from analysis.report.tables_cells import as_recorded, cell_of, printed_cell
-from analysis.report.tables_files import (
-    DEFAULT_SEEDS,
+from analysis.report.tables_recorded import (
     NO_CELL,
+    CountsSource,
+    RecordedCell,
     RecordedTable,
+    RescoredTable,
     read_recorded,
     reproduce_command,
+    score_again,
 )
-from analysis.report.tables_intervals import Intervals, Track
-from analysis.report.tables_scored import RescoredTable, changed, interval_key, score_again
+from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
-from sweeps.table.scoring import score
+from sweeps.table.scoring import ScoredTable, published, score
 from sweeps.table.table import Column, Row, Table
+
+Track = Callable[[Sequence[Any], str], Iterable[Any]]
+"""Goes over a sequence and shows how far it is: (sequence, what is done)."""
+
+DEFAULT_SEEDS = (0, 1, 2)
+"""Of a table that nobody has run yet."""
+
+NOT_HERE = "counts of some runs are not in the store; the value is as recorded, without interval."
+
+
+@dataclass(frozen=True)
+class CellInterval:
+    """An interval, and what it is over; without one, why there is none."""
+
+    interval: Interval | None
+    covers: Uncertainty
+    reason: str = ""
+
+
+Intervals = Mapping[tuple[CountsSource, str], CellInterval]
+"""Intervals by source and metric."""
 
 
 def table_entries(
@@ -43,55 +67,148 @@ def table_entries(
         track: shows how far it is.
         remarks: gets a sentence for everything that cannot be read or does not agree.
     """
-    files = _load_all(track, remarks)
-    recorded = _read_all(records, remarks)
-    drafts = {
-        index: RescoredTable(each, score_again(each, files[each.name], runs))
-        for index, each in enumerate(recorded)
-        if each.name in files
-    }
-    intervals = Intervals(runs)
-    for draft in drafts.values():
-        _ask(draft, intervals)
-    intervals.compute(resamples, track)
-    known = {each.name for each in recorded}
-    made = [
-        _entry(drafts[index], intervals, remarks) if index in drafts else _without_file(each)
-        for index, each in enumerate(recorded)
-    ]
-    for each in recorded:
-        if each.name not in files:
-            remarks.append(f"Table '{each.name}' has no file here any more; it is as recorded.")
-    return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
-
-
-def _load_all(track: Track, remarks: list[str]) -> dict[str, Table]:
-    files = {}
+    files: dict[str, Table] = {}
     for name in track(list(dict.fromkeys(table_names())), "tables"):
         try:
             files[name] = load_table(name)
         except InputError as error:
             remarks.append(f"Table '{name}' is left out: {error}")
-    return files
-
-
-def _read_all(records: Sequence[MlflowRun], remarks: list[str]) -> list[RecordedTable]:
-    found = []
+    recorded = []
     for record in records:
         try:
-            found.append(read_recorded(record))
+            recorded.append(read_recorded(record))
         except InputError as error:
             remarks.append(str(error))
-    return sorted(found, key=lambda each: (each.name, each.scale, each.extra))
+    recorded.sort(key=lambda each: (each.name, each.scale, each.extra))
+    drafts = [score_again(each, files.get(each.name) or _file_of(each), runs) for each in recorded]
+    wanted = (
+        draft.interval_key(row, column)
+        for draft in drafts
+        for row in draft.scored.table.rows
+        for column in draft.scored.table.columns
+    )
+    intervals = find_intervals(filter(None, wanted), runs, resamples, track)
+    made = [_entry(draft, intervals, remarks) for draft in drafts]
+    known = {each.name for each in recorded}
+    for index, each in enumerate(recorded):
+        if each.name not in files:
+            remarks.append(f"Table '{each.name}' has no file here any more; it is as recorded.")
+            orders = {name: (rho, 0) for name, rho in each.orders.items()}
+            made[index] = replace(made[index], orders=orders)
+    return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
 
 
-def _ask(draft: RescoredTable, intervals: Intervals) -> None:
-    table = draft.scored.table
-    for row in table.rows:
-        for column in table.columns:
-            key = interval_key(draft, row, column)
-            if key is not None:
-                intervals.request(*key)
+def find_intervals(
+    wanted: Iterable[tuple[CountsSource, str]],
+    runs: Mapping[str, ReportRun],
+    resamples: int,
+    track: Track,
+) -> dict[tuple[CountsSource, str], CellInterval]:
+    """Intervals of scores: every set of runs is resampled once, for all of its metrics.
+
+    Args:
+        wanted: sources, and metrics of them.
+        runs: opened runs by key.
+        resamples: of the images.
+        track: shows how far it is.
+    """
+    metrics_of: dict[CountsSource, dict[str, None]] = {}
+    for source, metric in wanted:
+        metrics_of.setdefault(source, {})[metric] = None
+    found: dict[tuple[CountsSource, str], CellInterval] = {}
+    for source in track(list(metrics_of), "intervals"):
+        metrics = tuple(metrics_of[source])
+        settings = Resampling(resamples=resamples, absent=source.absent)
+        try:
+            counts = [[runs[key].counts(path) for key in source.keys] for path in source.paths]
+            intervals = _resampled(counts, metrics, settings)
+        except InputError as error:
+            intervals = dict.fromkeys(metrics, CellInterval(None, "none", str(error)))
+        found |= {(source, metric): each for metric, each in intervals.items()}
+    return found
+
+
+def _resampled(
+    counts: Sequence[Sequence[Counts]], metrics: Sequence[str], settings: Resampling
+) -> dict[str, CellInterval]:
+    """Intervals of scores, or of the difference of two evaluations of the same runs."""
+    if len(counts) == 1:
+        estimates = estimate(counts[0], metrics, settings)
+        parts = [(name, each.images, each.both, each.said) for name, each in estimates.items()]
+    else:
+        first, second = counts
+        compared = compare(second, first, metrics, settings, paired=True)
+        parts = [
+            (each.metric, each.images, each.both, compared.said) for each in compared.differences
+        ]
+    found = {}
+    for metric, images, both, said in parts:
+        if both is not None:
+            found[metric] = CellInterval(both, "images and seeds")
+        elif images is not None:
+            found[metric] = CellInterval(images, "images")
+        else:
+            found[metric] = CellInterval(None, "none", f"no interval: {said} are too few.")
+    return found
+
+
+def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals) -> CellEntry:
+    """One cell of a table that was run."""
+    scored, place = draft.scored, (row.label, column.name)
+    plain = replace(_printed(scored, row, column), values=draft.values(row, column))
+    line, cell = draft.line(row, column), scored.cells.get(place)
+    if cell is None or cell.seeds < line.seeds:
+        return _as_recorded(plain, line)
+    mean = None if math.isnan(cell.mean) else cell.mean
+    entry = replace(
+        plain,
+        mean=mean,
+        sd=None if math.isnan(cell.sd) else cell.sd,
+        seeds=cell.seeds,
+        difference=_difference(mean, plain.published),
+        reason=line.reason or cell.reason or plain.reason,
+        runs=line.keys,
+        rank=scored.ranks_ours.get(place, 0),
+    )
+    key = draft.interval_key(row, column)
+    found = None if key is None else intervals.get(key)
+    if found is None:
+        return entry
+    if found.interval is None:
+        return replace(entry, reason=entry.reason or found.reason)
+    low, high = found.interval.low, found.interval.high
+    return replace(entry, low=low, high=high, covers=found.covers)
+
+
+def _printed(scored: ScoredTable, row: Row, column: Column) -> CellEntry:
+    """What is known of a cell without any run."""
+    needs = column.needs or row.needs or scored.table.needs or ""
+    if not needs and row.experiment is None:
+        needs = "shown as published only"
+    return CellEntry(
+        published=published(row, column),
+        reason=needs,
+        published_rank=scored.ranks_published.get((row.label, column.name), 0),
+    )
+
+
+def _as_recorded(plain: CellEntry, line: RecordedCell) -> CellEntry:
+    """A cell whose runs have no counts here."""
+    if line.mean is None:
+        return replace(plain, reason=line.reason or plain.reason, runs=line.keys)
+    return replace(
+        plain,
+        mean=line.mean,
+        sd=line.sd,
+        seeds=line.seeds,
+        difference=_difference(line.mean, plain.published),
+        reason=line.reason or NOT_HERE,
+        runs=line.keys,
+    )
+
+
+def _difference(mean: float | None, printed: float | None) -> float | None:
+    return None if mean is None or printed is None else mean - printed
 
 
 def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> TableEntry:
@@ -102,7 +219,7 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
         remarks.append(
             f"Table '{recorded.name}': its file has no row '{gone[0]}' any more, which was run."
         )
-    remarks += changed(draft)
+    remarks += draft.changed()
     return _laid_out(
         recorded.name,
         table,
@@ -136,11 +253,10 @@ def _command(recorded: RecordedTable) -> str:
 
 def _waiting(name: str, table: Table) -> TableEntry:
     """A table that nobody has run."""
-    scored = score(name, table, {}, scale="")
     return _laid_out(
         name,
         table,
-        partial(printed_cell, scored),
+        partial(_printed, score(name, table, {}, scale="")),
         scale="",
         orders={},
         notes=_notes(table),
@@ -167,28 +283,20 @@ def _laid_out(
     )
 
 
-def _without_file(recorded: RecordedTable) -> TableEntry:
-    """A recorded table whose file is gone: as recorded, without intervals."""
+def _file_of(recorded: RecordedTable) -> Table:
+    """What is known of a table whose file is gone: it is shown as recorded, without intervals."""
     rows, columns = recorded.rows(), recorded.columns()
-    lines = [[recorded.lines.get((row, column), NO_CELL) for column in columns] for row in rows]
-    return TableEntry(
-        name=recorded.name,
+    printed = {
+        row: {name: recorded.lines.get((row, name), NO_CELL).published for name in columns}
+        for row in rows
+    }
+    return Table(
         paper=recorded.name.rpartition("/")[0],
         number=recorded.name,
         caption="",
-        scale=recorded.scale,
         data="",
-        unit="percent",
-        columns=columns,
-        best=tuple("none" for _ in columns),
-        rows=rows,
-        proposed=tuple(False for _ in rows),
-        cells=tuple(
-            tuple(as_recorded(CellEntry(published=line.published), line) for line in row)
-            for row in lines
-        ),
-        orders={name: (rho, 0) for name, rho in recorded.orders.items()},
-        notes=("Its file is gone: values as recorded, without intervals.", *recorded.remarks),
-        command=_command(recorded),
-        extra=recorded.extra,
+        # As recorded, like the sizes of networks: how the values were made is not known.
+        columns=tuple(Column(name=name, best="none", parameters=True) for name in columns),
+        rows=tuple(Row(label=row, experiment="", values=printed[row]) for row in rows),
+        remarks=("Its file is gone: values as recorded, without intervals.",),
     )

@@ -11,22 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sweeps.report import drawing
-from sweeps.report.axes import used_parameters
-from sweeps.report.study_data import Importances, StudyData
+from sweeps.report.study_data import Importances, StudyData, used_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_CONTOUR_TRIALS = 4
 """Fewest trials with both parameters from which a surface is drawn."""
-
-
-CONTOUR_STYLE: Any = {
-    "figure.figsize": (7.0, 5.2),
-    "figure.dpi": 110,
-    "figure.constrained_layout.use": True,
-}
 
 
 @dataclass(frozen=True)
@@ -71,20 +65,22 @@ def draw(data: StudyData, shares: Importances, folder: Path) -> list[StudyFigure
     return pictures
 
 
-FigureMaker = tuple[str, str, str, "Callable[[], Figure]"]
-
-
-def _figures(data: StudyData, shares: Importances) -> Iterator[FigureMaker]:
+def _figures(
+    data: StudyData, shares: Importances
+) -> Iterator[tuple[str, str, str, Callable[[], Figure]]]:
     """(file name, title, why it cannot be drawn or "", function) for this kind of study."""
     if data.kind == "list":
         return
     incomplete = "" if data.complete else "no trial is complete yet."
     if data.kind == "search":
-        history = partial(drawing.history, data)
-        yield "history", "Objectives by trial", incomplete, history
-        intermediate = partial(drawing.intermediate, data)
-        reason = _without_reports(data)
-        yield "intermediate", "Validation while training", reason, intermediate
+        yield "history", "Objectives by trial", incomplete, partial(drawing.history, data)
+        reason = ""
+        if len(data.metrics) > 1:
+            reason = "trials with several objectives report no values while they train."
+        elif not any(trial.intermediate_values for trial in data.trials):
+            reason = "no trial has reported a value while it trained."
+        make = partial(drawing.intermediate, data)
+        yield "intermediate", "Validation while training", reason, make
     unimportant = "" if shares.shares else shares.remark
     bars = partial(drawing.importance_bars, data, shares)
     yield "importances", "Importance of the parameters", unimportant, bars
@@ -93,28 +89,17 @@ def _figures(data: StudyData, shares: Importances) -> Iterator[FigureMaker]:
     no_values = incomplete
     if data.complete and not used_parameters(data):
         no_values = "the complete trials have no parameters."
-    lines = partial(drawing.parallel, data)
+    lines = partial(by_optuna, data, "plot_parallel_coordinate", 0)
     yield "parallel", "Parallel coordinates, dark lines are best", no_values, lines
     for index, metric in enumerate(data.metrics):
         end = "" if len(data.metrics) == 1 else "_" + re.sub(r"\W+", "_", metric)
-        slices = partial(drawing.slices, data, index)
+        slices = partial(by_optuna, data, "plot_slice", index)
         yield f"slices{end}", f"{metric} over each parameter", no_values, slices
-        names = _most_important(shares, index)
+        # The two most important parameters for this objective.
+        names = sorted(shares.shares, key=lambda name: -shares.shares[name][index])[:2]
         reason = _without_contour(data, shares, names, index)
-        contour = partial(_contour, data, names, index)
+        contour = partial(by_optuna, data, "plot_contour", index, params=names)
         yield f"contour{end}", f"{metric} over two parameters", reason, contour
-
-
-def _most_important(shares: Importances, index: int) -> list[str]:
-    """The two most important parameters for one objective."""
-    return sorted(shares.shares, key=lambda name: -shares.shares[name][index])[:2]
-
-
-def _without_reports(data: StudyData) -> str:
-    if len(data.metrics) > 1:
-        return "trials with several objectives report no values while they train."
-    has_reports = any(trial.intermediate_values for trial in data.trials)
-    return "" if has_reports else "no trial has reported a value while it trained."
 
 
 def _without_contour(data: StudyData, shares: Importances, names: list[str], index: int) -> str:
@@ -134,21 +119,33 @@ def _without_contour(data: StudyData, shares: Importances, names: list[str], ind
     return ""
 
 
-def _contour(data: StudyData, names: list[str], index: int) -> Figure:
+def by_optuna(data: StudyData, function: str, index: int, **options: Any) -> Figure:
+    """A figure of `optuna.visualization.matplotlib` for one objective.
+
+    Args:
+        data: the study.
+        function: its name.
+        index: of the objective.
+        options: of the function.
+    """
     import optuna
     from matplotlib import pyplot
 
     # Optuna draws with pyplot, which would open a window, and changes its style for good.
     pyplot.switch_backend("agg")
-    with pyplot.rc_context(CONTOUR_STYLE), warnings.catch_warnings():
+    # Optuna's slices are half as wide as a figure each.
+    size = (5.4, 3.4) if function == "plot_slice" else (8.0, 5.2)
+    style: Any = {"figure.dpi": 110, "figure.constrained_layout.use": True, "figure.figsize": size}
+    with pyplot.rc_context(style), warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        axis: Any = optuna.visualization.matplotlib.plot_contour(
-            data.copy(),
-            params=names,
-            target=lambda trial: trial.values[index],
-            target_name=data.metrics[index],
+        warnings.filterwarnings("ignore", "Attempting to set identical")  # of one trial
+        draw_function = getattr(optuna.visualization.matplotlib, function)
+        made = draw_function(
+            data.of_objective(index, with_others=function == "plot_parallel_coordinate"),
+            target_name=data.direction(index),
+            **options,
         )
-        drawing.adjust_contour(axis, data, index)
-    figure: Figure = axis.figure
+        figure: Figure = np.ravel(made)[0].figure
+        np.ravel(made)[0].set_title("")
     pyplot.close(figure)
     return figure

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rgbt.tracking.mlflow_server import pages_of
 from rgbt.tracking.mlflow_store import MlflowTracking
@@ -57,15 +57,20 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
     """
     if not isinstance(tracking, MlflowTracking):
         return []
-    every = {"kind": kind, RECORD: name, "mlflow.note.content": _cut(note), **tags}
+    if len(note) > NOTE_LENGTH:
+        more = "\n\n(the rest is in the artifacts)\n"
+        note = note[: NOTE_LENGTH - len(more)].rpartition("\n")[0] + more
+    every = {"kind": kind, RECORD: name, "mlflow.note.content": note, **tags}
     try:
-        from mlflow.entities import RunTag
+        from mlflow.entities import Metric, RunTag
 
         store = tracking.store()
         run_id = _run(store, name)
+        now = round(1000 * time.time())
+        named = {re.sub(r"[^\w\-. :/]", "_", each): value for each, value in metrics.items()}
         store.client.log_batch(
             run_id,
-            metrics=_metrics(metrics),
+            metrics=[Metric(n, value, now, 0) for n, value in named.items() if isfinite(value)],
             tags=[RunTag(key, value) for key, value in every.items()],
         )
         for path in files:
@@ -106,19 +111,3 @@ def _oldest(store: MlflowStore, name: str) -> str | None:
         max_results=1,
     )
     return str(runs[0].info.run_id) if runs else None
-
-
-def _metrics(metrics: Mapping[str, float]) -> list[Any]:
-    from mlflow.entities import Metric
-
-    now = round(1000 * time.time())
-    named = {re.sub(r"[^\w\-. :/]", "_", name): value for name, value in metrics.items()}
-    return [Metric(n, value, now, 0) for n, value in named.items() if math.isfinite(value)]
-
-
-def _cut(note: str) -> str:
-    """The note, cut at the end of a line where it is too long."""
-    if len(note) <= NOTE_LENGTH:
-        return note
-    more = "\n\n(the rest is in the artifacts)\n"
-    return note[: NOTE_LENGTH - len(more)].rpartition("\n")[0] + more

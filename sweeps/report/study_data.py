@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rgbt.config.compose import PIXELS, with_pixels
 from sweeps import attributes
 
@@ -74,11 +76,16 @@ class StudyData:
     @cached_property
     def front(self) -> list[FrozenTrial]:
         """The Pareto front, best first objective first; with one objective its best trials."""
+        import optuna
+
         if not self.complete:
             return []
+        study = optuna.create_study(
+            directions=["maximize" if up else "minimize" for up in self.maximize]
+        )
+        study.add_trials(self.complete)
         # The copy has the complete trials alone, so that its numbers are indices of our list.
-        best = [self.complete[trial.number] for trial in self.copy().best_trials]
-        return sorted(best, key=self.rank)
+        return sorted((self.complete[best.number] for best in study.best_trials), key=self.rank)
 
     @cached_property
     def latest(self) -> list[FrozenTrial]:
@@ -90,15 +97,37 @@ class StudyData:
         """Sorts complete trials by their first objective, best first, then by number."""
         return (-1.0 if self.maximize[0] else 1.0) * trial.values[0], trial.number
 
-    def copy(self) -> optuna.Study:
-        """A study in memory of the complete trials, numbered anew, for Optuna's own functions."""
-        import optuna
+    def of_objective(self, index: int, *, with_others: bool = False) -> optuna.Study:
+        """The complete trials in memory with one objective and parameters as shown.
 
-        way = optuna.study.StudyDirection
-        directions = [way.MAXIMIZE if up else way.MINIMIZE for up in self.maximize]
-        study = optuna.create_study(directions=directions)
-        study.add_trials(self.complete)
+        Args:
+            index: of the objective.
+            with_others: the other objectives are parameters.
+        """
+        import optuna
+        from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+        study = optuna.create_study(direction="maximize" if self.maximize[index] else "minimize")
+        others = [i for i in range(len(self.metrics)) if with_others and i != index]
+        for trial in self.complete:
+            params, kinds = dict(trial.params), dict(trial.distributions)
+            for name, kind in trial.distributions.items():
+                if isinstance(kind, CategoricalDistribution):
+                    params[name] = self.shown(params[name])
+                    kinds[name] = CategoricalDistribution(tuple(map(self.shown, kind.choices)))
+            for other in others:
+                column = [each.values[other] for each in self.complete]
+                params[self.metrics[other]] = trial.values[other]
+                kinds[self.metrics[other]] = FloatDistribution(min(column), max(column))
+            value = trial.values[index]
+            study.add_trial(
+                optuna.trial.create_trial(value=value, params=params, distributions=kinds)
+            )
         return study
+
+    def direction(self, index: int) -> str:
+        """An objective as the title of an axis."""
+        return f"{self.metrics[index]} ({'higher' if self.maximize[index] else 'lower'} is better)"
 
     def shown(self, value: object) -> str:
         """A parameter's value as shown."""
@@ -127,6 +156,11 @@ def read(study: optuna.Study) -> StudyData:
         trials=tuple(t for t in trials if not t.user_attrs.get(attributes.DROPPED)),
         command=str(notes.get(attributes.COMMAND, "")),
     )
+
+
+def used_parameters(data: StudyData) -> list[str]:
+    """Parameters that some complete trial has."""
+    return [n for n in data.distributions if any(n in trial.params for trial in data.complete)]
 
 
 def short_names(names: Collection[str]) -> dict[str, str]:
@@ -185,47 +219,33 @@ def importances(data: StudyData) -> Importances:
     varied = [name for name in values if len(values[name]) > 1]
     if not varied:
         return Importances({}, "no parameter took two values.")
-    by_objective = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
-    remark = " ".join(_remarks(data, varied, by_objective))
-    shares = {name: tuple(shares[name] for shares in by_objective) for name in varied}
-    if all(math.isnan(share) for of_objectives in shares.values() for share in of_objectives):
+    found = [_of_objective(data, index, varied) for index in range(len(data.metrics))]
+    shares = {name: tuple(each[name] for each in found) for name in varied}
+    constant = ", ".join(name for name in data.distributions if name not in varied)
+    flat = [data.metrics[i] for i, each in enumerate(found) if math.isnan(each[varied[0]])]
+    remark = " ".join(
+        [
+            *([f"{constant}: one value only, left out."] if constant else []),
+            *([f"{', '.join(flat)}: the same value in all trials."] if flat else []),
+            *([f"rough: {count} complete trials, {ADVISED} are advised."] * (count < ADVISED)),
+        ]
+    )
+    if len(flat) == len(data.metrics):
         return Importances({}, remark)
-    ordered = dict(sorted(shares.items(), key=lambda item: _descending(item[1])))
-    return Importances(ordered, remark)
-
-
-def _descending(shares: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(0.0 if math.isnan(share) else -share for share in shares)
+    order = sorted(varied, key=lambda name: [-np.nan_to_num(share) for share in shares[name]])
+    return Importances({name: shares[name] for name in order}, remark)
 
 
 def _of_objective(data: StudyData, index: int, names: list[str]) -> dict[str, float]:
+    """Shares for one objective; NaN where all trials have the same value."""
     import optuna
 
     if len({trial.values[index] for trial in data.complete}) == 1:
         return dict.fromkeys(names, math.nan)
-    sign = -1.0 if data.maximize[index] else 1.0
     with warnings.catch_warnings():
-        # The sign is right, and `_remarks` says how uncertain the shares are.
-        warnings.filterwarnings("ignore", "PedAnovaImportanceEvaluator computes", UserWarning)
+        # The remark says how uncertain the shares are.
         warnings.filterwarnings("ignore", "Some regimes for parameter", UserWarning)
-        return optuna.importance.get_param_importances(
-            data.copy(), params=names, target=lambda trial: sign * trial.values[index]
-        )
-
-
-def _remarks(data: StudyData, varied: list[str], by_objective: list[dict[str, float]]) -> list[str]:
-    constant = [name for name in data.distributions if name not in varied]
-    flat = [
-        metric
-        for metric, shares in zip(data.metrics, by_objective, strict=True)
-        if all(map(math.isnan, shares.values()))
-    ]
-    count = len(data.complete)
-    return [
-        *([f"{', '.join(constant)}: one value only, left out."] if constant else []),
-        *([f"{', '.join(flat)}: the same value in all trials."] if flat else []),
-        *([f"rough: {count} complete trials, {ADVISED} are advised."] if count < ADVISED else []),
-    ]
+        return optuna.importance.get_param_importances(data.of_objective(index), params=names)
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What was asked of the store, which is not read; the page is one line."""
     told: list[Any] = []
 
-    def fake(wanted: Any, track: Any) -> ReportData:
-        told.append(wanted)
+    def fake(*wanted: Any) -> ReportData:
+        *told[:], track = wanted
         assert list(track([1, 2], "something")) == [1, 2]
         return EMPTY
 
@@ -59,11 +59,11 @@ def test_it_says_where_the_page_is_and_what_it_holds(
     assert "holds  0 runs, 0 tables with runs, 0 published alone, 0 studies" in said
     assert err.count("rgbt: Remark ") == 5
     assert "2 more remarks stand on the page." in err
-    (wanted,) = asked
-    assert isinstance(wanted.tracking, MlflowTracking)
-    assert wanted.tracking.uri == "http://me:secret@host:5000"
-    assert (wanted.runs_dir, wanted.resamples) == (runs, 300)
-    assert wanted.command.startswith("rgbt report out=")
+    tracking, *others, command, trust = asked
+    assert isinstance(tracking, MlflowTracking)
+    assert tracking.uri == "http://me:secret@host:5000"
+    assert (others, trust) == ([runs, 300], ())
+    assert command.startswith("rgbt report out=")
 
 
 @pytest.mark.parametrize(

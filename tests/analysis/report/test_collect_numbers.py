@@ -14,10 +14,14 @@ from analysis.report import collect
 from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
 from analysis.report.store import MlflowRun
-from analysis.report.tables_cells import cell_of
-from analysis.report.tables_files import RecordedCell, RecordedTable
-from analysis.report.tables_intervals import CountsSource, Intervals
-from analysis.report.tables_scored import RescoredTable, interval_key, score_again, values_of
+from analysis.report.tables import cell_of, find_intervals
+from analysis.report.tables_recorded import (
+    CountsSource,
+    RecordedCell,
+    RecordedTable,
+    RescoredTable,
+    score_again,
+)
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -52,12 +56,10 @@ def test_variances_of_parts_are_no_percent() -> None:
 @pytest.mark.parametrize("absent", ["released", "exclude"])
 def test_intervals_score_absent_classes_as_the_table_does(absent: Any) -> None:
     runs = {f"k{seed}": run_of({}, seed, without_a_class(seed)) for seed in range(2)}
-    intervals, source = Intervals(runs), CountsSource(tuple(runs), (OWN_COUNTS,), absent)
-    intervals.request(source, "mIoU")
-    intervals.compute(200, quiet)
+    asked = (CountsSource(tuple(runs), (OWN_COUNTS,), absent), "mIoU")
     counts = [without_a_class(seed) for seed in range(2)]
     expected = estimate(counts, ["mIoU"], Resampling(resamples=200, absent=absent))["mIoU"]
-    assert intervals.found[source, "mIoU"].interval == expected.both
+    assert find_intervals([asked], runs, 200, quiet)[asked].interval == expected.both
 
 
 def test_differences_score_absent_classes_as_the_runs_do() -> None:
@@ -93,7 +95,7 @@ def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -
         lines={("A", column): line for column in ("mIoU", "rgb", "drop")},
         orders={},
     )
-    return RescoredTable(recorded, score_again(recorded, load_table(str(path)), runs))
+    return score_again(recorded, load_table(str(path)), runs)
 
 
 def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
@@ -106,7 +108,7 @@ def test_a_difference_of_columns_is_first_less_second(tmp_path: Path) -> None:
         "mIoU", counts_of(0), "released"
     )
     assert expected < 0
-    assert values_of(found, table.rows[0], drop, {"k0": run}) == pytest.approx((expected,))
+    assert found.values(table.rows[0], drop) == pytest.approx((expected,))
 
 
 def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
@@ -116,11 +118,11 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
     found = draft(tmp_path, 1, {"k0": run}, text)
     row, column = found.scored.table.rows[0], found.scored.table.columns[3]
     sides = [value("mIoU", counts_of(0, right), "released") for right in (0.5, 0.7)]
-    assert values_of(found, row, column, {"k0": run}) == pytest.approx((sum(sides) / 2,))
+    assert found.values(row, column) == pytest.approx((sum(sides) / 2,))
     assert found.scored.cells["A", "drop"].mean == pytest.approx(sum(sides) / 2)
-    assert interval_key(found, row, column) is None
+    assert found.interval_key(row, column) is None
     missing = draft(tmp_path, 1, {"k0": run_of({}, 0, counts_of(0))}, text)
-    assert values_of(missing, row, column, {"k0": run_of({}, 0, counts_of(0))}) == (None,)
+    assert missing.values(row, column) == (None,)
 
 
 def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> None:
@@ -132,16 +134,15 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
         ("C", "TC"): RecordedCell(None, None, 0, None, "", ()),
     }
     recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
-    scored = score_again(recorded, load_table(str(path)), {})
-    found = RescoredTable(recorded, scored)
-    assert {place: cell.mean for place, cell in scored.cells.items()} == {
+    found = score_again(recorded, load_table(str(path)), {})
+    assert {place: cell.mean for place, cell in found.scored.cells.items()} == {
         ("A", "TC"): 54.36,
         ("B", "TC"): 44.56,
     }
-    row, column = scored.table.rows[0], scored.table.columns[-1]
-    cell = cell_of(found, row, column, Intervals({}))
+    row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
+    cell = cell_of(found, row, column, {})
     assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 1, ())
-    assert interval_key(found, row, column) is None
+    assert found.interval_key(row, column) is None
 
 
 def pairs_of(seed: int) -> Counts:
@@ -152,7 +153,7 @@ def pairs_of(seed: int) -> Counts:
     return replace(single, counts=drawn.reshape(*size, 2, 2), partition="aligned1")
 
 
-def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path: Path) -> None:
+def test_column_of_frames_is_scored_from_its_file(tmp_path: Path) -> None:
     runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
     for seed, run in enumerate(runs.values()):
         run._evaluations["evaluations/consistency_aligned_test.npz"] = pairs_of(seed)
@@ -161,30 +162,28 @@ def test_a_column_of_two_frames_is_scored_from_the_file_of_its_protocol(tmp_path
     found = draft(tmp_path, 2, runs, text)
     row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
     expected = [value("class/car/TC", pairs_of(seed), "released") for seed in range(2)]
-    assert values_of(found, row, column, runs) == ()  # recorded without the column
+    assert found.values(row, column) == ()  # recorded without the column
     assert found.scored.cells["A", "TC"].mean == pytest.approx(sum(expected) / 2)
-    asked = interval_key(found, row, column)
+    asked = found.interval_key(row, column)
     source = CountsSource(("k0", "k1"), ("evaluations/consistency_aligned_test.npz",), None)
     assert asked == (source, "class/car/TC")
-    intervals = Intervals(runs)
-    intervals.request(*asked)
-    intervals.compute(200, quiet)
     wanted = estimate(
         [pairs_of(seed) for seed in range(2)], ["class/car/TC"], Resampling(resamples=200)
     )
-    assert intervals.found[asked].interval == wanted["class/car/TC"].both
+    found_interval = find_intervals([asked], runs, 200, quiet)[asked]
+    assert found_interval.interval == wanted["class/car/TC"].both
 
 
-def test_a_cell_that_lacks_a_recorded_seed_has_no_interval(tmp_path: Path) -> None:
+def test_cell_without_a_recorded_seed_has_no_interval(tmp_path: Path) -> None:
     runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
     table = draft(tmp_path, 2, runs).scored.table
     row, column = table.rows[0], table.columns[0]
-    assert interval_key(draft(tmp_path, 2, runs), row, column) is not None
-    assert interval_key(draft(tmp_path, 3, runs), row, column) is None
+    assert draft(tmp_path, 2, runs).interval_key(row, column) is not None
+    assert draft(tmp_path, 3, runs).interval_key(row, column) is None
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_a_run_that_is_there_twice_the_finished_one_is_shown(
+def test_run_stored_twice_is_shown_finished(
     order: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one: MlflowRun = stored(files_of(tmp_path), rgbt__key="k0")

@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.report import masks
+from analysis.report import masks, tables
 from analysis.report.data import RunEntry
 from analysis.report.differences import Choice, Side, find_pairs, load_choices
 from analysis.report.masks import data_address, mask_pictures, maskers_in_use
 from analysis.report.runs import ReportRun
-from analysis.report.runs_provenance import host_of, read_provenance, repeat_command
+from analysis.report.runs_provenance import read_provenance, repeat_command
 from analysis.report.store import MlflowRun, RunFiles
 from analysis.report.studies import pareto_front, read_study
-from analysis.report.tables_files import read_recorded, reproduce_command
+from analysis.report.tables_recorded import CSV_FILE, read_recorded, reproduce_command
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.provenance import commit_of
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
 from tests.composed import composed as configuration
 
@@ -42,10 +41,9 @@ def stored(files: RunFiles, **tags: str) -> MlflowRun:
 
 def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) -> ReportRun:
     """A run with that configuration, by dotted key."""
+    texts = ("name", "run_id", "commit", "started", "command", "repeat", "host", "dataset")
     entry = RunEntry(
         key=f"k{seed}",
-        name="",
-        run_id="",
         status="FINISHED",
         experiment="grbm",
         scale="demo",
@@ -53,21 +51,10 @@ def run_of(config: dict[str, Any], seed: int = 0, counts: Counts | None = None) 
         group=str(config.get("group", "grbm")),
         studies=(),
         table_rows={},
-        split="test",
-        partition="ring2",
-        classes=(),
         scores={},
-        region_ious=(),
-        class_region_ious=(),
-        images=12,
-        commit="",
-        started="",
         seconds=None,
-        command="",
-        repeat="",
-        host="",
-        dataset="",
         config={},
+        **dict.fromkeys(texts, ""),
     )
     return ReportRun(
         entry=entry,
@@ -113,17 +100,6 @@ def test_a_run_is_repeated_with_its_own_overrides(command: str, expected: str) -
     assert repeat_command(command, config, GRID) == expected
 
 
-def test_a_machine_is_named_by_its_devices() -> None:
-    assert host_of({"host": "desk", "gpus": ["H100", "H100"], "cpu": "x"}) == "desk: H100, H100"
-    assert host_of({}) == ""
-
-
-def test_a_commit_says_whether_it_was_clean() -> None:
-    assert commit_of({"git_commit": "0123456789abc", "git_dirty": True}) == "0123456789+"
-    assert commit_of({"git_commit": "0123456789abc", "git_dirty": False}) == "0123456789"
-    assert commit_of({"git_commit": None, "git_dirty": None}) == ""
-
-
 def test_a_run_continued_by_other_code_is_told(tmp_path: Path) -> None:
     remarks: list[str] = []
     text = '[{"git_commit": "aaa"}, {"git_commit": "bbb", "git_dirty": true}]'
@@ -161,46 +137,36 @@ def test_a_point_without_parameters_is_called_by_its_label(tmp_path: Path) -> No
     assert study.command == ""
 
 
-@pytest.mark.parametrize(
-    ("texts", "sentence"),
-    [
-        ({}, "does not name the objectives"),
-        ({"study__md": MARKDOWN}, "has no trials.csv"),
-        ({"study__md": MARKDOWN, "trials__csv": "trial,state\n"}, "lacks the column 'label'"),
-        (
-            {"study__md": MARKDOWN, "trials__csv": TRIALS.replace("5.5", "high")},
-            "is damaged",
-        ),
-        (
-            {"study__md": MARKDOWN, "trials__csv": TRIALS.splitlines()[0] + "\n0,complete\n"},
-            "is damaged",
-        ),
-    ],
-)
-def test_a_damaged_study_is_one_sentence(
-    tmp_path: Path, texts: dict[str, str], sentence: str
-) -> None:
-    with pytest.raises(InputError, match=sentence):
-        read_study(stored(files_of(tmp_path, **texts), rgbt__study="s"))
-
-
 HEADER = "table,row,column,mean,sd,n,published,difference,reason,runs\n"
 
 
 @pytest.mark.parametrize(
-    ("texts", "sentence"),
+    ("read", "texts", "sentence"),
     [
-        ({}, "has no table.csv in the store"),
-        ({"table__csv": "table,row\n"}, "lacks the column 'column'"),
-        ({"table__csv": HEADER + "t,A,x,high,,1,,,,k\n"}, "is damaged"),
-        ({"table__csv": HEADER + "t,A,x\n"}, "is damaged"),
+        (read_study, {}, "does not name the objectives"),
+        (read_study, {"study__md": MARKDOWN}, "has no trials.csv"),
+        (read_study, {"study__md": MARKDOWN, "trials__csv": "trial,state\n"}, "the column 'label'"),
+        (
+            read_study,
+            {"study__md": MARKDOWN, "trials__csv": TRIALS.replace("5.5", "high")},
+            "is damaged",
+        ),
+        (
+            read_study,
+            {"study__md": MARKDOWN, "trials__csv": TRIALS.splitlines()[0] + "\n0,complete\n"},
+            "is damaged",
+        ),
+        (read_recorded, {}, "has no table.csv in the store"),
+        (read_recorded, {"table__csv": "table,row\n"}, "lacks the column 'column'"),
+        (read_recorded, {"table__csv": HEADER + "t,A,x,high,,1,,,,k\n"}, "is damaged"),
+        (read_recorded, {"table__csv": HEADER + "t,A,x\n"}, "is damaged"),
     ],
 )
-def test_a_damaged_table_is_one_sentence(
-    tmp_path: Path, texts: dict[str, str], sentence: str
+def test_damaged_record_is_one_sentence(
+    tmp_path: Path, read: Any, texts: dict[str, str], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
-        read_recorded(stored(files_of(tmp_path, **texts)))
+        read(stored(files_of(tmp_path, **texts), rgbt__study="s"))
 
 
 @pytest.mark.parametrize(
@@ -238,7 +204,7 @@ def test_choices_are_settings_that_differ_in_their_keys_alone(choice: Choice) ->
 CHOICE = Choice("t", "s", (), Side("a.x=1", {"a.x": 1}, ""), Side("a.x=2", {"a.x": 2}, ""))
 
 
-def test_pairs_differ_by_the_choice_and_what_is_no_part_of_a_run() -> None:
+def test_pairs_differ_by_the_choice_alone() -> None:
     same = {"model.width": 4, "tracking.uri": "here", "dataset.root": "/a"}
     elsewhere = {"model.width": 4.0, "tracking.uri": "there", "dataset.root": "/b"}
     paper = [run_of({"a.x": 1, **same}, seed) for seed in (1, 0)]
@@ -282,7 +248,7 @@ def test_maskers_are_told_apart_by_their_settings() -> None:
     assert found[0].masker["sigma_div"] == 2.0
 
 
-def test_masks_of_a_data_set_that_is_elsewhere_are_drawn_on_the_embedded_one() -> None:
+def test_masks_of_missing_data_use_embedded_images() -> None:
     config = masked_config()
     away = {"dataset._target_": "rgbt.data.mfnet.MFNet", "dataset.root": "/nowhere"}
     gone = {key: v for key, v in config.items() if not key.startswith("dataset.")} | away
@@ -307,9 +273,7 @@ def test_a_hostile_artifact_is_a_remark_and_runs_nothing(group: str, tmp_path: P
     assert not (tmp_path / "marker").exists()
 
 
-def test_a_masker_of_ones_own_is_drawn_where_it_is_trusted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_own_masker_is_drawn_where_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_maskers.py").write_text(
         "from rgbt.maskers.masker import Masker\n\nclass Mine(Masker):\n    pass\n"
     )
@@ -340,3 +304,33 @@ def test_pictures_stay_small_whatever_they_show() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (320, 640, 3), dtype=np.uint8)
     assert len(data_address(noise)) <= 4 * masks.MOST_BYTES / 3 + 30
     assert data_address(np.zeros((8, 8, 3), np.uint8)).startswith("data:image/webp;base64,")
+
+
+@pytest.mark.parametrize("name", ["spatialseg/table3", "gone/t"])
+def test_overrides_of_a_table_stand_beside_its_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "table_names", lambda: ["spatialseg/table3"])
+    said = {
+        "plain": "- A remark.\n",
+        "short": "- Every row of ours was run with trainer.max_steps=9 loss.spatial.alpha=1.\n",
+    }
+    records = [
+        MlflowRun(
+            run_id=variant,
+            name=f"{name} demo",
+            status="FINISHED",
+            started="",
+            seconds=None,
+            tags={"rgbt.table": name, "rgbt.scale": "demo", "rgbt.seeds": "0"},
+            params={},
+            metrics={},
+            files=files_of(tmp_path / variant, **{CSV_FILE: csv, "table.md": text}),
+        )
+        for variant, text in said.items()
+        for csv in [HEADER + f"{name},Ny/4,mIoU,50.0,,1,61.5,,,aa0\n"]
+    ]
+    remarks: list[str] = []
+    made = tables.table_entries(records, {}, 100, quiet, remarks)
+    extras = [each.extra for each in made if each.name == name]
+    assert extras == ["", "trainer.max_steps=9 loss.spatial.alpha=1"]

@@ -19,7 +19,7 @@ def read(runs_dir: Path, uri: str | None = None) -> list[MlflowRun]:
     return read_store(MlflowTracking(uri, **given), runs_dir, runs_dir)
 
 
-def test_a_store_that_is_not_there_is_refused_and_not_made(tmp_path: Path) -> None:
+def test_missing_store_is_refused_and_not_made(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"there is no MLflow store .*mlflow\.db"):
         read(tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -58,7 +58,5 @@ def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for entries in ("table_entries", "study_entries", "mask_pictures", "difference_entries"):
         monkeypatch.setattr(collecting, entries, lambda *_: ())
     tracking = MlflowTracking("sqlite:///x", artifact_uri=None, experiment="r", runs_dir="x")
-    data = collecting.collect(
-        collecting.ReportRequest(tracking, tmp_path, 1, ""), lambda things, _: list(things)
-    )
+    data = collecting.collect(tracking, tmp_path, 1, "", (), lambda things, _: list(things))
     assert [run.run_id for run in data.runs] == ["new"]

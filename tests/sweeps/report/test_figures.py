@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,10 +14,9 @@ import pytest
 from optuna.trial import TrialState
 
 from sweeps import attributes
-from sweeps.report.axes import Dimension, dimension
-from sweeps.report.drawing import history, intermediate, pareto, slices
-from sweeps.report.figures import StudyFigure, _contour, _most_important, _without_contour, draw
-from sweeps.report.study_data import Importances, importances, read
+from sweeps.report.drawing import history, intermediate, pareto
+from sweeps.report.figures import StudyFigure, by_optuna, draw
+from sweeps.report.study_data import Importances, StudyData, importances, read
 
 NONE = "no trial is complete yet."
 
@@ -85,13 +85,15 @@ def test_two_objectives_have_a_front_and_slices_each(tmp_path: Path) -> None:
         assert is_picture(found[name].path)
 
 
-def test_contour_leaves_the_style_of_others_alone() -> None:
+def test_optuna_figure_leaves_style_of_others_alone() -> None:
     import matplotlib
     from matplotlib import pyplot
 
     before = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
-    data = read(filled("maximize"))
-    assert _contour(data, _most_important(importances(data), 0), 0).axes
+    names = ["optimizer.lr", "masker.patch_size"]
+    axis = by_optuna(read(filled("maximize")), "plot_contour", 0, params=names).axes[0]
+    scales = {axis.get_xlabel(): axis.get_xscale(), axis.get_ylabel(): axis.get_yscale()}
+    assert scales == {"optimizer.lr": "log", "masker.patch_size": "linear"}
     after = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     assert after == before
     assert pyplot.get_fignums() == []
@@ -143,29 +145,33 @@ def test_constant_parameter_and_constant_objective(tmp_path: Path) -> None:
     assert found["contour"].reason.endswith("no parameter took two values.")
 
 
-def test_contour_of_parameters_that_never_meet_says_so() -> None:
+def test_contour_of_parameters_that_never_meet_says_so(tmp_path: Path) -> None:
     study = new_study("maximize")
     for index in range(20):
         trial = study.ask()
         value = trial.suggest_float("a" if index % 2 else "b", 0, 1)
         study.tell(trial, value)
-    data = read(study)
-    shares = importances(data)
-    reason = _without_contour(data, shares, _most_important(shares, 0), 0)
+    reason = drawn(study, tmp_path)["contour"].reason
     assert reason in (f"only 0 complete trials have both {x} and {y}." for x, y in ("ab", "ba"))
 
 
-def test_contour_uses_two_most_important_parameters() -> None:
+def test_contour_uses_two_most_important_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def fake(data: StudyData, function: str, index: int, **options: Any) -> Any:
+        if function == "plot_contour":
+            asked.append((index, options["params"]))
+        return history(data)
+
+    monkeypatch.setattr("sweeps.report.figures.by_optuna", fake)
     shares = {"optimizer.lr": (0.6, 0.1), "masker.patch_size": (0.3, 0.4), "masker": (0.1, 0.5)}
-    data = read(filled("maximize", "minimize"))
-    wanted = ({"optimizer.lr", "masker.patch_size"}, {"masker.patch_size", "masker"})
-    for index, names in enumerate(wanted):
-        figure = _contour(data, _most_important(Importances(shares, ""), index), index)
-        axis = figure.axes[0]
-        assert {axis.get_xlabel(), axis.get_ylabel()} == names
-        if "optimizer.lr" in names:
-            scales = {axis.get_xlabel(): axis.get_xscale(), axis.get_ylabel(): axis.get_yscale()}
-            assert scales == {"optimizer.lr": "log", "masker.patch_size": "linear"}
+    draw(read(filled("maximize", "minimize")), Importances(shares, ""), tmp_path)
+    assert asked == [
+        (0, ["optimizer.lr", "masker.patch_size"]),
+        (1, ["masker", "masker.patch_size"]),
+    ]
 
 
 def test_a_list_has_no_figures(tmp_path: Path) -> None:
@@ -211,29 +217,39 @@ def test_intermediate_distinguishes_trial_states() -> None:
 
 
 def test_slices_have_one_panel_per_parameter() -> None:
-    panels = {axis.get_xlabel(): axis for axis in slices(read(filled("maximize")), 0).axes}
-    assert panels["optimizer.lr (log)"].get_xscale() == "log"
+    axes = by_optuna(read(filled("maximize")), "plot_slice", 0).axes
+    panels = {axis.get_xlabel(): axis for axis in axes}
+    assert panels["optimizer.lr"].get_xscale() == "log"
     assert panels["masker.patch_size"].get_xscale() == "linear"
-    assert [text.get_text() for text in panels["masker"].get_xticklabels()] == ["grbm", "none"]
+    assert axes[0].get_ylabel() == "objective 1 (higher is better)"
 
 
-def test_dimensions_scale_to_their_own_range() -> None:
-    # log10 of 0.1, 1, 10 is -1, 0, 1; a category is its place; NaN stays.
-    assert Dimension("x", (0.1, 1.0, 10.0), is_log=True).positions().tolist() == [0.0, 0.5, 1.0]
-    assert Dimension("x", (2.0, 3.0, 6.0)).positions().tolist() == [0.0, 0.25, 1.0]
-    assert Dimension("x", (3.0, 3.0)).positions().tolist() == [0.5, 0.5]
-    chosen = Dimension("c", (2.0, math.nan), categories=("a", "b", "c"))
-    assert chosen.positions()[0] == 1.0
-    assert math.isnan(chosen.positions()[1])
-    assert chosen.ticks() == [(0.0, "a"), (0.5, "b"), (1.0, "c")]
-    ticks = Dimension("x", (0.1, 10.0), is_log=True).ticks()
-    assert (0.5, "1") in [(round(position, 6), text) for position, text in ticks]
+def test_parallel_coordinates_have_all_objectives_and_conditional_parameters() -> None:
+    data = read(filled("maximize", "minimize"))
+    axis = by_optuna(data, "plot_parallel_coordinate", 0).axes[0]
+    names = [label.get_text() for label in axis.get_xticklabels()]
+    assert sorted(names[1:]) == [
+        "masker",
+        "masker.patch_size",
+        "masker.sigma_div",
+        "objective 2",
+        "optimizer.lr",
+    ]
 
 
-def test_dimension_unset_conditional_parameter_is_nan() -> None:
-    data = read(filled("maximize"))
-    values = dimension(data, "masker.sigma_div").values
-    masker = dimension(data, "masker")
-    assert masker.categories == ("grbm", "none")
-    assert [math.isnan(value) for value in values] == [value == 1.0 for value in masker.values]
-    assert dimension(data, "masker.patch_size").is_integer
+def test_study_of_one_objective_has_shown_parameters() -> None:
+    study = new_study("maximize", "minimize")
+    sizes = ["${px:64}", "${px:8}"]
+    for size in sizes:
+        study.enqueue_trial({"masker.patch_size": size})
+        trial = study.ask()
+        trial.suggest_categorical("masker.patch_size", sizes)
+        trial.set_user_attr(attributes.PIXELS, 0.5)
+        study.tell(trial, [1.0, len(size)])
+    second = read(study).of_objective(1)
+    assert second.direction.name == "MINIMIZE"
+    assert [trial.value for trial in second.trials] == [8.0, 7.0]
+    assert [trial.params for trial in second.trials] == [
+        {"masker.patch_size": "32"},
+        {"masker.patch_size": "4"},
+    ]
