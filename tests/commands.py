@@ -83,6 +83,6 @@ def assert_one_sentence(err: str, sentence: str) -> None:
 
 def code_of(entry: Any, words: list[str]) -> int:
     """Exit code of a command with options of its own."""
-    from rgbt.config.reporting import exit_code
+    from rgbt.config.plain_command import exit_code
 
     return exit_code(lambda: entry.run(words))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.__main__ import help_text, main
-from rgbt.config.commands import COMMANDS
+from rgbt.config.plain_command import COMMANDS
 from rgbt.config.completion import BASH, OF_HYDRA, SCRIPTS, candidates
 from tests.commands import Call, assert_one_sentence
 

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from rgbt.build.load_run import open_run
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
-from rgbt.config.component import target_names
 from rgbt.config.compose import flatten
+from rgbt.config.stored_config import targets
 from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
@@ -139,7 +139,7 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     ]
     checkpoint = teacher.checkpoint.removesuffix(".pt")
     # Its configuration was composed by this command, so that its targets are the user's own.
-    trust = list(target_names(teacher.run.plain))
+    trust = list(targets(teacher.run.plain).values())
     session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
     write_pseudo_labels(
         session,

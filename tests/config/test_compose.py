@@ -10,7 +10,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import available, compose, groups, searching
-from rgbt.spec.upstream import parse_reference, upstream_config
+from rgbt.spec.specify import parse_reference, upstream_config
 
 OWN = """# @package _global_
 defaults:

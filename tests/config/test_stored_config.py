@@ -92,13 +92,13 @@ def test_what_shipped_configurations_name_is_allowed() -> None:
         check_targets({"masker": node("rgbt.data.kp.KP")}, (), "store", "masker")
     assert all(name.startswith("rgbt.") for name in shipped_targets())
     assert shipped_targets() >= {
-        str(target) for path in conf_dir().rglob("l*/*.yaml") for _, target in found_in(path)
+        str(target) for path in conf_dir().rglob("l*/*.yaml") for target in found_in(path)
     }
 
 
 def found_in(path: Path) -> Any:
     plain = OmegaConf.to_container(OmegaConf.load(path))
-    return [pair for pair in targets(plain) if str(pair[1]).startswith("rgbt.")]
+    return [each for each in targets(plain).values() if str(each).startswith("rgbt.")]
 
 
 def test_own_code_needs_trust_and_only_its_own_is_run(lab: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from rgbt.spec import upstream
 from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 from tests.composed import composed
@@ -26,7 +25,7 @@ DEPENDENT = (
 @pytest.fixture(autouse=True)
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of the time of these tests is composing the same again and again."""
-    monkeypatch.setattr(upstream, "compose", composed)
+    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
 
 
 def spec_of(experiment: str, *overrides: str) -> RunSpec:

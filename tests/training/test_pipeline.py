@@ -18,7 +18,6 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError, RunError
 from rgbt.files.atomic import holding
 from rgbt.metrics.counts import Counts
-from rgbt.spec import upstream
 from rgbt.spec.naming import TAGS, describe
 from rgbt.spec.run_spec import Dependency, RunSpec
 from rgbt.spec.specify import specify
@@ -31,7 +30,7 @@ from tests.composed import composed
 @pytest.fixture(autouse=True)
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of the time of these tests is composing the same again and again."""
-    monkeypatch.setattr(upstream, "compose", composed)
+    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
 
 
 @dataclass
