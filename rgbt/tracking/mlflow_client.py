@@ -77,7 +77,8 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
     make_client = quiet_client()  # imported before others wait for the lock
     with _alone(uri):
         client = make_client(tracking_uri=uri)
-        found = _experiment(client, experiment, artifact_uri)
+        found = client.get_experiment_by_name(experiment)
+        found = found or _created(client, experiment, artifact_uri)
     tags = {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}
     for name, value in tags.items():
         if found.tags.get(name) != value:
@@ -147,11 +148,8 @@ def _alone(uri: str) -> Iterator[None]:
         yield
 
 
-def _experiment(client: Any, name: str, artifact_uri: str | None) -> Any:
-    """The experiment of that name; another machine may be creating it at this moment."""
-    found = client.get_experiment_by_name(name)
-    if found is not None:
-        return found
+def _created(client: Any, name: str, artifact_uri: str | None) -> Any:
+    """A new experiment; another machine may be creating it at this moment."""
     try:
         client.create_experiment(name, artifact_location=artifact_uri)
     except Exception:
