@@ -51,14 +51,9 @@ def open_trained(
 ) -> TrainedNetwork:
     """The network of the run `run`; without one, that of `overrides` with `model.weights`.
 
-    Args:
-        run: folder, config key or MLflow run id; "" for none.
-        runs_dir: the folder of runs.
-        overrides: of the configuration of the run, or (without a run) of the configuration at
-            scale=paper, such as model=mfnet model.weights=final.pth dataset.root=/data/MFNet.
-        checkpoint: "best" or "last" of a run.
-        label_map: from the classes of the network to those of the data set, where they differ.
-        trust: see `open_run`.
+    A run is named by its folder, config key or MLflow run id. Without one ("") the overrides are of
+    the configuration at scale=paper, such as model=mfnet model.weights=final.pth
+    dataset.root=/data/MFNet. The other arguments are those of `open_run`.
 
     Raises:
         InputError: no such run; no weights; settings that do not fit.
