@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -72,6 +73,20 @@ def train(call: Call, data: Path, runs: Path, *overrides: str) -> tuple[int, str
 def only_run(runs: Path) -> Path:
     (result,) = runs.glob("*/result.json")
     return result.parent
+
+
+def logged(folder: Path, kind: str = "") -> list[dict[str, Any]]:
+    """Lines of ``metrics.jsonl``, of one kind or all."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if kind in ("", line["kind"])]
+
+
+def losses(folder: Path) -> list[dict[str, float]]:
+    """Losses by name of every training step."""
+    return [
+        {name: value for name, value in line["values"].items() if name.startswith("loss")}
+        for line in logged(folder, "train")
+    ]
 
 
 def assert_one_sentence(err: str, sentence: str) -> None:

@@ -29,30 +29,6 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
 
 
-@pytest.mark.parametrize(
-    "scale",
-    # Small ones are trained in other tests, or composed as rows of the tables.
-    [pytest.param("demo", marks=pytest.mark.slow), "paper"],
-)
-@pytest.mark.parametrize(
-    "experiment",
-    # tests/test_behaviour.py composes all of them, too.
-    [
-        pytest.param(name, marks=() if index % 4 == 0 else pytest.mark.slow)
-        for index, name in enumerate(options("experiment"))
-    ],
-)
-def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
-    rooted = ["dataset.root=unused"] if scale == "paper" else []
-    config = compose(f"+experiment={experiment}", f"scale={scale}", *rooted)
-    specify(config)
-    assert config.name == experiment
-    assert config.scale.pixel_factor == {"demo": 0.5, "paper": 1.0}[scale]
-    assert config.model.num_classes == config.dataset.num_classes
-    if scale == "paper":
-        assert config.recipe.dataset == config.dataset.name
-
-
 @pytest.fixture(scope="module")
 def default() -> DictConfig:
     """The whole configuration, of which one node at a time is exchanged."""
@@ -209,10 +185,6 @@ def test_a_missing_value_is_named_when_the_object_is_built() -> None:
 def test_flatten_gives_dotted_keys() -> None:
     config = OmegaConf.create({"a": {"b": 1, "c": [1, 2]}, "d": "${a.b}"})
     assert flatten(config) == {"a.b": 1, "a.c": [1, 2], "d": 1}
-
-
-def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
-    assert conf_dir() == Path(__file__).resolve().parents[2] / "conf"
 
 
 def test_paths_are_read_as_they_are_typed() -> None:

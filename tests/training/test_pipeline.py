@@ -119,25 +119,19 @@ def test_pipeline_teacher_of_a_teacher_is_trained_first(run: Pipeline) -> None:
     assert training.labels == [("thermal_teacher", "heatnet"), ("heatnet", "heatnet_rgb_only")]
 
 
-def test_pipeline_finished_upstream_runs_are_reused(run: Pipeline) -> None:
+def test_pipeline_finished_upstream_runs_are_reused(run: Pipeline, tmp_path: Path) -> None:
     run("multi_head_modified_night_init")
     again = run("multi_head_modified_night_init")
     assert (again.trained, again.validated, again.labels) == ([], [], [])
+    # Of an unfinished run only the direct upstream runs are needed.
+    kept = spec_of("multi_head_modified_night_init_stage1").key
+    copy = tmp_path.with_name("copy")
+    shutil.copytree(tmp_path / kept, copy / kept)
+    assert run("multi_head_modified_night_init", f"runs_dir={copy}").trained == []
     # Another run with the same upstream runs: its labels are predicted, nothing is trained.
     stage = run("multi_head_modified_night_init_stage1", "fresh=true")
     assert stage.trained == []
     assert stage.labels == [("thermal_teacher", "multi_head_modified_night_init_stage1")]
-
-
-def test_pipeline_needs_only_direct_upstream_of_an_unfinished_run(
-    run: Pipeline, tmp_path: Path
-) -> None:
-    run("multi_head_modified_night_init")
-    kept = spec_of("multi_head_modified_night_init_stage1").key
-    for folder in tmp_path.iterdir():
-        if folder.name != kept:
-            shutil.rmtree(folder)
-    assert run("multi_head_modified_night_init").trained == []
 
 
 def test_pipeline_finished_run_needs_no_upstream_run(run: Pipeline, tmp_path: Path) -> None:
@@ -145,14 +139,11 @@ def test_pipeline_finished_run_needs_no_upstream_run(run: Pipeline, tmp_path: Pa
     training = run("multi_head_night_stage1")
     assert (training.trained, training.validated, training.labels) == ([], [], [])
     assert list(training.tags) == ["multi_head_night_stage1"]
+    alone = run("sh_source")
+    assert (alone.trained, alone.validated) == ([], [])
 
 
-def test_pipeline_single_run_is_not_validated_twice(run: Pipeline) -> None:
-    training = run("sh_source")
-    assert (training.trained, training.validated) == ([], [])
-
-
-@pytest.mark.parametrize("name", ["thermal_teacher", "multi_head_night_stage1", "multi_head_night"])
+@pytest.mark.parametrize("name", ["thermal_teacher", "multi_head_night"])
 def test_pipeline_invalid_run_trains_nothing(run: Pipeline, name: str) -> None:
     training = Training(invalid=(name,))
     with pytest.raises(InputError) as raised:
@@ -168,16 +159,10 @@ def test_pipeline_invalid_run_trains_nothing(run: Pipeline, name: str) -> None:
     "error", [RunError("step 3: loss is nan."), InputError("no file."), KeyError()]
 )
 def test_pipeline_failed_upstream_run_ends_it(run: Pipeline, error: BaseException) -> None:
-    with pytest.raises(type(error)):
+    with pytest.raises(type(error)) as raised:
         run("sh_adversarial", training=Training(refused=[error]))
-
-
-def test_pipeline_error_names_the_upstream_run(run: Pipeline) -> None:
-    with pytest.raises(InputError) as raised:
-        run("multi_head_night", training=Training(refused=[InputError("no such file.")]))
-    assert str(raised.value) == (
-        "thermal_teacher, which is upstream of multi_head_night: no such file."
-    )
+    if isinstance(error, InputError):
+        assert str(raised.value) == "sh_source, which is upstream of sh_adversarial: no file."
 
 
 def test_upstream_run_is_named_as_a_run_of_its_own() -> None:
@@ -324,7 +309,6 @@ def test_pipeline_run_finished_by_another_process_is_used(run: Pipeline) -> None
     assert run("sh_adversarial", training=Late()).trained == []
 
 
-@pytest.mark.slow
 def test_evaluate_run_without_newer_settings_opens(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
@@ -335,12 +319,10 @@ def test_evaluate_run_without_newer_settings_opens(
     shutil.copytree(done, folder)
     stored = OmegaConf.load(folder / "config.yaml")
     del stored["domains"], stored["pretrained"], stored["trainer"]["tested"]
+    stored.trainer.threads = None  # a run of before it had a number
     OmegaConf.save(stored, folder / "config.yaml")
     code, _, err = call(evaluate.entry, f"run={folder}")
     assert code == 0, err
     (path,) = (folder / "evaluations").glob("*.npz")
     again, first = Counts.load(path), Counts.load(folder / "counts_test.npz")
     assert np.array_equal(again.counts, first.counts)
-    code, _, err = call(evaluate.entry, f"run={folder}", "head=source")
-    assert code == 2
-    assert "head=source chooses between the heads of two domains" in err
