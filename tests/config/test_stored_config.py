@@ -143,7 +143,7 @@ def test_a_stored_configuration_holds_resolved_values(plain: Any, reason: str) -
         settings_of(plain, "store")
 
 
-@pytest.mark.parametrize("experiment", ["grbm", "heatnet", "temporal_con", "cmx"])
+@pytest.mark.parametrize("experiment", ["grbm", "heatnet"])
 def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None:
     config = compose([f"+experiment={experiment}", "scale=paper"])
     (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True))

@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError, RunError
 from rgbt.files.atomic import holding
 from rgbt.metrics.counts import Counts
+from rgbt.run import main
 from rgbt.spec.naming import TAGS, describe
 from rgbt.spec.run_spec import Dependency, RunSpec
 from rgbt.spec.specify import specify
@@ -35,14 +36,10 @@ def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass
 class Training:
-    """In place of training and validation: notes the runs, and writes a result.
+    """In place of training and validation: notes names of runs in order, and writes a result.
 
-    Attributes:
-        trained: names of the runs upstream of the requested one, in order.
-        validated: names of the runs that were validated, in order.
-        labels: teacher and run of the pseudo-labels that were predicted.
-        refused: raised by the next trainings of upstream runs, one each.
-        invalid: names of the runs that do not pass validation.
+    `labels` are teacher and run of the pseudo-labels; `refused` is raised by the next trainings of
+    upstream runs, one each; runs that are `invalid` do not pass validation.
     """
 
     trained: list[str] = field(default_factory=list)
@@ -187,9 +184,8 @@ def test_fresh_names_upstream_runs_of_other_code(
     assert line.endswith("run +experiment=sh_source with fresh=true.")
 
 
-@pytest.mark.parametrize("state", ["missing", "begun", "finished"])
-def test_pipeline_unfinished_labels_are_validated_for(
-    run: Pipeline, tmp_path: Path, state: str
+def test_pipeline_predicts_and_validates_for_unfinished_labels(
+    run: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Predicting takes long: errors of the training after it are found before."""
     spec = spec_of("multi_head_night_stage1", f"runs_dir={tmp_path}")
@@ -197,67 +193,44 @@ def test_pipeline_unfinished_labels_are_validated_for(
     finish(teacher)
     folder = spec.labels_folder("target")
     assert folder is not None
-    if state != "missing":
-        folder.mkdir(parents=True)
-        name = {"begun": "pseudo_labels.begun.json", "finished": "pseudo_labels.json"}[state]
-        (folder / name).write_text("{}")
-    training = run("multi_head_night_stage1")
-    assert len(training.validated) == (0 if state == "finished" else 1)
-
-
-def test_pipeline_finished_labels_are_not_predicted_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spec = spec_of("multi_head_night_stage1", f"runs_dir={tmp_path}")
-    (teacher,) = spec.upstream
-    finish(teacher)
-    folder = spec.labels_folder("target")
-    assert folder is not None
     folder.mkdir(parents=True)
+    (folder / "pseudo_labels.begun.json").write_text("{}")
+    assert len(run("multi_head_night_stage1").validated) == 1
+    monkeypatch.undo()
 
     def opened(*given: Any, trust: Any) -> None:
         raise KeyError(given[0])
 
+    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
     monkeypatch.setattr(pipeline, "open_run", opened)
     monkeypatch.setattr(pipeline, "validate", lambda spec: None)
     monkeypatch.setattr(pipeline, "train", lambda spec, tags: None)
-    with pytest.raises(KeyError, match=folder.parent.parent.name):
+    with pytest.raises(KeyError, match=teacher.key):
         pipeline.run_pipeline(spec, {})
     (folder / "pseudo_labels.json").write_text("{}")
     pipeline.run_pipeline(spec, {})
+    assert run("multi_head_night_stage1").validated == []
 
 
-@pytest.mark.parametrize("experiment", ["sh_adversarial", "heatnet"])
-def test_run_ignored_pretrained_is_reported(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str
+def test_run_reports_ignored_pretrained_and_takes_tags_of_the_environment(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from rgbt import run
-
-    runs: list[str] = []
-    monkeypatch.setattr(pipeline, "run_pipeline", lambda spec, tags: runs.append(spec.name))
+    runs: list[tuple[str, Mapping[str, str]]] = []
+    monkeypatch.setattr(pipeline, "run_pipeline", lambda spec, tags: runs.append((spec.name, tags)))
+    monkeypatch.setenv(TAGS, '{"row": "1"}')
     file = tmp_path / "imagenet.pth"
     file.write_bytes(b"abc")
-    for typed in ([f"pretrained={file}"], []):
-        code, _, err = call(run.main, f"+experiment={experiment}", *typed)
+    for experiment in ("sh_adversarial", "heatnet"):
+        code, _, err = call(main, f"+experiment={experiment}", f"pretrained={file}")
         assert code == 0, err
         ignored = f"rgbt: pretrained={file} is ignored: heatnet does not start from it.\n"
-        assert err == (ignored if experiment == "heatnet" and typed else "")
-    assert runs == [experiment] * 2
+        assert err == (ignored if experiment == "heatnet" else "")
+    assert runs == [("sh_adversarial", {"row": "1"}), ("heatnet", {"row": "1"})]
 
 
 def test_pipeline_tags_belong_to_the_requested_run(run: Pipeline) -> None:
     training = run("sh_adversarial")
     assert training.tags == {"sh_source": None, "sh_adversarial": {"row": "1"}}
-
-
-def test_run_tags_come_from_the_environment(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rgbt import run
-
-    monkeypatch.setenv(TAGS, '{"row": "1"}')
-    tags: list[Mapping[str, str]] = []
-    monkeypatch.setattr(pipeline, "run_pipeline", lambda spec, given: tags.append(given))
-    assert call(run.main, "+experiment=grbm")[0] == 0
-    assert tags == [{"row": "1"}]
 
 
 @contextmanager
