@@ -38,24 +38,8 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
     """
     records = {node: record_of(component) for node, component in components.items()}
     failures = list(_failures(records))
-    if failures:
-        raise InputError(_sentence(failures, records, components, plain))
-
-
-def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
-    for node, record in records.items():
-        for requirement in record.requires:
-            other = records.get(requirement.node)
-            if other is not None and not requirement.is_met_by(other):
-                yield node, requirement
-
-
-def _sentence(
-    failures: list[Failure],
-    records: Mapping[str, Record],
-    components: Mapping[str, Any],
-    plain: Mapping[str, Any],
-) -> str:
+    if not failures:
+        return
     node, wanted = failures[0]
     both = {key: records[key] for key in (node, wanted.node)}
     candidates = list(_candidates((wanted.node, node), components, plain))
@@ -65,11 +49,19 @@ def _sentence(
     advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
     provided = records[wanted.node].get(wanted.key)
-    return (
+    raise InputError(
         f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, "
         f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
         f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
     )
+
+
+def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
+    for node, record in records.items():
+        for requirement in record.requires:
+            other = records.get(requirement.node)
+            if other is not None and not requirement.is_met_by(other):
+                yield node, requirement
 
 
 def _candidates(

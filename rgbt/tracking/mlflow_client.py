@@ -9,7 +9,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,13 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
     """
     check_reachable(uri)
     make_client = quiet_client()  # imported before others wait for the lock
-    with _alone(uri):
+    # Two processes that create the tables of one SQLite file together break it.
+    database = Path(uri.removeprefix("sqlite:///"))
+    lock = database.with_name(f".{database.name}.lock")
+    is_file = uri.startswith("sqlite:///")
+    if is_file:
+        database.parent.mkdir(parents=True, exist_ok=True)
+    with locked(lock) if is_file else nullcontext():
         client = make_client(tracking_uri=uri)
         found = client.get_experiment_by_name(experiment)
         found = found or _created(client, experiment, artifact_uri)
@@ -133,18 +139,6 @@ def locked(path: Path) -> Iterator[None]:
     with holding(path, wait_s=LOCK_WAIT_S - QUIET_WAIT_S) as holder:
         if holder is not None:
             raise StoreBusyError(f"{holder} has held {path} for {LOCK_WAIT_S:g} s")
-        yield
-
-
-@contextmanager
-def _alone(uri: str) -> Iterator[None]:
-    """One process at a time: two that create the tables of one SQLite file together break it."""
-    if not uri.startswith("sqlite:///"):
-        yield
-        return
-    database = Path(uri.removeprefix("sqlite:///"))
-    database.parent.mkdir(parents=True, exist_ok=True)
-    with locked(database.with_name(f".{database.name}.lock")):
         yield
 
 
