@@ -466,27 +466,27 @@ def test_a_store_is_the_same_however_much_of_its_address_was_hidden(tmp_path: Pa
     for stored in (hidden, uri, partly, "postgresql://u:***@h/db?sslpassword=x"):
         write_upload_state(folder, UploadState(stored, "e", None, "1", "the run"))
         assert store._sent(folder) == UploadState(hidden, "e", None, "1", "the run")
-    write_upload_state(
-        folder, UploadState("postgresql://u:***@other/db", "e", None, "1", "the run")
-    )
+    write_upload_state(folder, UploadState(f"{hidden}&y=1", "e", None, "1", "the run"))
     assert store._sent(folder).run_id == ""
 
 
-@pytest.mark.parametrize("uri", ["postgresql://u:***@h/db", "https://***@h", "x://h?password=***"])
-def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> None:
+@pytest.mark.parametrize(
+    ("state", "key"),
+    [
+        (UploadState("postgresql://u:***@h/db", "e"), "uri"),
+        (UploadState("https://***@h", "e"), "uri"),
+        (UploadState("http://h:5000", "e", "sftp://u:***@h/files"), "artifact_uri"),
+    ],
+)
+def test_a_password_that_is_not_kept_must_be_given(
+    tmp_path: Path, state: UploadState, key: str
+) -> None:
     folder = RunFolder(tmp_path / "run")
-    write_upload_state(folder, UploadState(uri, "e"))
-    with pytest.raises(InputError, match=r"give uri=\.\.\. with it"):
+    write_upload_state(folder, state)
+    with pytest.raises(InputError, match=rf"give {key}=\.\.\. with it"):
         sync.tracking_of(folder, sync.Options(run=folder.path))
-    write_upload_state(folder, UploadState("http://h:5000", "e", "sftp://u:***@h/files"))
-    with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
-        sync.tracking_of(folder, sync.Options(run=folder.path))
-    assert (
-        sync.tracking_of(
-            folder, sync.Options(run=folder.path, artifact_uri="sftp://u:pw@h/files")
-        ).uri
-        == "http://h:5000"
-    )
+    given = sync.Options(run=folder.path, **{key: "sftp://u:pw@h/files"})
+    assert sync.tracking_of(folder, given).experiment == "e"
 
 
 @pytest.mark.parametrize(
