@@ -1,6 +1,6 @@
 """The command ``rgbt``, also ``python -m rgbt``: ``rgbt evaluate run=...``.
 
-``rgbt NAME ...`` is ``python -m MODULE ...`` (`rgbt.config.commands`), except that the
+``rgbt NAME ...`` is ``python -m MODULE ...`` (`rgbt.config.plain_command`), except that the
 folders of PYTHONPATH and the working directory are searched for modules last.
 """
 
@@ -10,7 +10,7 @@ import runpy
 import sys
 
 from rgbt.checks import nearest
-from rgbt.config.commands import COMMANDS
+from rgbt.config.plain_command import COMMANDS, exit_code, say
 from rgbt.config.shadowing import search_user_folders_last
 
 HELP = """A lab for RGB-thermal semantic segmentation.
@@ -36,13 +36,11 @@ def main() -> None:
         sys.stdout.write(help_text())
     elif name in ("--completion", "--complete"):
         from rgbt.config.completion import print_candidates, print_script
-        from rgbt.config.reporting import exit_code
 
         answer = print_script if name == "--completion" else print_candidates
         code = exit_code(lambda: answer(words))
     else:
-        sys.stderr.write(f"rgbt: '{name}' is not a command; {nearest(name, COMMANDS)}.\n")
-        code = 2
+        code = say(f"'{name}' is not a command; {nearest(name, COMMANDS)}.", 2)
     sys.exit(code)
 
 

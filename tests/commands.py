@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -74,6 +75,20 @@ def only_run(runs: Path) -> Path:
     return result.parent
 
 
+def logged(folder: Path, kind: str = "") -> list[dict[str, Any]]:
+    """Lines of ``metrics.jsonl``, of one kind or all."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if kind in ("", line["kind"])]
+
+
+def losses(folder: Path) -> list[dict[str, float]]:
+    """Losses by name of every training step."""
+    return [
+        {name: value for name, value in line["values"].items() if name.startswith("loss")}
+        for line in logged(folder, "train")
+    ]
+
+
 def assert_one_sentence(err: str, sentence: str) -> None:
     told = [line for line in err.splitlines() if line.startswith("rgbt: ")]
     assert len(told) == 1, err
@@ -83,6 +98,6 @@ def assert_one_sentence(err: str, sentence: str) -> None:
 
 def code_of(entry: Any, words: list[str]) -> int:
     """Exit code of a command with options of its own."""
-    from rgbt.config.reporting import exit_code
+    from rgbt.config.plain_command import exit_code
 
     return exit_code(lambda: entry.run(words))

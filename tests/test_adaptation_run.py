@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,32 +13,23 @@ import numpy as np
 import pytest
 import torch
 
+from rgbt import evaluate, predict
 from rgbt.checkpoints.stored import save
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
+from rgbt.run import main
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.spec.specify import specify
-from tests.commands import Call, assert_one_sentence
+from tests.commands import Call, assert_one_sentence, logged, losses, short
 from tests.conftest import write_png
+from tests.days_and_nights import DAYS_AND_NIGHTS
 from tests.test_run import ADAPTATION, EXPERIMENTS
 
 ROOT = Path(__file__).resolve().parents[1]
-SIZES = (
-    *("dataset=synth_freiburg", "dataset.num_train_day=6", "dataset.num_train_night=5"),
-    *("dataset.num_val=2", "dataset.num_test=4"),
-)
-SMALL = (
-    *("scale.batch_size=2", "scale.eval_batch_size=4", "scale.critic_width=4", "tracking=none"),
-    *("trainer.accelerator=cpu", "trainer.threads=1", "trainer.log_every=1"),
-)
 QUICK = ("multi_head_night",)
 """Two kinds; the others are like one of them, or run below, and are slow."""
-
-
-def short(steps: int) -> tuple[str, ...]:
-    return f"trainer.max_steps={steps}", f"trainer.eval_every={steps}", "trainer.checkpoint_every=2"
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +45,7 @@ class Runs:
 
     def words(self, experiment: str, *overrides: str) -> list[str]:
         return [
-            *(f"+experiment={experiment}", *SIZES, f"dataset.cache_dir={self.cache}", *SMALL),
+            *(f"+experiment={experiment}", *DAYS_AND_NIGHTS, f"dataset.cache_dir={self.cache}"),
             *(f"runs_dir={self.runs}", *(() if "max_steps" in str(overrides) else short(2))),
             *overrides,
         ]
@@ -68,8 +55,6 @@ class Runs:
         return self.runs / specify(compose(self.words(experiment, *overrides))).key
 
     def told(self, experiment: str, *overrides: str) -> tuple[int, str, str]:
-        from rgbt.run import main
-
         return self.call(main, *self.words(experiment, *overrides))
 
     def __call__(self, experiment: str, *overrides: str) -> Path:
@@ -96,12 +81,10 @@ def elsewhere(call: Call, place: Path, tmp_path: Path) -> Callable[[str], Runs]:
 @pytest.fixture
 def evaluated(call: Call, tmp_path: Path) -> Callable[..., Counts]:
     """Counts of `rgbt.evaluate` of a run folder."""
-    from rgbt import evaluate
 
     def evaluate_run(folder: Path, *words: str) -> Counts:
         out = tmp_path / "evaluated.npz"
-        entry = evaluate.entry
-        code, _, err = call(entry, f"run={folder}", f"out={out}", *words)
+        code, _, err = call(evaluate.entry, f"run={folder}", f"out={out}", *words)
         assert code == 0, err
         return Counts.load(out)
 
@@ -137,7 +120,7 @@ def test_every_experiment_trains_and_counts_every_image(run: Runs, experiment: s
     assert counts.unscored == ("background", "ignore")
     labels = np.stack([dataset.read(name).label for name in counts.names])
     assert counts.counts.sum() == (labels != 255).sum()
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = logged(folder)
     assert [(line["kind"], line["step"]) for line in lines] == [
         *(("train", 1), ("train", 2), ("val", 2), ("test", 2))
     ]
@@ -200,44 +183,17 @@ def test_night_images_are_predicted_by_the_targets_head(
 
 
 @pytest.mark.slow
-def test_one_head_for_all_as_the_thesis_scripts(
-    run: Runs, evaluated: Callable[..., Counts]
-) -> None:
-    own, one = run("multi_head_night"), run("multi_head_night", "domains.tested_head=source")
-    assert own.name != one.name
-    weights = [load_checkpoint(folder / "best.pt")["model"] for folder in (own, one)]
-    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
-    counts = Counts.load(one / "counts_test.npz").counts
-    assert np.array_equal(evaluated(own, "head=source").counts, counts)
-    assert np.array_equal(
-        evaluated(one, "head=own").counts, Counts.load(own / "counts_test.npz").counts
-    )
-    assert not np.array_equal(counts[2:], Counts.load(own / "counts_test.npz").counts[2:])
-
-
-@pytest.mark.slow
 def test_thermal_images_are_predicted_by_the_targets_head(
     run: Runs, evaluated: Callable[..., Counts], tmp_path: Path
 ) -> None:
+    """Its counts are stored, and its scores in every line follow from them."""
     folder = run("multi_head_thermal")
     broken = without_head(folder, "target", tmp_path / "broken")
     assert only_road(evaluated(broken, "modality=thermal").counts)
     whole = Counts.load(folder / "counts_test.npz").counts
     assert np.array_equal(evaluated(broken).counts, whole)
     assert np.array_equal(evaluated(broken, "modality=rgb").counts, whole)
-    thermal = evaluated(folder, "modality=thermal").counts
-    assert not only_road(thermal)
-    assert not np.array_equal(thermal, whole)
-    # The run's own tables hold the same score.
-    values = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])["values"]
-    assert values["thermal/mIoU"] == pytest.approx(mean_of_twelve(thermal.sum((0, 1))))
-
-
-@pytest.mark.slow
-def test_the_targets_counts_are_stored(run: Runs, evaluated: Callable[..., Counts]) -> None:
-    """Its scores in every line follow from them."""
-    folder = run("multi_head_thermal")
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    lines = logged(folder)
     for split in ("val", "test"):
         stored = Counts.load(folder / f"counts_{split}_thermal.npz")
         again = evaluated(folder, "modality=thermal", f"split={split}")
@@ -246,6 +202,8 @@ def test_the_targets_counts_are_stored(run: Runs, evaluated: Callable[..., Count
         (values,) = (line["values"] for line in lines if line["kind"] == split)
         by_image = stored.counts.sum(1)
         assert values["thermal/mIoU"] == pytest.approx(mean_of_twelve(by_image.sum(0)))
+    assert not only_road(stored.counts)
+    assert not np.array_equal(stored.counts, whole)
     day, night = mean_of_twelve(by_image[:2].sum(0)), mean_of_twelve(by_image[2:].sum(0))
     assert (values["thermal/day/mIoU"], values["thermal/night/mIoU"]) == pytest.approx((day, night))
     for name in ("multi_head_night", "sh_source"):  # seen as the source is
@@ -256,39 +214,18 @@ def heads_line(said: str) -> list[str]:
     return [" ".join(line.split()) for line in said.splitlines() if line.split()[:1] == ["heads"]]
 
 
-@pytest.mark.parametrize(
-    ("experiment", "own"),
-    [
-        ("multi_head_night", "source by day, target at night"),
-        ("multi_head_thermal", "target for thermal, source otherwise"),
-        ("sh_source", None),
-    ],
-)
-@pytest.mark.slow
-def test_which_head_predicted_what_is_said(
-    run: Runs, call: Call, tmp_path: Path, experiment: str, own: str | None
-) -> None:
-    from rgbt import evaluate
-
-    folder = run(experiment)
-    expected = [] if own is None else [f"heads {own}"]
-    _, said, _ = run.told(experiment)
-    assert heads_line(said) == expected
-    asked = {"as trained": expected}
-    if own is not None:
-        asked |= {head: [f"heads {head} for all images"] for head in ("source", "target")}
-    for head, line in asked.items():
+def test_which_head_predicted_what_is_said(run: Runs, call: Call, tmp_path: Path) -> None:
+    folder = run("multi_head_night")
+    own = "heads source by day, target at night"
+    assert heads_line(run.told("multi_head_night")[1]) == [own]
+    for head, line in (("as trained", own), ("target", "heads target for all images")):
         words = (f"run={folder}", f"head={head}", f"out={tmp_path / 'x.npz'}")
-        code, said, err = call(evaluate.entry, *words)
-        assert code == 0, err
-        assert heads_line(said) == line
+        assert heads_line(call(evaluate.entry, *words)[1]) == [line]
 
 
 def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
     run: Runs, call: Call, tmp_path: Path
 ) -> None:
-    from rgbt import predict
-
     folder = run("multi_head_night")
     broken = without_head(folder, "target", tmp_path / "broken")
     dataset = build(compose(run.words("multi_head_night")).dataset)
@@ -371,20 +308,11 @@ def assert_equal(one: Any, other: Any) -> None:
         assert one == other
 
 
-def losses(folder: Path) -> list[dict[str, float]]:
-    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [
-        {name: value for name, value in line["values"].items() if name.startswith(("loss", "grad"))}
-        for line in lines
-        if line["kind"] == "train"
-    ]
-
-
 @pytest.mark.parametrize(
     "case",
     [
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("one head", "two heads")),
-        "heatnet",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("two heads", "heatnet")),
+        "one head",
     ],
 )
 def test_stopped_in_the_critics_phase_and_continued(
@@ -417,174 +345,9 @@ def test_stopped_in_the_critics_phase_and_continued(
     assert {"loss/critic/source", "loss/critic/target", "loss/target/adversarial"} <= named
 
 
-KILL = """
-import os, signal, sys
-from rgbt.run import main
-from rgbt.schemes.adversarial import Adversarial
-phase, calls, at = Adversarial._discriminator_phase, [], int(sys.argv.pop(1))
-def kill(self, seen):
-    calls.append(1)
-    if len(calls) == at:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return phase(self, seen)
-Adversarial._discriminator_phase = kill
-main()
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["one head", "heatnet"])
-def test_killed_in_the_critics_phase_and_continued(
-    run: Runs, elsewhere: Callable[[str], Runs], case: str
-) -> None:
-    words, at = RESUMED[case][0](run), RESUMED[case][1]
-    killed, straight = elsewhere("killed"), elsewhere("straight")
-    process = subprocess.run(
-        [sys.executable, "-c", KILL, str(at), *killed.words(*words, *short(6))],
-        cwd=ROOT,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        check=False,
-    )
-    assert process.returncode == -signal.SIGKILL, process.stderr
-    code, _, err = killed.told(*words, *short(6))
-    assert code == 0, err
-    assert "resumes at step 4" in err
-    assert_same_runs(killed.folder(*words, *short(6)), straight(*words, *short(6)))
-
-
 @pytest.mark.slow
 def test_a_step_of_two_batches_is_of_one_phase(run: Runs) -> None:
     folder = run("heatnet_no_teacher", "trainer.accumulate=2", *short(4))
     for number, line in enumerate(losses(folder)):
         assert ("loss/critic/source" in line) == (number % 2 == 0)
         assert ("loss/source/cross_entropy" in line) == (number % 2 == 1)
-
-
-# ---- what does not fit ----------------------------------------------------------------------
-
-
-def labels_of(place: Path, **changes: Any) -> Path:
-    """A folder that says of itself that it holds pseudo-labels."""
-    from rgbt.data.pseudo_labels import FORMAT
-
-    place.mkdir(parents=True)
-    said = {"format": FORMAT, "digest": "abc", "classes": ["road", "car"], **changes}
-    (place / "pseudo_labels.json").write_text(json.dumps(said))
-    return place
-
-
-BAD: dict[str, tuple[list[str], str]] = {
-    "no teacher's folder": (
-        ["sh_both", "domains.target.labels=/no/such"],
-        "domains.target.labels=/no/such: expected given, none, experiment:NAME/best.pt",
-    ),
-    "teacher of other classes": (
-        ["sh_both", "domains.target.labels=FOLDER"],
-        "have the classes road, car, but synth_freiburg has road, sidewalk",
-    ),
-    "no target": (
-        ["sh_source", "scheme=adversarial_thesis"],
-        "Adversarial requires num_domains=2 of the domains, Domains provides num_domains=1; choo",
-    ),
-    "no scheme for a target": (
-        ["sh_both", "scheme=supervised"],
-        "requires num_domains=2 of the scheme, Supervised provides num_domains=1; choose scheme=",
-    ),
-    "labels missing": (
-        ["sh_adversarial", "scheme.supervise_target=true"],
-        "with scheme.supervise_target=true requires target_labels=true of the domains",
-    ),
-    "labels not read": (
-        ["sh_adversarial", "domains.target.labels=given"],
-        "with scheme.supervise_target=false requires target_labels=false of the domains",
-    ),
-    "source without labels": (
-        ["sh_source", "domains.source.labels=none"],
-        "domains.source.labels=none, but every scheme reads labels of the source",
-    ),
-    "no such head": (
-        ["multi_head_thermal_stage1", "domains.source.head=left"],
-        "domains.source.head=left requires heads=left of the model, DeepLabV2 provides heads=sou",
-    ),
-    "heads of a network with one": (
-        ["multi_head_thermal_stage1", "model.heads=[main]"],
-        "domains.source.head=source requires heads=source of the model, DeepLabV2 provides heads=m",
-    ),
-    "a head that nothing trains": (
-        ["sh_source", "model.heads=[source,target]"],
-        "DeepLabV2 requires heads=source,target of the domains, Domains provides heads=",
-    ),
-    "network without scores": (
-        ["sh_both", "model=mask2former_tiny", "loss=set_criterion"],
-        "requires outputs=scores of the model, Mask2Former provides outputs=masks; choose model=",
-    ),
-    "loss that reads masks": (
-        ["sh_both", "loss=set_criterion"],
-        "requires outputs=masks of the model, DeepLabV2 provides outputs=scores; choose loss=cro",
-    ),
-    "masker that hides": (
-        ["sh_both", "masker=square"],
-        "requires hides_cells=false of the masker, Masker provides hides_cells=true; choose mask",
-    ),
-    "a view the network has not": (
-        ["heatnet_no_teacher", "domains.source.view=thermal"],
-        "Domains with domains.source.view=thermal requires views=thermal of the model, PSPNet",
-    ),
-    "an unknown split": (["sh_source", "domains.source.split=dusk"], "no split 'dusk'"),
-    "batch above the target": (
-        ["sh_both", "domains.target.split=train_night", "scale.batch_size=6"],
-        "data.batch_size is 6 but split 'train_night' of synth_freiburg has only 5",
-    ),
-    "scheme that knows no domains": (
-        ["sh_both", "scheme=temporal_paper", "loss=temporal_paper"],
-        "Domains requires num_domains=2 of the scheme, Temporal provides num_domains=1; choose ",
-    ),
-    "found before earlier runs are trained": (
-        ["multi_head_night", "scheme.weight=-1"],
-        "'scheme.weight' must be a number from 0",
-    ),
-    "found before a teacher is trained": (
-        ["multi_head_night_stage1", "masker=square"],
-        "requires hides_cells=false of the masker",
-    ),
-    "confidence that is not read": (
-        ["heatnet_no_teacher", "scheme.weighed_by_confidence=true"],
-        "requires target_confidence=true of the domains, Domains provides target_confidence=false",
-    ),
-}
-
-
-@pytest.mark.parametrize(("words", "sentence"), BAD.values(), ids=BAD)
-def test_what_does_not_fit_is_one_sentence_and_leaves_nothing(
-    elsewhere: Callable[[str], Runs], tmp_path: Path, words: list[str], sentence: str
-) -> None:
-    folder = labels_of(tmp_path / "labels")
-    bad = elsewhere("bad")
-    code, _, err = bad.told(*(word.replace("FOLDER", str(folder)) for word in words))
-    assert code == 2, err
-    assert_one_sentence(err, sentence)
-    assert not list(bad.runs.glob("*/*")), "nothing is left behind"
-
-
-def test_an_empty_target_split_is_told_before_its_teacher_is_trained(
-    elsewhere: Callable[[str], Runs], place: Path, tmp_path: Path, run: Runs
-) -> None:
-    words = run.words("sh_source")
-    dataset = build(compose(words).dataset)
-    root = tmp_path / "freiburg"
-    shutil.copytree(dataset.root, root)
-    for path in [*root.rglob("*night*")]:
-        if path.is_dir() and "train" in path.parts:
-            shutil.rmtree(path, ignore_errors=True)
-    bad = elsewhere("bad")
-    own = ["dataset=freiburg", f"dataset.root={root}", "dataset.crop=[1,97,48,240]"]
-    given = [
-        word for word in bad.words("multi_head_night_stage1") if not word.startswith("dataset")
-    ]
-    from rgbt.run import main
-
-    code, _, err = bad.call(main, *given, *own)
-    assert code == 2, err
-    assert_one_sentence(err, "train_night")
-    assert not list(bad.runs.glob("*/*"))

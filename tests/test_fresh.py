@@ -92,17 +92,6 @@ def test_changed_tests_or_documents_are_no_other_code(
     assert "other code" not in train(call, data, runs, "+experiment=crm", *short(1))[2]
 
 
-def test_a_run_of_before_threads_had_a_number_is_opened(call: Call, data: Path, runs: Path) -> None:
-    from rgbt import evaluate
-
-    folder = only_run(runs)
-    text = (folder / "config.yaml").read_text()
-    assert "threads: 1" in text
-    (folder / "config.yaml").write_text(text.replace("threads: 1", "threads: null"))
-    code, _, err = call(evaluate.entry, f"run={folder}", f"dataset.root={data}")
-    assert code == 0, err
-
-
 OWN_LOSS = """
 from rgbt.losses.cross_entropy import CrossEntropy
 

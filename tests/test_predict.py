@@ -57,20 +57,6 @@ def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_only_sure_pixels_are_labelled(call: Call, trained: Trained, tmp_path: Path) -> None:
-    asked = ("input=val", f"out={tmp_path / 'out'}", "pseudo_labels=true", "threshold=0.2")
-    code, said, err = call(PREDICT, f"run={trained(*ONE)}", *asked)
-    assert code == 0, err
-    assert "confidence of at least 0.2" in said
-    for name in SPLITS["val"]:
-        label = image(tmp_path / "out" / "labels" / f"{name}.png")
-        confidence = image(tmp_path / "out" / "confidence" / f"{name}.png")
-        sure = confidence / 65535
-        clear = np.abs(sure - 0.2) > 1e-4
-        assert np.array_equal((label == 255)[clear], (sure < 0.2)[clear])
-
-
-@pytest.mark.slow
 def test_a_network_of_other_classes_needs_a_label_map(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
@@ -131,47 +117,3 @@ def test_new_images_in_two_folders_or_two_files(
         assert said.endswith(f"{3 if number == 0 else 1} images in {out}\n")
         found.append(image(out / "00201D.png"))
     assert all(np.array_equal(each, found[0]) for each in found)
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ((), "got none of input, rgb and thermal"),
-        (("rgb=a.png",), "got rgb of input, rgb and thermal"),
-        (("rgb=a.png", "thermal=b.png"), "a.png is missing"),
-        (("rgb=a.png", "thermal=b.png", "input=val"), "expected either input=FOLDER"),
-        (("input=vall",), "no such split of mfnet; splits: did you mean 'val'?"),
-        (("input=val", "dataset.rot=x"), "did you mean 'dataset.root'? known: dataset._target_"),
-    ],
-)
-def test_what_names_no_images_is_refused(
-    call: Call, trained: Trained, tmp_path: Path, words: tuple[str, ...], sentence: str
-) -> None:
-    code, _, err = call(PREDICT, f"run={trained(*ONE)}", f"out={tmp_path / 'out'}", *words)
-    assert code == 2, err
-    assert_one_sentence(err, sentence)
-
-
-@pytest.mark.parametrize(
-    ("asked", "sentence"),
-    [
-        (("threshold=0.5",), "threshold=0.5 is for pseudo_labels=true"),
-        (("pseudo_labels=yes",), "'pseudo_labels' must be true or false"),
-        (("pseudo_labels=true", "threshold=half"), "'threshold' must be a number"),
-        (("pseudo_labels=true", "threshold=2"), "threshold must lie in [0, 1], got 2"),
-        (("pseudo_labels=true", "input=pictures"), "written of a split of mfnet; name one of"),
-        (("pseudo_labels=true", "label_map=x"), "there is no label_map 'x'"),
-        (("pseudo_labels=true", "modality=infrared"), "modality: 'infrared' is not a choice"),
-        (("pseudo_labels=true", "head=target"), "head=target chooses between the heads"),
-        (("pseudo_labels=true", "head=night"), "'head' must be"),
-        (("head=target",), "head=target chooses between the heads"),
-        (("checkpoint=first",), "'checkpoint' must be 'best' or 'last'"),
-    ],
-)
-def test_what_does_not_fit_is_refused(
-    call: Call, trained: Trained, tmp_path: Path, asked: tuple[str, ...], sentence: str
-) -> None:
-    place = (f"run={trained(*ONE)}", "input=val", f"out={tmp_path / 'out'}")
-    code, _, err = call(PREDICT, *place, *asked)
-    assert code == 2, err
-    assert_one_sentence(err, sentence)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +14,7 @@ from rgbt.config.compose import conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
 from rgbt.requirements import Record
+from rgbt.run import main
 from tests.commands import SMALL, Call, only_run, short
 from tests.composed import composed
 from tests.test_run import ELSEWHERE
@@ -103,8 +102,6 @@ QUICK = ("crm_pst900", "spatialseg_kp")
 def test_an_experiment_on_another_data_set_trains_and_counts(
     call: Call, tmp_path: Path, experiment: str
 ) -> None:
-    from rgbt.run import main
-
     splits = ("dataset.num_train=3", "dataset.num_val=3", "dataset.num_test=3")
     place = (f"dataset.cache_dir={tmp_path / 'cache'}", f"runs_dir={tmp_path / 'runs'}")
     size = ("dataset.height=48", "dataset.width=64", "tracking=none")
@@ -122,66 +119,45 @@ def test_an_experiment_on_another_data_set_trains_and_counts(
 
 # ---- what is told ---------------------------------------------------------------------------
 
-
-@dataclass
-class Told:
-    """A session of a few names, as the remarks look at it."""
-
-    recipe: str = "mfnet"
-    data: str = "mfnet"
-    scale: str = "paper"
-    val: tuple[str, ...] = ("a",)
-    picked: str = "val"
-    tested: str = "best"
-    weights: Any = "file"
-    parts: tuple[str, ...] = ("backbone",)
-
-    def session(self) -> Any:
-        splits = {"train": ("t",), "val": self.val, "test": ("x", "y")}
-        return SimpleNamespace(
-            spec=SimpleNamespace(
-                scale=SimpleNamespace(name=self.scale, pretrained=self.scale == "paper"),
-                recipe=SimpleNamespace(dataset=self.recipe),
-            ),
-            dataset=SimpleNamespace(name=self.data, names=splits.__getitem__),
-            trainer=SimpleNamespace(selection_split=self.picked, tested=self.tested),
-            model=SimpleNamespace(record=Record(pretrained_parts=self.parts)),
-            weights=self.weights,
-        )
+PUBLISHED = {
+    **{"recipe": "mfnet", "data": "mfnet", "scale": "paper", "val": ("a",), "picked": "val"},
+    **{"tested": "best", "weights": "file", "parts": ("backbone",)},
+}
+"""A run as published, as the remarks look at it."""
 
 
-@pytest.fixture
-def lines(capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
-    def of(**changes: Any) -> list[str]:
-        _report_unpublished_settings(Told(**changes).session())
-        return capsys.readouterr().err.splitlines()
-
-    return of
-
-
-def test_nothing_is_told_of_a_run_as_published(lines: Callable[..., list[str]]) -> None:
-    assert lines() == []
-    assert lines(scale="demo", data="kp", weights=None) == []
-    assert lines(weights=None, parts=()) == []
-
-
-def test_a_recipe_for_other_images_is_told_in_a_line(lines: Callable[..., list[str]]) -> None:
-    (line,) = lines(data="pst900")
-    assert line.startswith("rgbt: sizes, batch and steps of the recipe are those for mfnet, not")
-    assert "choose recipe=pst900, or set recipe.train_sizes" in line
-    (line,) = lines(data="mine", recipe="kp")
-    assert "those for kp, not for mine; set recipe.train_sizes" in line
-    assert lines(data="mine", recipe="mine") == []
-
-
-def test_random_weights_are_told(lines: Callable[..., list[str]]) -> None:
-    (line,) = lines(weights=None)
-    assert "starts from ImageNet weights, this run from random ones" in line
-
-
-def test_a_best_checkpoint_of_the_test_images_is_told(lines: Callable[..., list[str]]) -> None:
-    (line,) = lines(val=("x", "b", "y"), scale="demo")
-    assert "trainer.selection_split=val: 2 of its 3 images are test images" in line
-    # Asked for by name, as the releases do, or not picked at all.
-    assert lines(val=("x",), picked="test") == []
-    assert lines(val=("x",), tested="last") == []
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, []),
+        ({"scale": "demo", "data": "kp", "weights": None}, []),
+        ({"weights": None, "parts": ()}, []),
+        ({"data": "mine", "recipe": "mine"}, []),
+        ({"data": "pst900"}, ["those for mfnet, not", "choose recipe=pst900, or set recipe."]),
+        ({"data": "mine", "recipe": "kp"}, ["those for kp, not for mine; set recipe.train_sizes"]),
+        ({"weights": None}, ["starts from ImageNet weights, this run from random ones"]),
+        ({"val": ("x", "b", "y"), "scale": "demo"}, ["val: 2 of its 3 images are test images"]),
+        # Requested by name, as the releases do, or not picked at all.
+        ({"val": ("x",), "picked": "test"}, []),
+        ({"val": ("x",), "tested": "last"}, []),
+    ],
+)
+def test_settings_that_are_not_the_published_ones_are_reported(
+    changes: dict[str, Any], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = SimpleNamespace(**PUBLISHED | changes)
+    splits = {"train": ("t",), "val": run.val, "test": ("x", "y")}
+    session: Any = SimpleNamespace(
+        spec=SimpleNamespace(
+            scale=SimpleNamespace(name=run.scale, pretrained=run.scale == "paper"),
+            recipe=SimpleNamespace(dataset=run.recipe),
+        ),
+        dataset=SimpleNamespace(name=run.data, names=splits.__getitem__),
+        trainer=SimpleNamespace(selection_split=run.picked, tested=run.tested),
+        model=SimpleNamespace(record=Record(pretrained_parts=run.parts)),
+        weights=run.weights,
+    )
+    _report_unpublished_settings(session)
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == bool(words)
+    assert all(word in said for word in words)

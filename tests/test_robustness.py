@@ -11,7 +11,7 @@ import pytest
 
 from rgbt import evaluate, robustness
 from rgbt.metrics.counts import Counts
-from tests.commands import Call, Trained, assert_one_sentence, short
+from tests.commands import Call, Trained, short
 
 ENTRY = robustness.entry
 EVALUATE = evaluate.entry
@@ -62,41 +62,3 @@ def test_robustness_counts_are_those_of_evaluate(
     assert code == 0, err
     assert out.count("thermal removed (zeroed)") == 2
     assert (place.with_name("test_ring9") / "thermal_removed-1.npz").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["run=a", "degradations=blur"], "'degradations' is called 'corruptions' now"),
-        (["run=a", "corruptions=blurr"], "did you mean 'blur'"),
-        (["run=a", "transform.test_short_edge=60"], "name a folder for these counts with out="),
-        (["run=a", "metric.absent=exclude"], "changes how the run is measured"),
-        (["run=a,b", "out=x"], "out= is the folder of one run, but run= names 2"),
-        (["run=nowhere", "corruptions=blur"], "run=nowhere: neither a run folder"),
-        (["corruptions=blur"], "'run' has no value"),
-    ],
-)
-def test_bad_input_of_robustness_is_one_sentence(
-    call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str], sentence: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    code, out, err = call(ENTRY, *words)
-    assert (code, out) == (2, "")
-    assert_one_sentence(err, sentence)
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["degradation=noise"], "'degradation' is called 'corruption' now; give corruption="),
-        (["severity=1"], "'severity' has no effect without corruption="),
-        (["corruption.block=1"], "'corruption.block' has no effect without corruption="),
-        (["corruption=noise"], "needs a number (grey levels (std))"),
-    ],
-)
-def test_bad_corruption_of_evaluate_is_one_sentence(
-    call: Call, words: list[str], sentence: str
-) -> None:
-    code, _, err = call(EVALUATE, "run=x", *words)
-    assert code == 2
-    assert_one_sentence(err, sentence)

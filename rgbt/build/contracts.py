@@ -2,7 +2,8 @@
 
 Classes of this package are tested, and pass unchecked; others are compared with `rgbt.types` and
 with `rgbt.dataset` before a training starts, and what they return the first time they are
-used. docs/extending.md has an example of each.
+used. Each raises InputError, naming the member or what was returned and what was expected;
+docs/extending.md has an example of each.
 """
 
 from __future__ import annotations
@@ -39,11 +40,7 @@ def is_own(part: object) -> bool:
 
 
 def check_dataset(dataset: Any) -> None:
-    """Refuse a data set without the members of `rgbt.dataset.LabelledDataset`.
-
-    Raises:
-        InputError: naming the member.
-    """
+    """Refuse a data set without the members of `rgbt.dataset.LabelledDataset`."""
     check_members("dataset", dataset, DATASET, DATASET_CALLS)
     for attribute in ("classes", "palette", "unscored"):
         value = getattr(dataset, attribute)
@@ -61,11 +58,7 @@ def check_dataset(dataset: Any) -> None:
 
 
 def check_first_sample(dataset: Any, split: str) -> None:
-    """Refuse a data set whose first sample of a split is not a `rgbt.types.Sample`.
-
-    Raises:
-        InputError: naming the array, what it is and what was expected.
-    """
+    """Refuse a data set whose first sample of a split is not a `rgbt.types.Sample`."""
     kind = type(dataset).__name__
     names = dataset.names(split)
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
@@ -77,8 +70,14 @@ def check_first_sample(dataset: Any, split: str) -> None:
         raise InputError(f"dataset: {kind}.names('{split}') returned no name; expected some.")
     sample = dataset.read(names[0])
     check_sample(f"dataset: {kind}.read('{names[0]}') returned", sample, names[0])
-    if sample.label is not None:
-        _check_label(f"dataset: {kind}.read('{names[0]}')", sample.label, dataset.num_classes)
+    if sample.label is None:
+        return
+    wrong = sample.label[(sample.label >= dataset.num_classes) & (sample.label != IGNORE)]
+    if wrong.size:
+        raise InputError(
+            f"dataset: {kind}.read('{names[0]}') returned the label value {wrong[0]} ({wrong.size} "
+            f"pixels); expected 0 to {dataset.num_classes - 1}, or {IGNORE} to ignore a pixel."
+        )
 
 
 def check_sample(returned: str, sample: Any, name: str) -> None:
@@ -99,21 +98,8 @@ def check_sample(returned: str, sample: Any, name: str) -> None:
             )
 
 
-def _check_label(returned: str, label: np.ndarray, num_classes: int) -> None:
-    wrong = label[(label >= num_classes) & (label != IGNORE)]
-    if wrong.size:
-        raise InputError(
-            f"{returned} returned the label value {wrong[0]} ({wrong.size} pixels); expected 0 to "
-            f"{num_classes - 1}, or {IGNORE} to ignore a pixel."
-        )
-
-
 def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) -> None:
-    """Refuse a transform whose examples are not those of `rgbt.types.Example`.
-
-    Raises:
-        InputError: naming the method and what it returned.
-    """
+    """Refuse a transform whose examples are not those of `rgbt.types.Example`."""
     check_members("transform", transform, (), TRANSFORM_CALLS)
     kind = type(transform).__name__
     for method, found in (
@@ -137,11 +123,7 @@ def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) ->
 
 
 def check_regions(regions: Any, image_hw: tuple[int, int]) -> None:
-    """Refuse a partition that is not like `rgbt.metrics.metric.Regions`.
-
-    Raises:
-        InputError: naming what its `map` returned.
-    """
+    """Refuse a partition that is not like `rgbt.metrics.metric.Regions`."""
     members = ("name", "partition", "regions", "absent")
     check_members("metric", regions, members, {"map": ("image_hw",)})
     found = regions.map(image_hw)
@@ -163,9 +145,7 @@ def check_corruption(kind: Any) -> None:
 def watch_model(model: nn.Module, num_classes: int) -> None:
     """Compare what a user's network returns, in its first training and evaluation pass.
 
-    Raises:
-        InputError: its `forward` does not take what it is called with; later, from the pass: it
-            returned something else than `rgbt.types.Output`.
+    At once: whether its `forward` takes what it is called with.
     """
     check_members("model", model, (), MODEL_CALLS)
     left = {True, False}
@@ -205,14 +185,7 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
 
 
 class CheckedLoss:
-    """A user's loss; what it returns the first time is compared with `rgbt.types.Loss`.
-
-    Args:
-        loss: what is called; all its attributes are those of this object.
-
-    Raises:
-        InputError: it does not take what it is called with.
-    """
+    """A user's loss with all its attributes; what it first returns is compared with `Loss`."""
 
     def __init__(self, loss: Any) -> None:
         check_members("loss", loss, (), LOSS_CALLS)
@@ -225,7 +198,7 @@ class CheckedLoss:
         return getattr(self._loss, key)
 
     def __call__(self, output: Output, batch: Batch, generator: torch.Generator) -> Any:
-        """As the loss; InputError where it returns something else than named parts."""
+        """As the loss."""
         found = self._loss(output, batch, generator)
         if not self._is_checked:
             name = getattr(self._loss, "__name__", f"{type(self._loss).__name__}.__call__")
@@ -235,15 +208,7 @@ class CheckedLoss:
 
 
 class CheckedScheme:
-    """A user's scheme, whose phases are compared with `rgbt.types.Phase`.
-
-    Args:
-        scheme: what yields them; all its attributes are those of this object.
-        optimizers: names that phases may use.
-
-    Raises:
-        InputError: it does not take what it is called with.
-    """
+    """A user's scheme with all its attributes; its phases may name these `optimizers` alone."""
 
     def __init__(self, scheme: Any, optimizers: Collection[str]) -> None:
         check_members("scheme", scheme, (), SCHEME_CALLS)
@@ -256,7 +221,7 @@ class CheckedScheme:
         return getattr(self._scheme, key)
 
     def phases(self, batch: Any, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """As the scheme; InputError for anything that is no phase."""
+        """As the scheme."""
         kind = f"scheme: {type(self._scheme).__name__}.phases"
         found = self._scheme.phases(batch, generator_of)
         if not hasattr(found, "__iter__") or isinstance(found, Phase | Tensor):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -37,9 +36,16 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
         return None
     report = load_weights(model, source, fresh)
     info(report.sentence())
-    others = differences(spec.model.plain, report.facts.convention)
-    if not others and _has_other_inputs(spec.model.plain, report, source):
-        others = ["the inputs noted beside it"]
+    node = spec.model.plain
+    others = differences(node, report.facts.convention)
+    # A file of this project, or the run beside it, notes its inputs.
+    noted: Any = report.facts.inputs
+    beside = source.parent / "config.yaml"
+    if not others and noted is None and report.facts.layout == "own" and beside.is_file():
+        noted = read_settings(beside).get("model", {}).get("inputs")
+    if not others and None not in (noted, node.get("inputs")):
+        is_same = _plain(noted) == _plain(node["inputs"])
+        others = [] if is_same else ["the inputs noted beside it"]
     if others:
         info(
             f"{source} goes with {' '.join(others)}, this network with something else: its scores "
@@ -68,15 +74,6 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
         value = text
     found: Any = node.get(key.removeprefix("model."), value)
     return bool(found == value)
-
-
-def _has_other_inputs(node: Mapping[str, Any], report: Report, source: Path) -> bool:
-    """Whether a file of this project, or the run beside it, notes other inputs."""
-    noted: Any = report.facts.inputs
-    beside = source.parent / "config.yaml"
-    if noted is None and report.facts.layout == "own" and beside.is_file():
-        noted = read_settings(beside).get("model", {}).get("inputs")
-    return noted is not None and "inputs" in node and _plain(noted) != _plain(node["inputs"])
 
 
 def _plain(inputs: Any) -> Any:

@@ -9,9 +9,8 @@ from typing import Any
 
 from rgbt.build.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice
-from rgbt.config.component import target_names
 from rgbt.config.compose import compose
-from rgbt.config.stored_config import read_settings
+from rgbt.config.stored_config import check_targets, read_settings, targets
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
 from rgbt.metrics.counts import Counts
@@ -52,14 +51,9 @@ def open_trained(
 ) -> TrainedNetwork:
     """The network of the run `run`; without one, that of `overrides` with `model.weights`.
 
-    Args:
-        run: folder, config key or MLflow run id; "" for none.
-        runs_dir: the folder of runs.
-        overrides: of the configuration of the run, or (without a run) of the configuration at
-            scale=paper, such as model=mfnet model.weights=final.pth dataset.root=/data/MFNet.
-        checkpoint: "best" or "last" of a run.
-        label_map: from the classes of the network to those of the data set, where they differ.
-        trust: see `open_run`.
+    A run is named by its folder, config key or MLflow run id. Without one ("") the overrides are of
+    the configuration at scale=paper, such as model=mfnet model.weights=final.pth
+    dataset.root=/data/MFNet. The other arguments are those of `open_run`.
 
     Raises:
         InputError: no such run; no weights; settings that do not fit.
@@ -108,8 +102,9 @@ def open_run(
         InputError: a target that is not trusted, overrides that do not fit, no checkpoint, other
             classes than trained.
     """
-    spec = load_spec(folder, overrides, trust)
     trained_with = read_settings(folder / "config.yaml")
+    check_targets(trained_with, trust, str(folder / "config.yaml"))
+    spec = load_spec(trained_with, overrides)
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
     weights = folder / f"{checkpoint}.pt"
@@ -137,7 +132,7 @@ def open_run(
 
 def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     """Warn where the user's own code is not the code that the run was trained with."""
-    now = dict(user_code(target_names(trained_with)))
+    now = dict(user_code(targets(trained_with).values()))
     entries = read_provenance(folder / "provenance.json") if now else []
     before = entries[-1].get("own_code") if entries else None
     if before is not None and before != now:

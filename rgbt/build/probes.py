@@ -36,11 +36,7 @@ def example_hw(session: Session) -> tuple[int, int]:
 
 
 def check_own_parts(session: Session) -> None:
-    """Refuse a user's data set, transform or partition that does not do what it must.
-
-    Raises:
-        InputError: in the words of `rgbt.build.contracts`.
-    """
+    """Refuse a user's data set, transform or partition that does not do what it must."""
     dataset, transform = reader_of(session.dataset), session.transform
     splits = [domain.split for domain in session.domains.named.values()]
     if is_own(dataset):
@@ -54,11 +50,7 @@ def check_own_parts(session: Session) -> None:
 
 
 def check_cells(session: Session, masker: AnyMasker) -> None:
-    """Draw one mask, so that cells that do not fit the crop are reported before the run starts.
-
-    Raises:
-        InputError: they do not, or a user's masker is none.
-    """
+    """Draw one mask, so that cells that do not fit the crop are refused before the run starts."""
     crop_hw = record_of(session.transform).crop_hw
     if crop_hw is None and is_own(masker):
         crop_hw = example_hw(session)
@@ -67,11 +59,7 @@ def check_cells(session: Session, masker: AnyMasker) -> None:
 
 
 def check_cameras(session: Session, scheme: object) -> None:
-    """Refuse the camera of other images: of a scheme of two frames, and of consistency.
-
-    Raises:
-        InputError: naming the key of the camera.
-    """
+    """Refuse the camera of other images: of a scheme of two frames, and of consistency."""
     camera = record_of(scheme).camera
     if camera is not None:
         _check_camera("scheme", camera, example_hw(session))

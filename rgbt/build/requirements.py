@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -18,19 +18,11 @@ MOST_CHOICES = 6
 """Names that a message lists of one group."""
 
 
-class Failure(NamedTuple):
-    """A requirement that is not met: the key of the component that has it, and what it is."""
+Failure = tuple[str, Requirement]
+"""A requirement that is not met, after the key of the component that has it."""
 
-    node: str
-    requirement: Requirement
-
-
-class Candidate(NamedTuple):
-    """A file of ``conf/`` that could be chosen, and the record of what it describes."""
-
-    group: str
-    name: str
-    record: Record
+Candidate = tuple[str, str, Record]
+"""Group and name of a file of ``conf/`` that could be chosen, the record of what it describes."""
 
 
 def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
@@ -46,24 +38,8 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
     """
     records = {node: record_of(component) for node, component in components.items()}
     failures = list(_failures(records))
-    if failures:
-        raise InputError(_sentence(failures, records, components, plain))
-
-
-def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
-    for node, record in records.items():
-        for requirement in record.requires:
-            other = records.get(requirement.node)
-            if other is not None and not requirement.is_met_by(other):
-                yield Failure(node, requirement)
-
-
-def _sentence(
-    failures: list[Failure],
-    records: Mapping[str, Record],
-    components: Mapping[str, Any],
-    plain: Mapping[str, Any],
-) -> str:
+    if not failures:
+        return
     node, wanted = failures[0]
     both = {key: records[key] for key in (node, wanted.node)}
     candidates = list(_candidates((wanted.node, node), components, plain))
@@ -73,11 +49,19 @@ def _sentence(
     advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
     provided = records[wanted.node].get(wanted.key)
-    return (
+    raise InputError(
         f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, "
         f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
         f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
     )
+
+
+def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:
+    for node, record in records.items():
+        for requirement in record.requires:
+            other = records.get(requirement.node)
+            if other is not None and not requirement.is_met_by(other):
+                yield node, requirement
 
 
 def _candidates(
@@ -88,20 +72,20 @@ def _candidates(
         for name, node in choices(plain, group):
             record = _record_of_file(node, group, components)
             if record is not None:
-                yield Candidate(group, name, record)
+                yield group, name, record
 
 
 def _options(
     failures: list[Failure], records: Mapping[str, Record], candidates: list[Candidate]
 ) -> list[str]:
     """Files with which the first failure is gone and fewest remain, by group."""
-    remaining = set(failures[1:])
-    left = [(each, set(_failures({**records, each.group: each.record}))) for each in candidates]
-    helping = [(each, len(rest)) for each, rest in left if rest <= remaining]
-    fewest = min((number for _, number in helping), default=0)
+    left = [(g, name, set(_failures({**records, g: record}))) for g, name, record in candidates]
+    helping = [(g, name, len(rest)) for g, name, rest in left if rest <= set(failures[1:])]
+    fewest = min((number for *_, number in helping), default=0)
     names: dict[str, list[str]] = {}
-    for each in (each for each, number in helping if number == fewest):
-        names.setdefault(each.group, []).append(each.name)
+    for group, name, number in helping:
+        if number == fewest:
+            names.setdefault(group, []).append(name)
     return [
         f"{group}={', '.join(each[:MOST_CHOICES])}{', ...' if len(each) > MOST_CHOICES else ''}"
         for group, each in names.items()

@@ -80,7 +80,16 @@ def open_session(
     """
     keep_memory()
     fix_threads(spec.trainer.threads)
-    fabric = _fabric(spec.trainer)
+    trainer = spec.trainer
+    # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    try:
+        fabric = Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"trainer.accelerator={trainer.accelerator} with trainer.precision={trainer.precision} "
+            f"cannot be used on this machine ({str(error).splitlines()[0]})."
+        ) from error
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "weights"))
         model: nn.Module = spec.model.build()
@@ -89,7 +98,14 @@ def open_session(
         check_dataset(files)
     dataset = cached_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
     num_classes = spec.model.values.get("num_classes", dataset.num_classes)
-    _check_classes(num_classes, dataset, label_map)
+    if label_map is not None:
+        label_map.check(num_classes, tuple(dataset.classes), dataset.name)
+    elif num_classes != dataset.num_classes:
+        raise InputError(
+            f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
+            "classes; omit it, so that the data set decides, or let rgbt.predict map the classes "
+            "of a network that was trained on others with label_map=..."
+        )
     if is_own(model):
         watch_model(model, num_classes)
     weights = start_from_weights(model, spec) if load_weights else None
@@ -101,34 +117,11 @@ def open_session(
         loading=spec.data,
         regions=spec.metric.build(),
         consistency=spec.consistency.build(),
-        trainer=spec.trainer,
+        trainer=trainer,
         fabric=fabric,
         model=model.to(fabric.device),
         weights=weights,
     )
-
-
-def _check_classes(num_classes: int, dataset: LabelledDataset, label_map: LabelMap | None) -> None:
-    if label_map is not None:
-        label_map.check(num_classes, tuple(dataset.classes), dataset.name)
-    elif num_classes != dataset.num_classes:
-        raise InputError(
-            f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
-            "classes; omit it, so that the data set decides, or let rgbt.predict map the classes "
-            "of a network that was trained on others with label_map=..."
-        )
-
-
-def _fabric(trainer: TrainerSettings) -> Fabric:
-    # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    try:
-        return Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"trainer.accelerator={trainer.accelerator} with trainer.precision={trainer.precision} "
-            f"cannot be used on this machine ({str(error).splitlines()[0]})."
-        ) from error
 
 
 def names_key(session: Session) -> str:

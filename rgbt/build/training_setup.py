@@ -123,17 +123,17 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
     model = session.fabric.setup_module(session.model)
-    scheme = _scheme(session, model=model, loss=checked, masker=masker)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive(spec.seed, "scheme weights"))  # of networks of its own
+        scheme: Any = spec.scheme.build(model=model, loss=checked, masker=masker, domains=domains)
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
         **{"masker": masker, "transform": session.transform, "data": session.loading},
         "dataset": session.dataset,
     }
     check_requirements(components, spec.plain)
-    for split in (
-        *(domain.split for domain in domains.named.values()),
-        *(session.trainer.selection_split, "test"),
-    ):
+    splits = [domain.split for domain in domains.named.values()]
+    for split in (*splits, session.trainer.selection_split, "test"):
         session.dataset.names(split)
     datasets = {
         name: session.dataset if labels_key(name) in missing else _labelled(session, name, domain)
@@ -147,7 +147,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     check_cameras(session, scheme)
     if upstream_finished:
         _report_unpublished_settings(session)
-    others, optimizers = _set_up(session, scheme)
+    others, optimizers = _networks_and_optimizers(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     return TrainingSetup(
         session, datasets, model, others, optimizers, scheme, spec.schedule.build()
@@ -239,16 +239,7 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
         )
 
 
-def _scheme(session: Session, **collaborators: Any) -> Scheme:
-    """The scheme; weights of networks of its own are drawn from (seed, "scheme weights")."""
-    spec = session.spec
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(spec.seed, "scheme weights"))
-        scheme: Scheme = spec.scheme.build(**collaborators, domains=session.domains)
-    return scheme
-
-
-def _set_up(
+def _networks_and_optimizers(
     session: Session, scheme: Any
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
@@ -259,7 +250,5 @@ def _set_up(
     for name, module in others.items():
         built[name] = record.builders[name](module)
         others[name] = fabric.setup_module(module)
-    optimizers: dict[str, Any] = {
-        name: fabric.setup_optimizers(each) for name, each in built.items()
-    }
-    return others, optimizers
+    wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}
+    return others, wrapped

@@ -1,4 +1,4 @@
-"""The command line: Hydra overrides in, one sentence and an exit code out.
+"""Commands that are called with Hydra overrides alone, and configurations composed for others.
 
 For commands with options of their own see `rgbt.config.plain_command`.
 """
@@ -23,7 +23,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
-from rgbt.config.reporting import exit_code
+from rgbt.config.plain_command import exit_code
 from rgbt.runtime.signals import answered
 
 Main = Callable[[DictConfig], int | None]
@@ -41,10 +41,6 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     """
 
     def decorate(main: Main) -> Callable[[], None]:
-        def checked(config: DictConfig) -> int | None:
-            check_keys(config)
-            return main(config)
-
         @wraps(main)
         def entry() -> None:
             codes: list[int] = []
@@ -55,26 +51,31 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                 words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
             sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
 
+            def checked(config: DictConfig) -> int | None:
+                check_keys(config)
+                return main(config)
+
             def job(config: DictConfig) -> None:
                 codes.append(exit_code(lambda: checked(config), catch_interrupt=False))
 
+            def run() -> None:
+                check_words(words)
+                # Only so does Hydra hand its own errors to us instead of printing them and leaving.
+                os.environ["HYDRA_FULL_ERROR"] = "1"
+                # Hydra's root logger shows the INFO lines of every library.
+                logging.getLogger("matplotlib").setLevel(logging.WARNING)
+                register_resolvers()
+                hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(
+                    job
+                )()
+
             with answered(), searching(words):
-                code = max([exit_code(lambda: _compose(job, words)), *codes])
+                code = max([exit_code(run), *codes])
             sys.exit(code)
 
         return entry
 
     return decorate
-
-
-def _compose(job: Callable[[DictConfig], None], words: Sequence[str]) -> None:
-    check_words(words)
-    # Only with this set does Hydra hand its own errors to us instead of printing them and leaving.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Hydra's root logger shows the INFO lines of every library.
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)
-    register_resolvers()
-    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
 
 
 @contextmanager
@@ -97,5 +98,4 @@ def built(node: str, overrides: Sequence[str]) -> Any:
         InputError: overrides that Hydra refuses, or settings that the constructor does.
     """
     with composing(overrides):
-        config = compose(overrides)
-        return build(config[node])
+        return build(compose(overrides)[node])

@@ -13,9 +13,8 @@ from contextlib import suppress
 from typing import Any
 
 from rgbt.checks import InputError, check_choice
-from rgbt.config.commands import COMMANDS
 from rgbt.config.options import choices_of, types_of
-from rgbt.config.plain_command import CommandGroup, PlainCommand
+from rgbt.config.plain_command import COMMANDS, CommandGroup, PlainCommand
 
 # Bash cuts words at "=" and ":", and replaces only what follows the last of them.
 BASH = r"""# add to ~/.bashrc:  eval "$(rgbt --completion bash)"

@@ -108,20 +108,20 @@ def build(node: DictConfig, **collaborators: Any) -> Any:
     return Component.from_node(node).build(**collaborators)
 
 
-def target_names(value: Any) -> Iterator[str]:
-    """Every `_target_` inside plain values."""
-    if isinstance(value, Mapping) and "_target_" in value:
-        yield value["_target_"]
-    children = value.values() if isinstance(value, Mapping) else value
-    for child in children if isinstance(value, Mapping | list) else ():
-        yield from target_names(child)
-
-
 def _typed_values(node: DictConfig, path: str, target: Any) -> Iterator[tuple[str, Any]]:
     parameters = inspect.signature(target).parameters
     hints = setting_types(target)
     run_settings = RUN_SETTINGS.get(path, {})
-    for key, value in _items(node, path):
+    for key in map(str, node):
+        if key == "_target_":
+            continue
+        if OmegaConf.is_missing(node, key):
+            raise InputError(f"'{path}.{key}' has no value; give one with {path}.{key}=...")
+        try:
+            value = node[key]
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"'{path}.{key}' cannot be resolved: {reason}") from error
         if key in run_settings:
             check_value(f"{path}.{key}", value, run_settings[key])
         elif key not in parameters:
@@ -135,29 +135,16 @@ def _typed_values(node: DictConfig, path: str, target: Any) -> Iterator[tuple[st
             yield key, check_value(f"{path}.{key}", value, hints.get(key, Any))
 
 
-def _items(node: DictConfig, path: str) -> Iterator[tuple[str, Any]]:
-    for key in node:
-        if key == "_target_":
-            continue
-        if OmegaConf.is_missing(node, key):
-            raise InputError(f"'{path}.{key!s}' has no value; give one with {path}.{key!s}=...")
-        try:
-            yield str(key), node[key]
-        except OmegaConfBaseException as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(f"'{path}.{key!s}' cannot be resolved: {reason}") from error
-
-
 def constructor(target: Any, path: str) -> Any:
-    """The class or function that `target` names, unless Hydra's policy refuses it.
+    """The class or function that `target` names; its module is imported.
 
     Args:
-        target: dotted path; its module is imported.
+        target: dotted path.
         path: key in the configuration, for messages.
 
     Raises:
-        InputError: not a dotted path, no such object, or refused (os.system, exec, subprocess.run
-            and the like).
+        InputError: not a dotted path, no such object, or refused by Hydra's policy (os.system,
+            exec, subprocess.run and the like).
     """
     return authorized(target, path).func
 

@@ -79,12 +79,7 @@ def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
 
 
 def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictConfig]]:
-    """The files of a group: name, and the node that each would be in a configuration.
-
-    Args:
-        plain: the configuration that interpolations of the files refer to, as resolved values.
-        group: key of the node, which is the name of its folder.
-    """
+    """The files of a group: name, and the node that each would be in the configuration `plain`."""
     names = available(group)
     composed = _composed_choices(group, plain["scale"]["name"], tuple(names))
     changed = OmegaConf.create(dict(plain))

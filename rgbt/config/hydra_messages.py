@@ -32,10 +32,7 @@ ADDED = ("experiment", "search", "debug")
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse words that Hydra would read as something else, or leave aside with a warning.
-
-    Args:
-        words: of the command line, after the name of the command.
+    """Refuse words of a command that Hydra would misread, or leave aside with a warning.
 
     Raises:
         InputError: an unknown option, a list of seeds, a folder of configurations that is missing.
@@ -63,12 +60,7 @@ def _typed(key: str, value: str) -> str:
 
 
 def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
-    """What Hydra or OmegaConf refused, in one sentence with the nearest known name.
-
-    Args:
-        error: as raised.
-        overrides: as they were typed.
-    """
+    """What Hydra or OmegaConf refused of typed overrides, with the nearest known name."""
     if isinstance(error, MissingConfigException):
         missing = error.missing_cfg_file or ""
         group, _, name = missing.rpartition("/")
@@ -155,11 +147,9 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
 
 
 def check_key(word: str, names: Sequence[str]) -> None:
-    """Refuse an override without a dot that is no key of the configuration: an option, misspelt.
+    """Refuse a word without a dot that is no key of the configuration: a misspelt option.
 
-    Args:
-        word: as typed.
-        names: options of the command.
+    `names` are the options of the command.
     """
     key = word.lstrip("+~").partition("=")[0]
     nodes, values = top_level()

@@ -97,7 +97,15 @@ def _plain(key: str, text: str, annotation: Any) -> Any:
         if typing.get_origin(kind) is tuple:
             item = typing.get_args(kind)[0]
             return [_plain(key, each, item) for each in split_list(text, "values")]
-    return _as_hydra_reads(key, text)
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_override(f"{key}={text}")
+        # What is no single value (1,2) is refused as the text that it is.
+        return text if parsed.is_sweep_override() else parsed.value()
+    except HydraException:
+        return text
 
 
 def _leaves(annotation: Any) -> list[Any]:
@@ -117,18 +125,6 @@ def choices_of(annotation: Any) -> list[str]:
     leaves = _leaves(annotation)
     booleans = ["true", "false"] if bool in leaves else []
     return [*booleans, *(each for each in leaves if isinstance(each, str))]
-
-
-def _as_hydra_reads(key: str, text: str) -> Any:
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        parsed = OverridesParser.create().parse_override(f"{key}={text}")
-        # What is no single value (1,2) is refused as the text that it is.
-        return text if parsed.is_sweep_override() else parsed.value()
-    except HydraException:
-        return text
 
 
 def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None) -> None:

@@ -1,6 +1,9 @@
-"""Commands with options of their own: ``rgbt evaluate run=... split=val``.
+"""Commands: their names, their options, and how each of them ends.
 
-Other ``key=value`` words are overrides of the configuration. See `rgbt.config.options`.
+``rgbt NAME`` is ``python -m MODULE``. Words ``key=value`` that are no options
+(`rgbt.config.options`) are overrides of the configuration. What ends a command is one sentence on
+stderr and an exit code: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
+129, 130 and 143 stopped by SIGHUP, Ctrl-C and SIGTERM.
 """
 
 from __future__ import annotations
@@ -8,17 +11,92 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from rgbt.checks import nearest
-from rgbt.config.commands import typed_as
+from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
-from rgbt.config.reporting import exit_code, say
-from rgbt.runtime.signals import answered
+from rgbt.runtime.resources import reporting_exhaustion
+from rgbt.runtime.signals import Stopped, answered
 
 T = TypeVar("T")
 HELP = ("-h", "--help")
+
+
+class Entry(NamedTuple):
+    """What ``python -m`` runs, and one line about it."""
+
+    module: str
+    about: str
+
+
+COMMANDS = {
+    "run": Entry("rgbt.run", "train one configuration; with -m a grid or a search"),
+    "evaluate": Entry("rgbt.evaluate", "scores of a run, or of weights from a file"),
+    "predict": Entry("rgbt.predict", "class maps and overlays of images, or pseudo-labels"),
+    "consistency": Entry("rgbt.consistency", "temporal consistency (TC, CA) of a run"),
+    "robustness": Entry("rgbt.robustness", "scores under missing, noisy, occluded images"),
+    "reproduce": Entry("sweeps.reproduce", "run a published table, or one of your own (new)"),
+    "study": Entry("sweeps.study", "report of a grid or a search, also while it runs"),
+    "report": Entry("analysis.report.__main__", "one page of everything in the MLflow store"),
+    "compare": Entry("analysis.compare", "two methods: differences, intervals, p-values"),
+    "score": Entry("analysis.score", "scores by region of any method's predictions"),
+    "spatial": Entry("analysis.spatial", "what a data set looks like by region"),
+    "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
+    "check": Entry("rgbt.data.check", "read a whole data set and say what is wrong with it"),
+    "prepare": Entry(
+        "rgbt.data.prepare.__main__", "turn an official download into a data set folder"
+    ),
+    "cache": Entry("rgbt.data.cache.__main__", "decode a data set once into a cache, or remove it"),
+    "weights": Entry("rgbt.weights", "inspect a file of weights, or export those of a run"),
+    "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
+    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of one pair of images"),
+    "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
+    "scenes": Entry("rgbt.data.synth.sheet", "draw scenes of the embedded data set"),
+}
+
+
+def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
+    """Exit code of `work`; a user's mistake is reported in one sentence on stderr.
+
+    Args:
+        work: what to do.
+        catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
+    """
+    try:
+        with reporting_exhaustion():
+            return work() or 0
+    except (InputError, RunError) as error:
+        return say(str(error), 2 if isinstance(error, InputError) else 1)
+    except KeyboardInterrupt as stop:
+        if not catch_interrupt:
+            raise
+        if isinstance(stop, Stopped):
+            return say(str(stop), stop.code)
+        # A second Ctrl-C.
+        return say("interrupted; rerun the command to resume from its last checkpoint.", 130)
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
+            from rgbt.config.hydra_messages import hydra_sentence  # --help does not wait for Hydra
+
+            words = [word for word in sys.argv[1:] if not word.startswith("-")]
+            return say(hydra_sentence(error, words), 2)
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            place = f"{error.filename}: a file is where a folder is needed"
+            return say(f"{place}; name another path.", 2)
+        if isinstance(error, OSError):
+            return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
+        raise
+
+
+def say(sentence: str, code: int) -> int:
+    """Write a sentence to stderr; returns `code`."""
+    with suppress(OSError):  # output may go to a file on a disk that is full
+        sys.stdout.flush()
+    # Names of files and words of damaged files may hold anything.
+    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
+    return code
 
 
 @dataclass(frozen=True)
@@ -30,7 +108,7 @@ class PlainCommand(Generic[T]):
         main: gets the options, and all other words as overrides of the configuration; its docstring
             is the help text.
         heeds: keys of the configuration that take effect, each with all below it; None: all.
-        name: as it is typed; "": as `rgbt.config.commands` names its module.
+        name: as it is typed; "": as `COMMANDS` names its module.
         first: option that the first word sets if it has no ``=``.
     """
 
@@ -44,7 +122,7 @@ class PlainCommand(Generic[T]):
         """Run with the words of ``sys.argv``; a mistake is one sentence on stderr."""
         words = sys.argv[1:]
         if set(words) & set(HELP):
-            usage = f"{self.name or typed_as(self.main)} {self.first.upper()}".strip()
+            usage = f"{self.name or self._typed()} {self.first.upper()}".strip()
             about = inspect.getdoc(self.main) or ""
             sys.stdout.write(f"{help_text(usage, self.options, about, self.first)}\n")
             sys.exit(0)
@@ -53,6 +131,14 @@ class PlainCommand(Generic[T]):
         with answered(), searching(words):
             code = exit_code(lambda: self.run(words))
         sys.exit(code)
+
+    def _typed(self) -> str:
+        """How the command may be typed: "rgbt evaluate"."""
+        spec = getattr(sys.modules["__main__"], "__spec__", None)
+        module = self.main.__module__
+        module = spec.name if module == "__main__" and spec else module
+        names = [name for name, entry in COMMANDS.items() if entry.module == module]
+        return f"rgbt {names[0]}" if names else f"python -m {module}"
 
     def run(self, words: Sequence[str]) -> int | None:
         """Parse `words` and do it.

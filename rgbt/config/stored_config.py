@@ -81,7 +81,7 @@ def check_targets(
         InputError: naming source, key and target, and what to type.
     """
     shipped = shipped_targets(group)
-    for key, target in targets(settings):
+    for key, target in targets(settings).items():
         if isinstance(target, str) and (target in shipped or target in trust):
             continue
         home = None  # the module that defines it, where a trusted one is imported for it
@@ -92,11 +92,9 @@ def check_targets(
             raise InputError(_refusal(source, key, target, home, group))
 
 
-def targets(settings: Any) -> Iterator[tuple[str, Any]]:
-    """Dotted key and value of every ``_target_``, inside lists too."""
-    for key, value in _walk(settings):
-        if key == "_target_" or key.endswith("._target_"):
-            yield key, value
+def targets(settings: Any) -> dict[str, Any]:
+    """Every ``_target_`` by its dotted key, inside lists too."""
+    return {key: value for key, value in _walk(settings) if key.rpartition(".")[2] == "_target_"}
 
 
 def parse_trust(text: str) -> tuple[str, ...]:

@@ -24,9 +24,7 @@ from rgbt.tracking.terminal import info
 
 
 class PairFiles:
-    """The files of counts of pairs of one split.
-
-    They are written to the folder `out`, or to that of the network.
+    """The files of counts of pairs of one split, in the folder `out` or that of the network.
 
     Attributes:
         suffixes: words that end their names; (): they are the run's own measurement.

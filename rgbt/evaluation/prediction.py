@@ -109,10 +109,7 @@ def counts_of(
 def decode_ahead(session: Session, *splits: str) -> None:
     """Fill the image cache with these splits, if the session has one.
 
-    In the main process, before others read from it.
-
-    Raises:
-        InputError: the cache cannot be written.
+    In the main process, before others read from it; InputError where it cannot be written.
     """
     dataset = cached_layer(session.dataset)
     if dataset is None:

@@ -63,7 +63,7 @@ class NetworkRequest:
             )
 
     def open(self, label_map: LabelMap | None = None) -> TrainedNetwork:
-        """The network with its weights, see `rgbt.build.load_run.open_trained`."""
+        """The network with its weights (`rgbt.build.load_run.open_trained`)."""
         regions = [] if self.regions == AS_TRAINED else [f"metric={self.regions}"]
         return open_trained(
             self.options.run,
@@ -78,9 +78,7 @@ class NetworkRequest:
 def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Part of a file's name where a run is measured on images that it was not trained with.
 
-    Args:
-        dataset: that is evaluated.
-        marker: what the run knows of its own (``dataset.json``); None: nothing.
+    `marker` is its ``dataset.json``; None: it has none.
     """
     trained_on = (marker or {}).get("files")
     if trained_on in (None, found := dataset.fingerprint()):

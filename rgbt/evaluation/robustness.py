@@ -171,10 +171,9 @@ def weights_digest(model: nn.Module) -> str:
 
 def _read_json(path: Path) -> Any:
     """The mapping in a file of JSON; None where it is missing or damaged."""
-    try:
+    with suppress(InputError):
         return budgets.read_json(path, dict[str, Any], "")
-    except InputError:
-        return None
+    return None
 
 
 def counts_folder(opened: TrainedNetwork, network: NetworkRequest, split: str) -> Path:

@@ -5,7 +5,7 @@ The second frame is a virtual view of the first (frames=virtual), or a true one 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Literal, NamedTuple
@@ -103,7 +103,14 @@ def count_pairs(
     """
     assert request.corruption is None, "pairs are counted of clean images"
     split = request.split
-    _check_second_frames(session, frames)
+    # What cannot be measured is refused before anything is drawn or predicted.
+    if frames == "next":
+        NextFrames(session.dataset)
+    elif not session.consistency.sets:
+        raise InputError(
+            "consistency.sets is empty: no virtual views are named; name sets of angles, such as "
+            "consistency.sets=[released_1], or give consistency=views."
+        )
     decode_ahead(session, split)
     predictor = Predictor(session, model, request)
     found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
@@ -138,17 +145,6 @@ def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, Co
         seen = None if valid is None else valid[index]
         counts = pair_counts(first[index], second[index], label[index], num_classes, seen)
         found.setdefault(name, {})[scenes.number] = counts
-
-
-def _check_second_frames(session: Session, frames: Frames) -> None:
-    """Refuse what cannot be measured before anything is drawn or predicted."""
-    if frames == "next":
-        NextFrames(session.dataset)
-    elif not session.consistency.sets:
-        raise InputError(
-            "consistency.sets is empty: no virtual views are named; name sets of angles, such as "
-            "consistency.sets=[released_1], or give consistency=views."
-        )
 
 
 def _virtual(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
@@ -210,19 +206,15 @@ def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes
             )
         moved = [each.to(session.fabric.device) for each in (batch, later)]
         first, second = (predictor.classes(each).cpu() for each in moved)
-        followed, seen = _followed(after, batch.name, first)
+        # The first prediction at the pixels of the second frame, and where it was seen.
+        height, width = first.shape[1:]
+        sources = [np.stack(after.source(name, (height, width))) for name in batch.name]
+        rows, columns = torch.from_numpy(np.stack(sources, 1))
+        seen = rows >= 0
+        flat = (rows * width + columns).clamp(min=0).flatten(1)
+        followed = first.flatten(1).gather(1, flat).view_as(first)
         maps = Compared(followed, second, later.label, seen & (later.label != IGNORE))
         yield Scenes(batch.name, {"next": maps}, (moved[0].rgb, moved[1].rgb), first)
-
-
-def _followed(after: NextFrames, names: Iterable[str], first: Tensor) -> tuple[Tensor, Tensor]:
-    """The first prediction at the pixels of the second frame, and where it was seen."""
-    height, width = first.shape[1:]
-    places = [np.stack(after.source(name, (height, width))) for name in names]
-    rows, columns = torch.from_numpy(np.stack(places, 1))
-    seen = rows >= 0
-    flat = (rows * width + columns).clamp(min=0).flatten(1)
-    return first.flatten(1).gather(1, flat).view_as(first), seen
 
 
 def _example(scenes: Scenes, name: str, protocol: Protocol) -> PairExample:

@@ -46,7 +46,7 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
 
     Args:
         spec: the run.
-        extra_tags: of the command that asks for it (`tags_from_environment`).
+        extra_tags: see `tags_from_environment`.
     """
     params = {
         key: str(value)
@@ -61,29 +61,33 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
         "rgbt.seed": str(spec.seed),
         **(extra_tags or {}),
     }
-    return Description(_name(spec, words, tags.get(VARIED, "").split()), tags, params)
+    # What varies, a dot, and what does not; outside of a sweep everything may vary.
+    varied = tags.get(VARIED, "").split()
+    shown = {key: _word((label, _short(value))) for key, (label, value) in words.items()}
+    first = [word for key, word in shown.items() if key in varied or not varied]
+    rest = [word for word in shown.values() if word not in first]
+    seed = f"seed={spec.seed}"
+    name = f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
+    if "experiment" in varied:
+        name = " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
+    return Description(name, tags, params)
 
 
 def group_of(tags: Mapping[str, str], params: Mapping[str, str]) -> str:
     """The group of a stored run, written as `describe` writes it now; "" without one.
 
     Older runs have ``${px:64}`` for its value, and short keys with which several keys end.
-
-    Args:
-        tags: of the run.
-        params: of the run, as `describe` made them.
     """
-    return " ".join(_as_now(word, params) for word in tags.get(GROUP, "").split(" "))
-
-
-def _as_now(word: str, params: Mapping[str, str]) -> str:
-    key, equals, value = word.partition("=")
-    value = _resolved(value, key, params)
-    if equals and "." not in key:
-        same = [each for each in _ending(key, params) if params.get(each) == value]
-        is_clear = len(_ending(key, params)) < 2 or len(same) != 1 or key in params
-        key = key if is_clear else same[0]
-    return f"{key}{equals}{value}"
+    found = []
+    for word in tags.get(GROUP, "").split(" "):
+        key, equals, value = word.partition("=")
+        value = _resolved(value, key, params)
+        if equals and "." not in key:
+            same = [each for each in _ending(key, params) if params.get(each) == value]
+            is_clear = len(_ending(key, params)) < 2 or len(same) != 1 or key in params
+            key = key if is_clear else same[0]
+        found.append(f"{key}{equals}{value}")
+    return " ".join(found)
 
 
 def _words(overrides: Sequence[str], params: Mapping[str, str]) -> dict[str, tuple[str, str]]:
@@ -123,17 +127,6 @@ def _resolved(value: str, key: str, params: Mapping[str, str]) -> str:
     if factor is not None:
         value = with_pixels(value, float(factor))
     return params.get(key, value) if "${" in value else value
-
-
-def _name(spec: RunSpec, words: Mapping[str, tuple[str, str]], varied: Sequence[str]) -> str:
-    """What varies, a dot, and what does not; outside of a sweep everything may vary."""
-    shown = {key: _word((label, _short(value))) for key, (label, value) in words.items()}
-    first = [word for key, word in shown.items() if key in varied or not varied]
-    rest = [word for word in shown.values() if word not in first]
-    seed = f"seed={spec.seed}"
-    if "experiment" in varied:
-        return " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
-    return f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
 
 
 def _short(value: str) -> str:

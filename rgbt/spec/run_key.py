@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.config.component import target_names
+from rgbt.config.stored_config import targets
 from rgbt.files.budgets import read_json
 from rgbt.spec.source_code import user_code
 
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
     """12 hexadecimal digits over settings, and over the user's own code that they name."""
-    code = user_code(target_names(settings))
+    code = user_code(targets(settings).values())
     text = json.dumps({**settings, **({"code": code} if code else {})}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 

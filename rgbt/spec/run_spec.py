@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, target_names
+from rgbt.config.component import Component
+from rgbt.config.stored_config import targets
 from rgbt.data.domains import GIVEN, NONE, Domains
 from rgbt.data.loaders import LoaderSettings
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
@@ -251,7 +252,7 @@ class RunSpec:
 
     def own_code(self) -> dict[str, str]:
         """Digest or version of the user's own code in the run, by module (see `user_code`)."""
-        return dict(user_code(target_names(self.plain)))
+        return dict(user_code(targets(self.plain).values()))
 
     def _content(self, key: str, value: str) -> str:
         """What stands for a file, a folder or an upstream run in the key."""

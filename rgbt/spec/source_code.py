@@ -43,7 +43,12 @@ def user_code(targets: Iterable[str]) -> tuple[Used, ...]:
         distribution and its version. () where every target is released. Each module is read once
         per process, so that the answer belongs to the code that this process has loaded.
     """
-    own = {_module_of(each) for each in targets if each.split(".")[0] not in RELEASED}
+    own = set()
+    for target in (each for each in targets if each.split(".")[0] not in RELEASED):
+        name = target.rpartition(".")[0]
+        while "." in name and _place(name) is None:  # the longest beginning that is a module
+            name = name.rpartition(".")[0]
+        own.add(name)
     for module in own - set(_used_by):
         _used_by[module] = tuple(_follow(module))
     return tuple(sorted({used for module in own for used in _used_by[module]}))
@@ -61,19 +66,12 @@ def loaded_modules() -> list[str]:
     return [name for name, file in files if name.split(".")[0] not in RELEASED and _is_own(file)]
 
 
-def _module_of(target: str) -> str:
-    """The longest beginning of a target that is a module."""
-    name = target.rpartition(".")[0]
-    while "." in name and _place(name) is None:
-        name = name.rpartition(".")[0]
-    return name
-
-
 def _follow(module: str) -> Iterator[Used]:
     """What `user_code` gives for one module."""
     place = _place(module)
     if place is not None and INSTALLED & set(Path(place[0] or "").parts):
-        yield from _distributions(module.split(".")[0])
+        packages = metadata.packages_distributions().get(module.split(".")[0], ())
+        yield from ((name, metadata.version(name)) for name in sorted(set(packages)))
         return
     waiting = [*_with_packages(module)]
     seen: set[str] = set()
@@ -85,11 +83,6 @@ def _follow(module: str) -> Iterator[Used]:
             digest, imported = _read(name, Path(place[0]))
             waiting += imported
             yield name, digest
-
-
-def _distributions(package: str) -> Iterator[Used]:
-    for name in sorted(set(metadata.packages_distributions().get(package, ()))):
-        yield name, metadata.version(name)
 
 
 def _place(name: str) -> tuple[str | None, Any] | None:
@@ -120,11 +113,11 @@ def _is_own(file: str | None) -> bool:
 def _read(name: str, file: Path) -> tuple[str, list[str]]:
     """Digest of a module's code, and what it imports."""
     content = file.read_bytes()
-    if file.suffix != ".py":  # a compiled library
-        return hashlib.sha256(content).hexdigest(), []
     try:
-        tree = ast.parse(content)
+        tree = ast.parse(content) if file.suffix == ".py" else None
     except SyntaxError:  # imported in a function that has not been called
+        tree = None
+    if tree is None:  # or a compiled library
         return hashlib.sha256(content).hexdigest(), []
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     return hashlib.sha256(repr(_structure(tree)).encode()).hexdigest(), [*_imports(tree, package)]

@@ -46,17 +46,15 @@ def _as_text(cell: object) -> object:
     if not isinstance(cell, str):
         return cell
     text = cell.replace("\r", "\n")  # the writer does not quote a carriage return
-    return f"'{text}" if FORMULA.match(text) and not _is_number(text) else text
+    if not FORMULA.match(text):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
 
 
 def _original(cell: Any) -> Any:
     is_marked = isinstance(cell, str) and cell.startswith("'") and FORMULA.match(cell) is not None
     return cell[1:] if is_marked else cell
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

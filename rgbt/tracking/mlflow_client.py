@@ -9,7 +9,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,9 +75,16 @@ def open_store(uri: str, artifact_uri: str | None, experiment: str) -> MlflowSto
     """
     check_reachable(uri)
     make_client = quiet_client()  # imported before others wait for the lock
-    with _alone(uri):
+    # Two processes that create the tables of one SQLite file together break it.
+    database = Path(uri.removeprefix("sqlite:///"))
+    lock = database.with_name(f".{database.name}.lock")
+    is_file = uri.startswith("sqlite:///")
+    if is_file:
+        database.parent.mkdir(parents=True, exist_ok=True)
+    with locked(lock) if is_file else nullcontext():
         client = make_client(tracking_uri=uri)
-        found = _experiment(client, experiment, artifact_uri)
+        found = client.get_experiment_by_name(experiment)
+        found = found or _created(client, experiment, artifact_uri)
     tags = {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}
     for name, value in tags.items():
         if found.tags.get(name) != value:
@@ -135,23 +142,8 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def _alone(uri: str) -> Iterator[None]:
-    """One process at a time: two that create the tables of one SQLite file together break it."""
-    if not uri.startswith("sqlite:///"):
-        yield
-        return
-    database = Path(uri.removeprefix("sqlite:///"))
-    database.parent.mkdir(parents=True, exist_ok=True)
-    with locked(database.with_name(f".{database.name}.lock")):
-        yield
-
-
-def _experiment(client: Any, name: str, artifact_uri: str | None) -> Any:
-    """The experiment of that name; another machine may be creating it at this moment."""
-    found = client.get_experiment_by_name(name)
-    if found is not None:
-        return found
+def _created(client: Any, name: str, artifact_uri: str | None) -> Any:
+    """A new experiment; another machine may be creating it at this moment."""
     try:
         client.create_experiment(name, artifact_location=artifact_uri)
     except Exception:

@@ -133,18 +133,15 @@ class MlflowTracking(Tracking):
             sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
         except Exception as error:  # The one border: a dead tracker never stops a training.
             self._quiet_until = time.monotonic() + PAUSE_S
-            self._warn(error)
-
-    def _warn(self, error: Exception) -> None:
-        if self._warned or self._folder is None:
-            return
-        self._warned = True
-        reason = (str(error).splitlines() or [""])[0][:120]
-        sys.stderr.write(
-            f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
-            f"({type(error).__name__}: {without_passwords(reason)}). The run continues; "
-            f"`{sync_command(self._folder)}` sends it later.\n"
-        )
+            if self._warned:
+                return
+            self._warned = True
+            reason = (str(error).splitlines() or [""])[0][:120]
+            sys.stderr.write(
+                f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
+                f"({type(error).__name__}: {without_passwords(reason)}). The run continues; "
+                f"`{sync_command(self._folder)}` sends it later.\n"
+            )
 
 
 def sync_command(folder: RunFolder) -> str:

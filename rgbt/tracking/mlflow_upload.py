@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +22,22 @@ from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
 from rgbt.metrics.names import shown
 from rgbt.tracking.mlflow_client import MlflowStore
-from rgbt.tracking.mlflow_run import identity, new_run, noted_run, short_name, unnoted_run
-from rgbt.tracking.replaced_runs import shown_description
-from rgbt.tracking.run_files import read_provenance, read_result, read_tables
+from rgbt.tracking.replaced_runs import shown_description, shown_key
+from rgbt.tracking.run_files import Description, read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
 from rgbt.tracking.tables import ResultTables, result_grids, without_nan
 from rgbt.tracking.tracker import Status
 
+NAME_LENGTH = 250
+"""Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
+
 PARAM_LENGTH = 500
 """Characters of a parameter's value that are sent; MLflow's pages show far fewer."""
 
-BATCH_LENGTH = 1000
-"""Metrics in one call, MLflow's limit."""
+TAG_LENGTH = 5000
+
+BATCH_LENGTH, BATCH_PARAMS = 1000, 100
+"""Metrics and parameters in one call, MLflow's limits."""
 
 FILES = (
     "config.yaml",
@@ -101,7 +106,9 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         sent: what that store has.
         status: the state to show.
     """
-    known_params, seen, name = _find_run(store, folder, sent)
+    description = shown_description(folder)
+    assert description is not None, f"{folder.path}: describe() comes before upload()"
+    run = _run_of(store, folder, sent, description)
     tables = read_tables(folder.path)
     every = folder.lines()
     lines = [line for line in every if line.step > sent.steps.get(line.kind, -1)]
@@ -111,46 +118,107 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         sent.profile = True
     later = _later(folder, every, sent)
     metrics += later.values()
-    _send(store, sent, (metrics, _params(folder, known_params), _tags(folder, tables)))
+    _send(store, folder, sent, (metrics, set(run.data.params), description, tables))
     sent.steps |= {line.kind: line.step for line in lines}
     sent.later += later
-    _send_table(store, sent, tables)
-    _send_files(store, folder, sent)
-    description = shown_description(folder)
-    if description is not None and short_name(description.name) != name:
-        store.client.update_run(sent.run_id, name=short_name(description.name))
-    if status == "RUNNING" and seen != status:
+    _send_files(store, folder, sent, tables)
+    name = _short(description.name)
+    if name != run.info.run_name:
+        store.client.update_run(sent.run_id, name=name)
+    if status == "RUNNING" and run.info.status != status:
         store.client.update_run(sent.run_id, status=status)
-    elif status != seen:
-        store.client.set_terminated(sent.run_id, status=status, end_time=_end_time(folder))
+    elif status != run.info.status:
+        written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
+        end = max(path.stat().st_mtime for path in written if path.exists())
+        store.client.set_terminated(sent.run_id, status=status, end_time=round(1000 * end))
     write_upload_state(folder, sent)
 
 
-def _find_run(
-    store: MlflowStore, folder: RunFolder, sent: UploadState
-) -> tuple[set[str], str, str]:
-    """Its parameters' names, status and name; the run is made if the store does not know it."""
-    run = noted_run(store, sent.run_id)
+def _run_of(
+    store: MlflowStore, folder: RunFolder, sent: UploadState, description: Description
+) -> Any:
+    """The MLflow run of the folder: the one that ``mlflow.json`` names, an unnoted or a new one.
+
+    A run that was deleted in the pages takes nothing more; its folder gets a new one.
+    """
+    from mlflow.exceptions import MlflowException
+
+    try:
+        run = store.client.get_run(sent.run_id) if sent.run_id else None
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        run = None
+    if run is not None and run.info.lifecycle_stage == "active":
+        return run
+    # A process that was killed may have made the run without noting its id; it would stay in the
+    # pages as running for ever. The start keeps runs of one key apart that were trained again.
+    entry = (read_provenance(folder.path / "provenance.json") or [{}])[0]
+    first = entry.get("started")
+    seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
+    start = round(1000 * seconds)
+    found = store.client.search_runs([store.experiment_id], f"attributes.start_time = {start}")
+    # Compared here: MLflow's search cannot quote every path.
+    tags = _identity(folder)
+    run = next((each for each in found if tags.items() <= each.data.tags.items()), None)
     if run is None:
-        run = unnoted_run(store, folder) or new_run(store, folder)
-        sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
-        sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
-        write_upload_state(folder, sent)
-    return set(run.data.params), str(run.info.status), str(run.info.run_name)
+        run = store.client.create_run(
+            store.experiment_id, start_time=start, tags=tags, run_name=_short(description.name)
+        )
+    sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
+    sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
+    write_upload_state(folder, sent)
+    return run
+
+
+def _identity(folder: RunFolder) -> dict[str, str]:
+    """Tags that are set in the call that makes a run, and by which it is found."""
+    return {"rgbt.key": shown_key(folder), "rgbt.folder": str(folder.path)}
+
+
+def _short(name: str) -> str:
+    """A run's name as MLflow takes it; the whole one stays in the folder."""
+    return name if len(name) <= NAME_LENGTH else f"{name[: NAME_LENGTH - 4]} ..."
 
 
 def _send(
-    store: MlflowStore, sent: UploadState, entities: tuple[list[Any], list[Any], list[Any]]
+    store: MlflowStore,
+    folder: RunFolder,
+    sent: UploadState,
+    found: tuple[list[Any], set[str], Description, ResultTables | None],
 ) -> None:
-    """One call with everything new; more only beyond MLflow's limits on one call."""
-    metrics, params, tags = entities
-    store.client.log_batch(
-        sent.run_id, metrics=metrics[:BATCH_LENGTH], params=params[:100], tags=tags
+    """One call with metrics, tags and parameters; more only beyond MLflow's limits on one call."""
+    from mlflow.entities import Param, RunTag
+
+    metrics, known, description, tables = found
+    # MLflow refuses to change a parameter.
+    new = {name: value for name, value in description.params.items() if name not in known}
+    params = [Param(name, value[:PARAM_LENGTH]) for name, value in new.items()]
+    first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
+    tags = {
+        "mlflow.user": getpass.getuser(),
+        "mlflow.source.type": "LOCAL",
+        "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
+        "rgbt.command": first.get("command", ""),
+        "mlflow.source.git.commit": first.get("git_commit") or "",
+        "rgbt.dataset": (read_result(folder.path) or {}).get("dataset", ""),
+        **_identity(folder),
+        **description.tags,
+    }
+    if tables is not None:
+        tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
+        tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
+    client, run_id = store.client, sent.run_id
+    client.log_batch(
+        run_id,
+        metrics=metrics[:BATCH_LENGTH],
+        params=params[:BATCH_PARAMS],
+        tags=[RunTag(name, value[:TAG_LENGTH]) for name, value in tags.items() if value],
     )
     for start in range(BATCH_LENGTH, len(metrics), BATCH_LENGTH):
-        store.client.log_batch(sent.run_id, metrics=metrics[start : start + BATCH_LENGTH])
-    for start in range(100, len(params), 100):
-        store.client.log_batch(sent.run_id, params=params[start : start + 100])
+        client.log_batch(run_id, metrics=metrics[start : start + BATCH_LENGTH])
+    for start in range(BATCH_PARAMS, len(params), BATCH_PARAMS):
+        client.log_batch(run_id, params=params[start : start + BATCH_PARAMS])
 
 
 def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
@@ -179,17 +247,14 @@ def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dic
     """
     from mlflow.entities import Metric
 
-    result = read_result(folder.path)
-    if result is None:
-        return {}
-    held = {f"{line.kind}/{name}" for line in lines if line.kind == "test" for name in line.values}
+    result = read_result(folder.path) or {}
+    known = {f"test/{name}" for line in lines if line.kind == "test" for name in line.values}
     found = {}
     for kind in ("val", "test"):
         for name, value in (result.get(kind) or {}).items():
             key = f"{kind}/{name}"
-            if name.split("/")[0] not in (names.TC, names.CA) or key in held or key in sent.later:
-                continue
-            if value is not None:
+            is_pairs = name.split("/")[0] in (names.TC, names.CA)
+            if is_pairs and value is not None and key not in known and key not in sent.later:
                 label = name if kind == "test" else key
                 time_ms = round(1000 * lines[-1].time)
                 found[key] = Metric(label, shown(name, value), time_ms, 0)
@@ -200,42 +265,12 @@ def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
     """IoU over the regions as a line: the step is the region's number."""
     from mlflow.entities import Metric
 
-    times = [line.time for line in lines] or [time.time()]
+    last = lines[-1].time if lines else time.time()
     return [
-        Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * times[-1]), region)
+        Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * last), region)
         for region, iou in enumerate(tables.regions.region_ious, start=1)
         if math.isfinite(iou)
     ]
-
-
-def _params(folder: RunFolder, known: set[str]) -> list[Any]:
-    """Parameters the run does not have yet; MLflow refuses to change one."""
-    from mlflow.entities import Param
-
-    description = shown_description(folder)
-    params = {} if description is None else description.params
-    return [Param(k, v[:PARAM_LENGTH]) for k, v in params.items() if k not in known]
-
-
-def _tags(folder: RunFolder, tables: ResultTables | None) -> list[Any]:
-    from mlflow.entities import RunTag
-
-    description = shown_description(folder)
-    first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
-    tags = {
-        "mlflow.user": getpass.getuser(),
-        "mlflow.source.type": "LOCAL",
-        "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
-        "rgbt.command": first.get("command", ""),
-        "mlflow.source.git.commit": first.get("git_commit") or "",
-        "rgbt.dataset": (read_result(folder.path) or {}).get("dataset", ""),
-        **identity(folder),
-        **({} if description is None else description.tags),
-    }
-    if tables is not None:
-        tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
-        tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
-    return [RunTag(name, value[:5000]) for name, value in tags.items() if value]
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
@@ -264,18 +299,16 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
     return {"columns": ["score", "IoU %", "accuracy %"], "data": data}
 
 
-def _send_table(store: MlflowStore, sent: UploadState, tables: ResultTables | None) -> None:
-    if tables is None:
-        return
-    text = json.dumps(artifact_table(tables))
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    if sent.files.get(TABLE_FILE) != digest:
-        store.client.log_text(sent.run_id, text, TABLE_FILE)
-        sent.files[TABLE_FILE] = digest
-
-
-def _send_files(store: MlflowStore, folder: RunFolder, sent: UploadState) -> None:
-    """Upload files that are new or changed, under their path in the folder."""
+def _send_files(
+    store: MlflowStore, folder: RunFolder, sent: UploadState, tables: ResultTables | None
+) -> None:
+    """Upload the table and files that are new or changed, under their path in the folder."""
+    if tables is not None:
+        text = json.dumps(artifact_table(tables))
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        if sent.files.get(TABLE_FILE) != digest:
+            store.client.log_text(sent.run_id, text, TABLE_FILE)
+            sent.files[TABLE_FILE] = digest
     for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
         inside = path.relative_to(folder.path)
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -283,10 +316,3 @@ def _send_files(store: MlflowStore, folder: RunFolder, sent: UploadState) -> Non
             parent = None if inside.parent == Path() else str(inside.parent)
             store.client.log_artifact(sent.run_id, str(path), parent)
             sent.files[str(inside)] = digest
-
-
-def _end_time(folder: RunFolder) -> int:
-    """Milliseconds since 1970 of the last thing the run wrote."""
-    names = ("result.json", "metrics.jsonl", "run.json")
-    times = [(folder.path / n).stat().st_mtime for n in names if (folder.path / n).exists()]
-    return round(1000 * max(times))

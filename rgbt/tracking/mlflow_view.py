@@ -50,6 +50,33 @@ COLUMNS = (
 )
 """Metrics that are columns of the runs table; those that no run has do not appear."""
 
+PROFILE = {
+    "metricKey": names.REGION_PROFILE,
+    "xAxisKey": "step",
+    "xAxisScaleType": "linear",
+    "scaleType": "linear",
+    "range": {},
+    "lineSmoothness": 0,
+    "displayPoints": True,
+    "selectedXAxisMetricKey": "",
+    "yAxisKey": "metric",
+    "yAxisExpressions": [],
+    "ignoreOutliers": False,
+    "useGlobalXaxisKey": False,
+    "useGlobalLineSmoothing": False,
+}
+AXES = {
+    "xaxis": {"key": names.VAR, "type": "METRIC"},
+    "yaxis": {"key": names.MIOU, "type": "METRIC"},
+}
+CHARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("BAR", "miou", {"metricKey": names.MIOU}),
+    ("BAR", "variance", {"metricKey": names.VAR}),
+    ("LINE", "profile", PROFILE),
+    ("SCATTER", "trade-off", AXES),
+)
+"""Charts of the headline section."""
+
 
 def view_tags() -> dict[str, str]:
     """Tags of an experiment that hold both views: every run, and means over runs of one group."""
@@ -103,46 +130,16 @@ def _state(group_by: dict[str, Any] | None) -> dict[str, Any]:
             {"uuid": name, "name": name, "display": unfolded, "isReordered": True}
             for name, unfolded in SECTIONS.items()
         ],
-        "compareRunCharts": _charts(),
-    }
-
-
-def _charts() -> list[dict[str, Any]]:
-    """The charts of the headline section."""
-    profile = {
-        "metricKey": names.REGION_PROFILE,
-        "xAxisKey": "step",
-        "xAxisScaleType": "linear",
-        "scaleType": "linear",
-        "range": {},
-        "lineSmoothness": 0,
-        "displayPoints": True,
-        "selectedXAxisMetricKey": "",
-        "yAxisKey": "metric",
-        "yAxisExpressions": [],
-        "ignoreOutliers": False,
-        "useGlobalXaxisKey": False,
-        "useGlobalLineSmoothing": False,
-    }
-    scatter = {
-        "xaxis": {"key": names.VAR, "type": "METRIC"},
-        "yaxis": {"key": names.MIOU, "type": "METRIC"},
-    }
-    return [
-        _chart("BAR", "miou", {"metricKey": names.MIOU}),
-        _chart("BAR", "variance", {"metricKey": names.VAR}),
-        _chart("LINE", "profile", profile),
-        _chart("SCATTER", "trade-off", scatter),
-    ]
-
-
-def _chart(kind: str, key: str, settings: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "uuid": f"rgbt {key}",
-        "type": kind,
-        "runsCountToCompare": 100,
-        "metricSectionId": HEADLINE,
-        "deleted": False,
-        "isGenerated": False,
-        **settings,
+        "compareRunCharts": [
+            {
+                "uuid": f"rgbt {key}",
+                "type": kind,
+                "runsCountToCompare": 100,
+                "metricSectionId": HEADLINE,
+                "deleted": False,
+                "isGenerated": False,
+                **settings,
+            }
+            for kind, key, settings in CHARTS
+        ],
     }

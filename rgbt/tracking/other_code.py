@@ -31,8 +31,11 @@ def other_code(folder: Path) -> str | None:
     """
     now = code()
     for entry in _contributing(read_provenance(folder / "provenance.json")):
-        if _differs(entry, _diff(folder, entry), now):
-            return f"{_version(entry)} of {str(entry.get('started'))[:10]}, now {_now(entry, now)}"
+        if _differs(folder, entry, now):
+            same = entry.get("git_commit") and entry["git_commit"] == now["git_commit"]
+            present = _version(now).removeprefix("commit ")
+            present = "with other uncommitted changes" if same else present
+            return f"{_version(entry)} of {str(entry.get('started'))[:10]}, now {present}"
     return None
 
 
@@ -71,26 +74,15 @@ def _contributing(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any
     return found
 
 
-def _differs(entry: Mapping[str, Any], diff: str | None, now: Mapping[str, Any]) -> bool:
+def _differs(folder: Path, entry: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     if entry.get("code"):
         return bool(entry["code"] != now["code"])
     if not entry.get("git_commit") or not now["git_commit"]:
         return False
-    is_other_diff = diff is not None and diff != now["diff"]
-    return bool(entry["git_commit"] != now["git_commit"] or is_other_diff)
-
-
-def _diff(folder: Path, entry: Mapping[str, Any]) -> str | None:
-    """Uncommitted changes of an entry; None where the folder does not hold them."""
-    if not entry.get("diff"):
-        return ""
-    path = folder / str(entry["diff"])
-    return path.read_text() if path.is_file() else None
-
-
-def _now(entry: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    same = entry.get("git_commit") and entry["git_commit"] == now["git_commit"]
-    return "with other uncommitted changes" if same else _version(now).removeprefix("commit ")
+    path = folder / str(entry["diff"]) if entry.get("diff") else None
+    diff = path.read_text() if path is not None and path.is_file() else ""
+    is_known = path is None or path.is_file()
+    return bool(entry["git_commit"] != now["git_commit"] or (is_known and diff != now["diff"]))
 
 
 def _version(entry: Mapping[str, Any]) -> str:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from rgbt.types import IGNORE
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Image = NDArray[np.uint8]
@@ -65,14 +64,7 @@ class Legend:
 
 
 def colours(label: Image, palette: Image) -> Image:
-    """Class indices as colours.
-
-    Args:
-        label: (H, W) uint8, class index or 255 = ignore.
-        palette: (K, 3) uint8.
-
-    Returns:
-        (H, W, 3) uint8; ignored pixels are `IGNORED_COLOUR`.
+    """Classes (H, W) uint8 as colours (H, W, 3) of a palette (K, 3); 255 is `IGNORED_COLOUR`.
 
     Raises:
         ValueError: a label is neither below K nor 255.
@@ -91,13 +83,10 @@ def overlay(rgb: Image, label: Image, palette: Image, alpha: float = 0.6) -> Ima
         out = round((1 - alpha) * rgb + alpha * palette[label])
 
     Args:
-        rgb: (H, W, 3) uint8.
+        rgb: (H, W, 3) uint8, as is what is returned.
         label: (H, W) uint8, class index or 255.
         palette: (K, 3) uint8.
         alpha: opacity of the paint in [0, 1].
-
-    Returns:
-        (H, W, 3) uint8.
 
     Raises:
         ValueError: image and label differ in size.
@@ -156,11 +145,21 @@ def draw_columns(
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
     for row, (name, pictures) in zip(axes, rows, strict=True):
         for axis, picture in zip(row, pictures, strict=True):
-            _image(axis, picture)
+            axis.imshow(picture, interpolation="nearest")
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
         row[0].set_ylabel(_broken(name, int(cell_h / LETTER_INCHES)), fontsize=8)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=10)
-    _class_legend(figure, legend)
+    from matplotlib.patches import Patch
+
+    patches = [
+        Patch(facecolor=colour / 255.0, edgecolor="grey", label=name)
+        for name, colour in zip(legend.names, legend.palette, strict=True)
+    ]
+    figure.legend(
+        handles=patches, loc="outside lower center", ncols=min(len(patches), 9), fontsize=8
+    )
     figure.savefig(path)
 
 
@@ -266,21 +265,3 @@ def _figure(width_inches: float, height_inches: float) -> Figure:
     figure = Figure(figsize=(width_inches, height_inches), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def _image(axis: Axes, picture: Image) -> None:
-    axis.imshow(picture, interpolation="nearest")
-    axis.set(xticks=[], yticks=[])
-    for spine in axis.spines.values():
-        spine.set_visible(False)
-
-
-def _class_legend(figure: Figure, legend: Legend) -> None:
-    from matplotlib.patches import Patch
-
-    patches = [
-        Patch(facecolor=colour / 255.0, edgecolor="grey", label=name)
-        for name, colour in zip(legend.names, legend.palette, strict=True)
-    ]
-    columns = min(len(patches), 9)
-    figure.legend(handles=patches, loc="outside lower center", ncols=columns, fontsize=8)

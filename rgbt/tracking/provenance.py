@@ -30,12 +30,12 @@ def provenance() -> dict[str, Any]:
     """What is needed to say how this process's results were made.
 
     Returns:
-        ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords hidden), ``cwd``,
-        ``pid``, ``git_commit`` and ``git_dirty`` (None where this code is not under git),
-        ``untracked`` (files the diff does not show), ``diff`` (text), ``code`` (`package_digest`),
-        ``threads`` (of torch on the CPU), ``python``, ``packages``
-        (name -> version), ``host``, ``platform``, ``cpu``, ``cpu_count``, ``cpu_usable``,
-        ``memory_gib``, ``gpus`` (names), ``cuda``.
+        ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords hidden), ``cwd``, ``pid``,
+        ``git_commit`` and ``git_dirty`` (None where this code is not under git), ``untracked``
+        (files the diff does not show), ``diff`` (text), ``code`` (`package_digest`), ``python``,
+        ``packages`` (name -> version), and the machine: ``threads`` (of torch on the CPU),
+        ``host``, ``platform``, ``cpu``, ``cpu_count``, ``cpu_usable``, ``memory_gib``, ``gpus``
+        (names), ``cuda``.
     """
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -178,22 +178,17 @@ def _machine() -> dict[str, Any]:
 
     gpus = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    model = [line.partition(":")[2] for line in lines if line.startswith("model name")]
     return {
         "threads": torch.get_num_threads(),
         "host": platform.node(),
         "platform": platform.platform(),
-        "cpu": _cpu_model(Path("/proc/cpuinfo")),
+        "cpu": model[0].strip() if model else platform.processor() or platform.machine(),
         "cpu_count": os.cpu_count(),
         "cpu_usable": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
         "memory_gib": round(memory / 2**30, 1),
         "gpus": [torch.cuda.get_device_name(index) for index in gpus],
         "cuda": torch.version.cuda,
     }
-
-
-def _cpu_model(cpuinfo: Path) -> str:
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

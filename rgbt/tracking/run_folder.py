@@ -26,8 +26,8 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -132,18 +132,16 @@ class RunFolder:
         if diff:
             write_atomic(self.path / name, diff.encode())
         plain = {**entry, "diff": name if diff else None}
-        self._write_provenance([*before, plain])
+        self._write_json("provenance.json", [*map(sealed, before), sealed(plain)])
 
     def begin_at(self, step: int) -> None:
         """Note the step at which the last process of ``provenance.json`` began."""
-        entries = self._provenance()
-        self._write_provenance([*entries[:-1], {**entries[-1], "from_step": step}])
+        *before, last = self._provenance()
+        entries = [*before, {**last, "from_step": step}]
+        self._write_json("provenance.json", [*map(sealed, entries)])
 
     def _provenance(self) -> list[dict[str, Any]]:
         return read_provenance(self.path / "provenance.json")
-
-    def _write_provenance(self, entries: Sequence[Mapping[str, Any]]) -> None:
-        self._write_json("provenance.json", [sealed(each) for each in entries])
 
     def describe(self, description: Description) -> None:
         """Write how a tracker shall show this run."""
@@ -274,18 +272,10 @@ def find_run(run: str, runs_dir: Path) -> Path:
         if (folder / "config.yaml").is_file():
             return folder.resolve()
     for sent in sorted((*runs_dir.glob("*/mlflow.json"), *runs_dir.glob("replaced/*/mlflow.json"))):
-        if _sent_as(sent) == run:
-            return sent.parent.resolve()
+        with suppress(InputError):  # a damaged one names no run
+            if str(read_json(sent, dict[str, Any], "").get("run_id")) == run:
+                return sent.parent.resolve()
     raise InputError(
         f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
         f"{runs_dir.resolve()}; list that folder to see the runs, or name another with runs_dir=..."
     )
-
-
-def _sent_as(sent: Path) -> str | None:
-    """The MLflow run id in ``mlflow.json``; None where the file is damaged."""
-    try:
-        found = read_json(sent, dict[str, Any], "")
-    except InputError:
-        return None
-    return str(found.get("run_id"))

@@ -95,12 +95,9 @@ def status_of(folder: RunFolder) -> Status:
     return "RUNNING" if folder.is_locked() else "KILLED"
 
 
-def sync_all(options: Options) -> int:
-    """Send every folder; 1 if one of them could not be sent.
-
-    Raises:
-        InputError: see `folders_of`; of ``run=...`` also `tracking_of`, and a damaged file.
-    """
+def main(options: Options, overrides: list[str]) -> int:
+    """Send run folders to MLflow. Safe to repeat: only what a store does not have is sent."""
+    del overrides  # none is heeded
     stores: dict[tuple[str, str], MlflowTracking] = {}
     failed = 0
     busy: dict[str, StoreBusyError] = {}
@@ -127,12 +124,6 @@ def sync_all(options: Options) -> int:
         if not uri.startswith("http"):
             sys.stdout.write(f"open MLflow  {ui_command(uri)}\n")
     return 1 if failed else 0
-
-
-def main(options: Options, overrides: list[str]) -> int:
-    """Send run folders to MLflow. Safe to repeat: only what a store does not have is sent."""
-    del overrides  # none is heeded
-    return sync_all(options)
 
 
 entry = PlainCommand(Options, main, heeds=())

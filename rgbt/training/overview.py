@@ -22,10 +22,11 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
     batch = session.loading.batch_size * trainer.accumulate
     epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
+    counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.read_splits()]
     lines = [
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
-        ("images", f"{session.dataset.name}: {_images(setup)}"),
+        ("images", f"{session.dataset.name}: {', '.join(counts)}"),
         (
             "steps",
             f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), "
@@ -64,9 +65,3 @@ def _write(*lines: str) -> None:
 
 def _millions(network: nn.Module) -> str:
     return f"{sum(each.numel() for each in network.parameters()) / MILLION:.2f} M"
-
-
-def _images(setup: TrainingSetup) -> str:
-    """Numbers of images by split: those of the training, of the selection and of the test."""
-    counts = ((len(setup.session.dataset.names(each)), each) for each in setup.read_splits())
-    return ", ".join(f"{count} {split}" for count, split in counts)

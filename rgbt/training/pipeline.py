@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from rgbt.build.load_run import open_run
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
-from rgbt.config.component import target_names
 from rgbt.config.compose import flatten
+from rgbt.config.stored_config import targets
 from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
@@ -41,19 +41,29 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     Raises:
         InputError: see `validate` and `train`; the message names the upstream run that is wrong.
     """
-    if run.fresh:
-        _warn_of_other_code(run)
+    for dependency in run.dependencies if run.fresh else ():  # fresh=true does not repeat them
+        spec = dependency.run
+        made_by = other_code(spec.folder) if spec.is_finished else None
+        if made_by is not None:
+            warn(
+                f"the upstream run {spec.folder} ({dependency.key}) was made by other "
+                f"code ({made_by}) and is used as it is; to train it again, run "
+                f"+experiment={spec.name} with fresh=true."
+            )
     if run.is_finished and not run.fresh:
         train(run, extra_tags)  # shows the result
         return
     specs = topological_order(run)
-    if not _is_upstream_finished(run):
+    labels = [run.labels_folder(name) for name in run.domains.named]
+    has_labels = all(each is None or (each / MANIFEST).is_file() for each in labels)
+    if not has_labels or not all(each.is_finished for each in run.upstream):
         for spec in specs:
             with _naming(spec, run):
                 validate(spec)
     for spec in specs:
         with _naming(spec, run):
-            _write_labels(spec)
+            for teacher in (each for each in spec.dependencies if each.key != WEIGHTS):
+                _predict_labels(spec, teacher)
             if spec is run:
                 train(run, extra_tags)
             else:
@@ -67,25 +77,6 @@ def topological_order(run: RunSpec) -> list[RunSpec]:
         if not spec.is_finished:
             order |= {each.key: each for each in topological_order(spec)}
     return [*order.values(), run]
-
-
-def _is_upstream_finished(spec: RunSpec) -> bool:
-    folders = [spec.labels_folder(name) for name in spec.domains.named]
-    has_labels = all(each is None or (each / MANIFEST).is_file() for each in folders)
-    return has_labels and all(each.is_finished for each in spec.upstream)
-
-
-def _warn_of_other_code(run: RunSpec) -> None:
-    """Name the finished upstream runs that other code made: fresh=true does not repeat them."""
-    for dependency in run.dependencies:
-        spec = dependency.run
-        made_by = other_code(spec.folder) if spec.is_finished else None
-        if made_by is not None:
-            warn(
-                f"the upstream run {spec.folder} ({dependency.key}) was made by other "
-                f"code ({made_by}) and is used as it is; to train it again, run "
-                f"+experiment={spec.name} with fresh=true."
-            )
 
 
 @contextmanager
@@ -117,14 +108,8 @@ def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
                 raise
 
 
-def _write_labels(spec: RunSpec) -> None:
-    """Predict the pseudo-labels of a run with the networks of its upstream runs."""
-    for dependency in spec.dependencies:
-        if dependency.key != WEIGHTS:
-            _predict_labels(spec, dependency)
-
-
 def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
+    """Predict the pseudo-labels of a run with the network of an upstream run."""
     name = teacher.key.split(".")[1]
     folder, domain = spec.labels_folder(name), spec.domains.named[name]
     assert folder is not None, "the domain takes labels of an upstream run"
@@ -139,7 +124,7 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     ]
     checkpoint = teacher.checkpoint.removesuffix(".pt")
     # Its configuration was composed by this command, so that its targets are the user's own.
-    trust = list(target_names(teacher.run.plain))
+    trust = list(targets(teacher.run.plain).values())
     session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
     write_pseudo_labels(
         session,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from torch import nn
 from rgbt.build.session import Session, names_key
 from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
-from rgbt.data.domains import Domains
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, restore_weights
@@ -33,7 +32,7 @@ from rgbt.spec.naming import describe, group_of
 from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.other_code import warn_of_result, warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
-from rgbt.tracking.pictures import PanelExample, RegionHeat, draw_panel, draw_region_heat
+from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import (
@@ -45,7 +44,7 @@ from rgbt.tracking.run_files import (
     read_tables,
 )
 from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.tables import ConsistencyTable, ResultTables, without_nan
+from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info, print_rich, result_view, warn
 from rgbt.tracking.tracker import Tracking
 from rgbt.training.overview import announce_training
@@ -76,7 +75,13 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         _show_again(folder, tracking, description)
         warn_of_result(spec.folder)
         _warn_of_other_files(folder, spec)
-        _warn_of_missing_consistency(folder, spec.consistency.build())
+        views: ViewSets = spec.consistency.build()
+        measured = [spec.folder / file_name("aligned", each, views.mark) for each in views.splits]
+        if views.sets and not all(path.is_file() for path in measured):
+            info(
+                "its consistency on these views and splits has not been measured; to add it: "
+                f"rgbt consistency run={folder.path} split=..."
+            )
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         setup = set_up_training(spec)
@@ -87,13 +92,9 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         folder = RunFolder(spec.folder)
         with folder.lock():
             Run(setup, folder, tracking, description).complete()
-    _show_result(folder, tracking, spec.domains)
-
-
-def _show_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> None:
     tables = read_tables(folder.path)
     assert tables is not None, "a finished run has its tables"
-    heads = domains.heads_in_words(domains.tested_head)
+    heads = spec.domains.heads_in_words(spec.domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
     print_rich(result_view(tables, folder.path, links))
 
@@ -126,16 +127,6 @@ def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
         )
 
 
-def _warn_of_missing_consistency(folder: RunFolder, views: ViewSets) -> None:
-    """A finished run is not evaluated again: say which command measures its consistency."""
-    paths = [folder.path / file_name("aligned", split, views.mark) for split in views.splits]
-    if views.sets and not all(path.is_file() for path in paths):
-        info(
-            "its consistency on these views and splits has not been measured; to add it: "
-            f"rgbt consistency run={folder.path} split=..."
-        )
-
-
 @dataclass(frozen=True)
 class Run:
     """An unfinished run: trains, evaluates and fills its folder."""
@@ -160,7 +151,19 @@ class Run:
             pairs = self._consistency(session)
             self._test(session, state, pairs.get("test"))
             checkpoints.tidy()
-            self._finish(session, state, time.time() - started, pairs)
+            self.folder.finish(
+                {
+                    "name": self.description.name,
+                    "key": self.folder.path.name,
+                    "dataset": session.dataset.fingerprint(),
+                    "steps": state.step,
+                    "best_step": state.best_step,
+                    "best_score": state.best_score,
+                    "seconds_of_last_process": round(time.time() - started, 1),
+                    "skipped": state.skipped,
+                    **self._scores(session, state, pairs),
+                }
+            )
         except KeyboardInterrupt:
             self.tracking.finish("KILLED")
             raise
@@ -171,39 +174,19 @@ class Run:
         with deferred():  # a signal must not leave a finished run as running in the store
             self.tracking.finish("FINISHED")
 
-    def _finish(
-        self, session: Session, state: State, seconds: float, pairs: Mapping[str, ConsistencyTable]
-    ) -> None:
-        self.folder.finish(
-            {
-                "name": self.description.name,
-                "key": self.folder.path.name,
-                "dataset": session.dataset.fingerprint(),
-                "steps": state.step,
-                "best_step": state.best_step,
-                "best_score": state.best_score,
-                "seconds_of_last_process": round(seconds, 1),
-                "skipped": state.skipped,
-                **self._scores(state, pairs),
-            }
-        )
-
     def _scores(
-        self, state: State, pairs: Mapping[str, ConsistencyTable]
+        self, session: Session, state: State, pairs: Mapping[str, ConsistencyTable]
     ) -> dict[str, dict[str, float | None]]:
         """What the best checkpoint reached on the selection split and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        val = lines.get(("val", state.best_step)) or self._validated()
+        val = lines.get(("val", state.best_step))
+        if not val:  # its line was damaged
+            path = self.folder.path / counts_name(session.trainer.selection_split)
+            val = scores.summary(Counts.load(path), session.regions.absent)
         reached = {"val": val, "test": lines["test", state.step]}
         for kind, table in pairs.items():
             reached[kind] = {**reached[kind], **consistency_values(table)}
         return {kind: without_nan(values) for kind, values in reached.items()}
-
-    def _validated(self) -> dict[str, float]:
-        """Scores of the best checkpoint from its counts, where their line was damaged."""
-        session = self.setup.session
-        path = self.folder.path / counts_name(session.trainer.selection_split)
-        return scores.summary(Counts.load(path), session.regions.absent)
 
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
@@ -235,8 +218,7 @@ class Run:
         self._truncate(state)
         accumulate = session.trainer.accumulate
         steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
-        batches = self.setup.batches(steps)
-        trainer.fit(_noting_skipped(batches, state), state)
+        trainer.fit(_noting_skipped(self.setup.batches(steps), state), state)
         self._report_waiting(session)
         return state
 
@@ -280,7 +262,6 @@ class Run:
 
     def _trainer(self, session: Session, state: State) -> Trainer:
         split = session.trainer.selection_split
-        per_epoch = self.setup.steps_per_epoch()
 
         def validate(step: int) -> float:
             result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
@@ -292,6 +273,7 @@ class Run:
             state.skip(result.skipped)
             return values[names.MIOU]
 
+        per_epoch = self.setup.steps_per_epoch()
         trainer = Trainer(
             fabric=session.fabric,
             settings=session.trainer,
@@ -342,14 +324,22 @@ class Run:
         self.folder.append(state.step, "test", values)
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
-        subsets = {**tables.classes.subset_mious, **_parts_of(of_target)}
+        # As rows of the table: "thermal", "thermal, day", "thermal, night".
+        parts = {", ".join(each.split("/")[:-1]): value for each, value in of_target.items()}
+        subsets = {**tables.classes.subset_mious, **parts}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)
         self.folder.write_tables(tables)
-        if result.kept:
-            self._draw(session, tables, result.kept)
-        else:
+        if not result.kept:
             info("none of the images of the panel could be read; no pictures were drawn.")
+            return
+        draw_panel(result.kept, legend_of(session.dataset), self.folder.figure_path("panel"))
+        heat = RegionHeat(
+            title=f"{name}: IoU by region, {session.dataset.name} {tables.split}",
+            region_map=session.regions.map(result.kept[0].label.shape).astype(np.int64),
+            ious=tables.regions.region_ious,
+        )
+        draw_region_heat(heat, self.folder.figure_path("regions"))
 
     def _of_target(
         self, session: Session, model: nn.Module, split: str, folder: Path
@@ -367,20 +357,6 @@ class Run:
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(target.view, name): values[name] for name in kept if name in values}
-
-    def _draw(self, session: Session, tables: ResultTables, kept: Sequence[PanelExample]) -> None:
-        draw_panel(kept, legend_of(session.dataset), self.folder.figure_path("panel"))
-        heat = RegionHeat(
-            title=f"{self.description.name}: IoU by region, {session.dataset.name} {tables.split}",
-            region_map=session.regions.map(kept[0].label.shape).astype(np.int64),
-            ious=tables.regions.region_ious,
-        )
-        draw_region_heat(heat, self.folder.figure_path("regions"))
-
-
-def _parts_of(of_target: Mapping[str, float]) -> dict[str, float]:
-    """The same as rows of the table: "thermal", "thermal, day", "thermal, night"."""
-    return {", ".join(name.split("/")[:-1]): value for name, value in of_target.items()}
 
 
 def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iterator[Loaded]:

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from rich.text import Text as RichText
 
-from rgbt.tracking.column_layout import SHORTEST, blocks, shortened
-from rgbt.tracking.terminal import WIDTH
+from rgbt.tracking.terminal import SHORTEST, WIDTH, blocks, shortened
 from sweeps.rendering.line_builder import BESIDE_OURS, WITH_SD
 from sweeps.rendering.rendered_table import RenderedTable
 from sweeps.rendering.text_cell import TextCell

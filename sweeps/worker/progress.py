@@ -18,7 +18,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from rgbt.tracking.column_layout import SHORTEST, shortened
+from rgbt.tracking.terminal import SHORTEST, shortened
 from sweeps.worker.running_trial import RunningTrial
 
 CONSOLE = Console(stderr=True)

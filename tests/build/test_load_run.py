@@ -26,30 +26,20 @@ def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamesp
     )
 
 
-@pytest.fixture
-def warnings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    lines: list[str] = []
-    monkeypatch.setattr(load_run, "warn", lines.append)
-    return lines
-
-
-def test_other_splits_are_reported(tmp_path: Path, warnings: list[str]) -> None:
-    before = session(train=("a", "b"), test=("c",))
-    (tmp_path / "dataset.json").write_text(json.dumps({"names": names_key(before), "files": "x"}))
-    load_run._warn_of_other_splits(tmp_path, before)
-    load_run._warn_of_other_splits(tmp_path, session(None, train=("a", "c"), test=("b",)))
-    load_run._warn_of_other_splits(tmp_path, session(test=("c",)))
-    assert warnings == [], "the same splits, a data set without name, no training images"
-    load_run._warn_of_other_splits(tmp_path, session(train=("a", "c"), test=("b",)))
+def test_other_splits_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    warnings: list[str] = []
+    monkeypatch.setattr(load_run, "warn", warnings.append)
+    before, other = (session(train=("a", each), test=("c",)) for each in "bc")
+    marker = tmp_path / "dataset.json"
+    load_run._warn_of_other_splits(tmp_path, other)
+    marker.write_text("{")
+    load_run._warn_of_other_splits(tmp_path, other)
+    marker.write_text(json.dumps({"names": names_key(before), "files": "x"}))
+    same = (before, session(None, train=("a", "c"), test=("b",)), session(test=("c",)))
+    for each in same:
+        load_run._warn_of_other_splits(tmp_path, each)
+    assert warnings == [], "unknown, the same, a data set without name, no training images"
+    load_run._warn_of_other_splits(tmp_path, other)
     (line,) = warnings
     assert "training images may be evaluated" in line
     assert "rig (/data/rig)" in line
-
-
-def test_other_splits_without_recorded_names_are_not_reported(
-    tmp_path: Path, warnings: list[str]
-) -> None:
-    load_run._warn_of_other_splits(tmp_path, session(train=("a",), test=("b",)))
-    (tmp_path / "dataset.json").write_text("{")
-    load_run._warn_of_other_splits(tmp_path, session(train=("a",), test=("b",)))
-    assert warnings == []

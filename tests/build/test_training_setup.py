@@ -176,32 +176,6 @@ def test_predicted_labels_of_other_files(
     set_up_training(composed("multi_head_night_stage1", *typed))
 
 
-BEFORE_TRAINING = {
-    "a view of another network": (
-        ["multi_head_night_stage1", "domains.target.teacher_view=rgb"],
-        "requires views=rgb of the network of domains.target.labels, PSPNet provides views=thermal",
-    ),
-    "a confidence that masks do not read": (
-        ["heatnet", "model=mask2former_tiny", "loss=set_criterion"],
-        "requires outputs=scores of the model, Mask2Former provides outputs=masks",
-    ),
-    "a confidence that two frames do not read": (
-        [
-            *("multi_head_night_stage1", "domains.target.confidence=true"),
-            *("loss=temporal_paper", "loss@loss.segmentation=cross_entropy"),
-        ],
-        "TemporalLoss requires frames=2 of the scheme",
-    ),
-}
-
-
-@pytest.mark.parametrize(("typed", "sentence"), BEFORE_TRAINING.values(), ids=BEFORE_TRAINING)
-def test_validate_finds_errors_before_training(
-    call: Call, words: Callable[..., list[str]], tmp_path: Path, typed: list[str], sentence: str
-) -> None:
-    refused(call, words(*typed), sentence, tmp_path / "runs")
-
-
 def test_validate_view_of_the_teacher_passes(composed: Composed) -> None:
     for view in ("thermal", "null"):
         validate(composed("multi_head_night_stage1", f"domains.target.teacher_view={view}"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -27,30 +27,6 @@ class Knob:
 
 def options(group: str) -> list[str]:
     return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-
-
-@pytest.mark.parametrize(
-    "scale",
-    # Small ones are trained in other tests, or composed as rows of the tables.
-    [pytest.param("demo", marks=pytest.mark.slow), "paper"],
-)
-@pytest.mark.parametrize(
-    "experiment",
-    # tests/test_behaviour.py composes all of them, too.
-    [
-        pytest.param(name, marks=() if index % 4 == 0 else pytest.mark.slow)
-        for index, name in enumerate(options("experiment"))
-    ],
-)
-def test_every_experiment_composes_and_passes_the_check(experiment: str, scale: str) -> None:
-    rooted = ["dataset.root=unused"] if scale == "paper" else []
-    config = compose(f"+experiment={experiment}", f"scale={scale}", *rooted)
-    specify(config)
-    assert config.name == experiment
-    assert config.scale.pixel_factor == {"demo": 0.5, "paper": 1.0}[scale]
-    assert config.model.num_classes == config.dataset.num_classes
-    if scale == "paper":
-        assert config.recipe.dataset == config.dataset.name
 
 
 @pytest.fixture(scope="module")
@@ -121,29 +97,28 @@ def test_recipes_of_the_reference_networks() -> None:
     ]
 
 
-def test_published_settings_of_the_networks() -> None:
-    """Values that neither parameter counts nor recorded outputs in evaluation mode would show."""
-    cmx = compose("model=cmx_b2").model
-    assert (cmx.drop_path_rate, cmx.decoder_dropout, cmx.decoder_norm_eps) == (0.1, 0.1, 1e-3)
-    assert (cmx.drop_path_stage2, cmx.decoder_norm_eps_eval) == ("ramp", None)
-    heatnet = compose("model=heatnet").model
-    assert (list(heatnet.dropout), heatnet.align_corners) == ([0.3, 0.15], False)
-    modified = compose("model=deeplabv2_two_heads_modified").model
-    assert (list(modified.dropout), modified.align_corners) == ([0.3, 0.15], False)
-    for size in "tsb":
-        assert compose(f"model=mask2former_swin_{size}").model.drop_path_rate == 0.3
-    for depth in (18, 34, 50, 101, 152):
-        rtfnet = compose(f"model=rtfnet_{depth}").model
-        assert (rtfnet.final_relu, rtfnet.thermal_stem) == (True, "rgb_mean")
-    assert compose("model=mfnet").model.final_activation
+PUBLISHED: list[tuple[str, dict[str, Any]]] = [
+    ("cmx_b2", {"drop_path_rate": 0.1, "decoder_dropout": 0.1, "decoder_norm_eps": 1e-3}),
+    ("cmx_b2", {"drop_path_stage2": "ramp", "decoder_norm_eps_eval": None}),
+    ("heatnet", {"dropout": [0.3, 0.15], "align_corners": False}),
+    ("deeplabv2_two_heads_modified", {"dropout": [0.3, 0.15], "align_corners": False}),
+    *((f"mask2former_swin_{size}", {"drop_path_rate": 0.3}) for size in "tsb"),
+    *((f"rtfnet_{n}", {"final_relu": True, "thermal_stem": "rgb_mean"}) for n in (18, 50, 152)),
+    ("mfnet", {"final_activation": True}),
+    *(
+        (name, {"ceil_mode": True, "align_corners": True})
+        for name in ("deeplabv2", "deeplabv2_tiny")
+    ),
+]
+"""Values that neither parameter counts nor recorded outputs in evaluation mode would show."""
 
 
-@pytest.mark.parametrize("name", ["deeplabv2", "deeplabv2_tiny"])
-def test_deeplab_pools_as_released_and_counts_all_rates(name: str) -> None:
-    model = compose(f"model={name}").model
-    assert model.ceil_mode
-    assert model.align_corners
-    assert model.summed_rates == model.rates
+@pytest.mark.parametrize(("name", "settings"), PUBLISHED)
+def test_published_settings_of_the_networks(name: str, settings: dict[str, Any]) -> None:
+    model = alone(f"model/{name}").model
+    assert {key: model[key] for key in settings} == settings
+    if "ceil_mode" in settings:
+        assert model.summed_rates == model.rates
 
 
 def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
@@ -209,10 +184,6 @@ def test_a_missing_value_is_named_when_the_object_is_built() -> None:
 def test_flatten_gives_dotted_keys() -> None:
     config = OmegaConf.create({"a": {"b": 1, "c": [1, 2]}, "d": "${a.b}"})
     assert flatten(config) == {"a.b": 1, "a.c": [1, 2], "d": 1}
-
-
-def test_configuration_lies_beside_the_package_in_a_checkout() -> None:
-    assert conf_dir() == Path(__file__).resolve().parents[2] / "conf"
 
 
 def test_paths_are_read_as_they_are_typed() -> None:

@@ -10,7 +10,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import available, compose, groups, searching
-from rgbt.spec.upstream import parse_reference, upstream_config
+from rgbt.spec.specify import parse_reference, upstream_config
 
 OWN = """# @package _global_
 defaults:
@@ -76,13 +76,3 @@ def test_upstream_run_is_found_on_the_search_path(own: Path) -> None:
     assert (upstream.name, upstream.model.decoder_width) == ("own_stage", 16)
     with pytest.raises(InputError, match=r"no experiment 'own_stage'.*hydra\.searchpath="):
         parse_reference("model.weights", value)
-
-
-def test_unknown_file_mentions_the_search_path(own: Path) -> None:
-    with pytest.raises(InputError) as caught, composing(["dataset=mine"]):
-        compose(["dataset=mine"])
-    assert str(caught.value).startswith("there is no dataset 'mine'; ")
-    assert "'hydra.searchpath=[file:///my/conf]', or set RGBT_CONF=/my/conf." in str(caught.value)
-    with pytest.raises(InputError) as caught, searching([word(own)]), composing(["dataset=mine"]):
-        compose(["dataset=mine"])
-    assert "RGBT_CONF" not in str(caught.value)

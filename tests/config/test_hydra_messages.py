@@ -56,8 +56,8 @@ def test_word_that_hydra_would_misread_is_refused(word: str, sentence: str) -> N
 
 
 def test_word_that_hydra_understands_passes(tmp_path: Path) -> None:
-    check_words(["-m", "--cfg", "job", "seed=0,1", "+experiment=grbm", "--multirun"])
-    check_words([f"hydra.searchpath=[file://{tmp_path},pkg://somewhere,{tmp_path}]"])
+    words = ["-m", "--cfg", "job", "seed=0,1", "+experiment=grbm", "--multirun"]
+    check_words([*words, f"hydra.searchpath=[file://{tmp_path},pkg://somewhere,{tmp_path}]"])
 
 
 @pytest.mark.parametrize(

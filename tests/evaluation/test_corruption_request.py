@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.corruptions.corruption import OfPixels, OfTime
 from rgbt.evaluation.corruption_request import (
     choose_corruption,
     choose_corruptions,
-    requested_corruption,
-    split_overrides,
     standard_corruptions,
 )
 from tests.corruptions.recorded import NAMES, Recorded
@@ -44,14 +41,6 @@ def test_standard_corruptions_are_sorted_by_row() -> None:
         *("noise", "noise_rgb", "noise_thermal", "occluded", "occluded_rgb", "occluded_thermal"),
         *("rgb_removed", "thermal_removed"),
     ]
-
-
-def test_standard_corruptions_have_ladders_and_titles() -> None:
-    kinds = [choose_corruption(name).corruption for name in standard_corruptions()]
-    for kind in kinds:
-        assert isinstance(kind, OfPixels | OfTime)
-        assert len(kind.severities) == (4 if kind.unit else 1)
-    assert len({kind.title for kind in kinds}) == len(kinds)
 
 
 @pytest.mark.parametrize("name", standard_corruptions())
@@ -116,11 +105,6 @@ def test_own_file(tmp_path: Path) -> None:
         choose_corruption(str(tmp_path / "no.yaml"))
 
 
-def test_split_overrides() -> None:
-    words = ["dataset=mfnet", "corruption.block=16", "data.eval_batch_size=1"]
-    assert split_overrides(words) == (["corruption.block=16"], ["dataset=mfnet", words[2]])
-
-
 def test_identity_of_a_request() -> None:
     """On disk: counts that exist are recognised by it."""
     request = choose_corruption("occluded:thermal", ["corruption.block=16"]).at("0.5")
@@ -155,16 +139,6 @@ def test_identity_of_a_request() -> None:
 def test_bad_request_is_refused(name: str, words: list[str], severity: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         choose_corruption(name, words).at(severity)
-
-
-def test_severity_0_is_allowed() -> None:
-    assert choose_corruption("frozen").at("0").severity == 0
-
-
-def test_requested_corruption_of_none() -> None:
-    assert requested_corruption("none", "", [], ()) is None
-    with pytest.raises(InputError, match="'severity' has no effect without corruption="):
-        requested_corruption("none", "1", [], ())
 
 
 def test_choose_corruptions() -> None:

@@ -155,20 +155,28 @@ def test_measure_writes_counts_and_their_identity(evaluator: Evaluator, tmp_path
     assert made["failure"]["settings"] == {"image": "both"}
     saved = Counts.load(tmp_path / "out" / "noise-50.npz")
     np.testing.assert_array_equal(saved.counts, measured[-1].counts.counts)
+    again = measure(opened(), "test", noise(), tmp_path / "out")
+    assert len(evaluator.calls) == 5, "nothing is made again"
+    assert [each.mious for each in again] == [each.mious for each in measured]
 
 
-def test_measure_reuses_existing_counts(evaluator: Evaluator, tmp_path: Path) -> None:
-    first = measure(opened(), "test", noise(), tmp_path)
-    again = measure(opened(), "test", noise(), tmp_path)
-    assert len(evaluator.calls) == 5
-    assert [each.mious for each in again] == [each.mious for each in first]
+def other_files() -> Recorded:
+    files = Recorded()
+    files.fingerprint = lambda: "other"  # type: ignore[method-assign]
+    return files
+
+
+def other_weights() -> Network:
+    trained = Network()
+    trained.weight.data[3] += 1e-6
+    return trained
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"dataset": "files"},
-        {"model": "weights"},
+        {"dataset": other_files()},
+        {"model": other_weights()},
         {"trainer": SimpleNamespace(precision="bf16-mixed")},
         {"spec": spec_of(test_short_edge=60)},
     ],
@@ -178,14 +186,6 @@ def test_measure_repeats_after_other_settings(
     evaluator: Evaluator, tmp_path: Path, changes: dict[str, Any]
 ) -> None:
     measure(opened(), "test", noise(), tmp_path)
-    if "dataset" in changes:
-        other = Recorded()
-        other.fingerprint = lambda: "other"  # type: ignore[method-assign]
-        changes = {"dataset": other}
-    if "model" in changes:
-        trained = Network()
-        trained.weight.data[3] += 1e-6
-        changes = {"model": trained}
     measure(opened(**changes), "test", noise(), tmp_path)
     assert len(evaluator.calls) == 10
 
@@ -211,7 +211,9 @@ def test_measure_repeats_damaged_files(evaluator: Evaluator, tmp_path: Path) -> 
     assert len(evaluator.calls) == 11
 
 
-def test_measure_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_measure_stopped_resumes_and_leaves_no_wrong_identity(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     stopped, later = Evaluator(stop_at=3), Evaluator()
     monkeypatch.setattr(EVALUATE, stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -220,22 +222,13 @@ def test_measure_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
     measure(opened(), "test", noise(), tmp_path)
     assert later.calls == [(10.0, "rgbt"), (50.0, "rgbt")]
 
-
-def test_killed_measure_leaves_no_wrong_identity(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Killed between the two files: the identity of counts is removed before they change."""
-    monkeypatch.setattr(EVALUATE, Evaluator())
-    measure(opened(), "test", [], tmp_path)
-    other = Network()
-    other.weight.data += 1
-
     def killed(path: Path, content: bytes) -> None:
         raise KeyboardInterrupt
 
+    # Killed between the two files: the identity of counts is removed before they change.
     monkeypatch.setattr("rgbt.evaluation.robustness.write_atomic", killed)
     with pytest.raises(KeyboardInterrupt):
-        measure(opened(model=other), "test", [], tmp_path)
+        measure(opened(model=other_weights()), "test", [], tmp_path)
     assert not (tmp_path / "clean.json").exists()
 
 

@@ -17,36 +17,36 @@ def resolved(*overrides: str) -> DictConfig:
     return config
 
 
-OTHER = (("dataset", "synth_kp"), ("dataset.absent", "exclude"))
+OTHER = ("dataset=synth_kp", "dataset.absent=exclude")
 
 
 @pytest.mark.parametrize(
-    ("trained", "pairs", "expected"),
+    ("trained", "words", "expected"),
     [
         ((), (), "released"),
         # Another data set has its own convention; another partition changes none.
         ((), OTHER, "exclude"),
-        (("dataset.absent=exclude",), (("dataset", "synth_kp"),), "released"),
-        (("dataset.absent=exclude",), (("metric", "ring9"),), "exclude"),
+        (("dataset.absent=exclude",), ("dataset=synth_kp",), "released"),
+        (("dataset.absent=exclude",), ("metric=ring9",), "exclude"),
         # Set by hand, in the run or in the command that evaluates it.
-        (("metric.absent=exclude",), (("dataset", "synth_kp"),), "exclude"),
-        ((), (("metric", "ring9"), ("metric.absent", "exclude")), "exclude"),
+        (("metric.absent=exclude",), ("dataset=synth_kp",), "exclude"),
+        ((), ("metric=ring9", "metric.absent=exclude"), "exclude"),
     ],
 )
 def test_override_absent_classes_follow_the_evaluated_data_set(
-    trained: tuple[str, ...], pairs: tuple[tuple[str, str], ...], expected: str
+    trained: tuple[str, ...], words: tuple[str, ...], expected: str
 ) -> None:
     config = resolved(*trained)
-    load_spec._override(config, list(pairs))
+    load_spec._override(config, words)
     assert config.metric.absent == expected
 
 
 def test_override_user_partition_without_absent_is_kept() -> None:
     config = resolved()
     config.metric = {"_target_": "my_lab.Halved"}
-    load_spec._override(config, [("data.eval_batch_size", "1")])
+    load_spec._override(config, ["data.eval_batch_size=1"])
     assert config.metric == {"_target_": "my_lab.Halved"}
-    load_spec._override(config, [("metric", "ring9")])
+    load_spec._override(config, ["metric=ring9"])
     assert config.metric.absent == "released", "that of the data set"
 
 

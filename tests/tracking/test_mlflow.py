@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, build
 from rgbt.files.atomic import holding
 from rgbt.metrics.names import shown
 from rgbt.tracking import mlflow_client, sync
@@ -28,7 +26,7 @@ from rgbt.tracking.mlflow_upload import (
     read_upload_state,
     write_upload_state,
 )
-from rgbt.tracking.mlflow_view import SECTIONS, view_tags
+from rgbt.tracking.mlflow_view import view_tags
 from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
@@ -158,8 +156,9 @@ def unnoted(runs_dir: Path, name: str) -> RunFolder:
     return folder
 
 
-@pytest.mark.parametrize("name", ["unnoted", 'it\'s \\ "unnoted"'])
-@pytest.mark.parametrize("content", [None, "", "{}", "[1]", '{"uri": 3', "\0"])
+@pytest.mark.parametrize(
+    ("name", "content"), [('it\'s \\ "unnoted"', None), ("unnoted", ""), ("other", '{"uri": 3')]
+)
 def test_a_run_whose_id_was_not_noted_is_found_by_its_key(
     runs_dir: Path,
     name: str,
@@ -191,8 +190,9 @@ def test_a_run_trained_anew_under_the_same_key_is_another_mlflow_run(runs_dir: P
     assert run_id(folder) != first
 
 
-def test_the_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None:
-    run = client(runs_dir).get_run(run_id(finished))
+def test_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> None:
+    store = client(runs_dir)
+    run = store.get_run(run_id(finished))
     assert run.info.status == "FINISHED"
     assert run.info.run_name == "grbm seed=0"
     assert run.info.start_time == 1767225600000
@@ -202,25 +202,16 @@ def test_the_mlflow_run_says_what_it_is(runs_dir: Path, finished: RunFolder) -> 
     assert len(run.data.params["long"]) == 500
     assert "class/car" not in run.data.metrics, "a score that does not exist is not drawn"
     assert "| grbm | 25.00 | 50.00 | 40.00 | 156.25 |" in run.data.tags["mlflow.note.content"]
-
-
-def test_the_mlflow_run_holds_table_and_files(runs_dir: Path, finished: RunFolder) -> None:
-    store, run = client(runs_dir), run_id(finished)
-    table = Path(store.download_artifacts(run, "tables/iou.json"))
+    table = Path(store.download_artifacts(run.info.run_id, "tables/iou.json"))
     assert json.loads(table.read_text()) == artifact_table(TABLES)
-    logged = json.loads(store.get_run(run).data.tags["mlflow.loggedArtifacts"])
+    logged = json.loads(run.data.tags["mlflow.loggedArtifacts"])
     assert logged == [{"path": "tables/iou.json", "type": "table"}]
-    names = {item.path for item in store.list_artifacts(run)}
+    names = {item.path for item in store.list_artifacts(run.info.run_id)}
     assert {"config.yaml", "provenance.json", "counts_test.npz", "figures", "result.json"} <= names
-
-
-def test_experiment_carries_the_saved_views(runs_dir: Path) -> None:
-    begin(RunFolder(runs_dir / "views"), tracking(runs_dir))
-    experiment = client(runs_dir).get_experiment_by_name("rgbt")
+    experiment = store.get_experiment_by_name("rgbt")
     assert view_tags().items() <= experiment.tags.items()
     assert experiment.artifact_location == (runs_dir / "mlartifacts").as_uri()
     assert max(map(len, view_tags().values())) < 5000, "MLflow's limit on a tag"
-    assert next(iter(SECTIONS.values())), "the first section is unfolded"
 
 
 def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> None:
@@ -232,12 +223,14 @@ def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> 
     assert sent is not None
     store = client(runs_dir)
     assert store.get_run(sent.run_id).info.status == "FAILED"
-    begin(folder, tracking(runs_dir))
-    assert store.get_run(sent.run_id).info.status == "RUNNING"
+    tracking(runs_dir).start(folder, Description("grbm sigma_div=4 seed=0", TAGS, PARAMS))
+    info = store.get_run(sent.run_id).info
+    assert (info.status, info.run_name) == ("RUNNING", "grbm sigma_div=4 seed=0")
 
 
 def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Path) -> None:
     folder = RunFolder(runs_dir / "again")
+    folder.add_provenance({"started": "2026-01-04T00:00:00+00:00"})
     tracker = tracking(runs_dir)
     ids = []
     for _ in range(2):
@@ -251,22 +244,15 @@ def test_a_replaced_run_is_another_mlflow_run_than_what_replaces_it(runs_dir: Pa
     old, new = (client(runs_dir).get_run(each) for each in ids)
     assert (old.info.run_name, new.info.run_name) == ("grbm seed=0 (replaced)", "grbm seed=0")
     assert (old.info.status, new.info.status) == ("FINISHED", "FINISHED")
+    kept = RunFolder(runs_dir / "replaced" / "again-1")
+    (kept.path / "mlflow.json").unlink()
+    begin(kept, tracking(runs_dir))
+    assert run_id(kept) == ids[0], "found again where its id was not noted"
     keys = ("rgbt.key", "rgbt.group", "rgbt.replaced")
     assert [old.data.tags.get(key) for key in keys] == [
         *("replaced/again-1", "grbm (replaced)", "true"),
     ]
     assert [new.data.tags.get(key) for key in keys] == ["again", "grbm", None]
-
-
-def test_a_replaced_run_whose_id_was_not_noted_is_not_doubled(runs_dir: Path) -> None:
-    folder = unnoted(runs_dir, "replaced_unnoted")
-    conclude(folder)
-    replace_finished(folder, tracking(runs_dir))
-    kept = RunFolder(runs_dir / "replaced" / "replaced_unnoted-1")
-    first = run_id(kept)
-    (kept.path / "mlflow.json").unlink()
-    begin(kept, tracking(runs_dir))
-    assert run_id(kept) == first
 
 
 def test_a_run_deleted_in_the_pages_is_made_again(runs_dir: Path) -> None:
@@ -328,24 +314,49 @@ def test_sync_of_all_folders_sends_runs_made_without_tracker(
     assert client(runs_dir).get_run(sent.run_id).info.status == "KILLED"
 
 
-@pytest.mark.parametrize("name", ["result.json", "mlflow.json", "metrics.jsonl"])
-def test_sync_of_all_folders_goes_on_behind_a_damaged_one(
-    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+def test_sync_of_all_folders_sends_those_behind_a_damaged_one(
+    runs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for key in ("a", "b"):
+    uri = f"uri=sqlite:///{runs_dir / 'mlflow.db'}"
+    damaged = {"a": "result.json", "b": "mlflow.json", "c": "metrics.jsonl"}
+    for key in "abcd":
         begin(RunFolder(tmp_path / key), NoTracking())
-    (tmp_path / "a" / name).write_text("{\n")
-    assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
+    for key, name in damaged.items():
+        (tmp_path / key / name).write_text("{\n")
+    assert code_of(sync.entry, [f"runs_dir={tmp_path}", uri]) == 1
     output = capsys.readouterr()
-    assert f"rgbt: {tmp_path / 'a'} was not sent ({tmp_path / 'a' / name} is damaged" in output.err
-    assert f"{tmp_path / 'b'}  ->  MLflow run " in output.out
+    for key, name in damaged.items():
+        folder = tmp_path / key
+        assert f"rgbt: {folder} was not sent ({folder / name} is damaged" in output.err
+    assert f"{tmp_path / 'd'}  ->  MLflow run " in output.out
     assert code_of(sync.entry, [f"run={tmp_path / 'a'}"]) == 2
 
 
-def test_a_damaged_log_is_no_failure_of_the_store(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_damaged_log_and_a_held_lock_do_not_halt_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, tracker = RunFolder(tmp_path / "key"), tracking(tmp_path)
+    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
+    for name in "abc":
+        begin(RunFolder(tmp_path / name), NoTracking())
+    folder, tracker = RunFolder(tmp_path / "waits"), tracking(tmp_path)
+    with holding(tmp_path / ".mlflow.db.lock"):
+        begin(folder, tracker)
+        tracker.finish("FINISHED")
+        said = capsys.readouterr().err
+        assert said.count("waiting for process") == 2, "at the start and at the end"
+        assert said.count("cannot be used") == 1
+        assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
+        assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
+        # A sync of many runs waits once.
+        assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
+        said = capsys.readouterr().err
+        assert (said.count("waiting for process"), said.count("was not sent")) == (1, 4)
+    assert code_of(sync.entry, [f"run={folder.path}"]) == 0
+    assert run_id(folder)
+    capsys.readouterr()
+    # The store works; the run repairs its log when it resumes.
+    tracker = tracking(tmp_path)
     (folder.path / "metrics.jsonl").write_text("{\n")
     begin(folder, tracker)
     assert "not sent to MLflow:" in capsys.readouterr().err
@@ -354,24 +365,6 @@ def test_a_damaged_log_is_no_failure_of_the_store(
     tracker.update()
     assert points(client(tmp_path), run_id(folder), "train/loss") == [(5, 3.0)]
     assert capsys.readouterr().err == ""
-
-
-def test_a_lock_that_a_stopped_process_holds_does_not_halt_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
-    monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
-    folder, tracker = RunFolder(tmp_path / "waits"), tracking(tmp_path)
-    with holding(tmp_path / ".mlflow.db.lock"):
-        begin(folder, tracker)
-        tracker.finish("FINISHED")
-    said = capsys.readouterr().err
-    assert said.count("waiting for process") == 2, "at the start and at the end"
-    assert said.count("cannot be used") == 1
-    assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
-    assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
-    assert code_of(sync.entry, [f"run={folder.path}"]) == 0
-    assert run_id(folder)
 
 
 def test_links_open_the_pages(runs_dir: Path) -> None:
@@ -430,8 +423,6 @@ def test_artifact_table_has_unique_first_column_and_summaries_first() -> None:
     [
         ([], "give either run=<run folder> or runs_dir=<folder of runs>"),
         (["run=a", "runs_dir=b"], "give either run="),
-        (["run"], "expected key=value"),
-        (["runs_dri=a"], "did you mean 'runs_dir'"),
         (["runs_dir=/nowhere"], "no such folder"),
         (["run=/nowhere"], "not a run folder"),
     ],
@@ -444,15 +435,6 @@ def test_sync_refuses_in_one_sentence(
     assert error.startswith("rgbt: ")
     assert sentence in error
     assert error.count("\n") == 1
-
-
-def test_sync_asks_for_a_password_that_is_not_kept(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "key")
-    (folder.path / "mlflow.json").write_text(
-        json.dumps({"uri": "postgresql://me:***@host/db", "experiment": "rgbt"})
-    )
-    with pytest.raises(InputError, match="give uri="):
-        sync.tracking_of(folder, sync.Options(run=folder.path))
 
 
 def test_sync_hides_the_password_of_a_store_that_refuses(
@@ -472,26 +454,6 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
     assert "Secret" not in error
 
 
-@pytest.mark.parametrize(("name", "kind"), [("mlflow", MlflowTracking), ("none", NoTracking)])
-def test_configuration_builds(name: str, kind: type) -> None:
-    loaded = OmegaConf.load(CONF / f"{name}.yaml")
-    config = OmegaConf.create({"runs_dir": "runs", "tracking": loaded})
-    Component.from_node(config.tracking, "tracking")
-    tracker = build(config.tracking)
-    assert isinstance(tracker, kind)
-    if isinstance(tracker, MlflowTracking):
-        assert tracker.uri == f"sqlite:///{Path('runs').resolve() / 'mlflow.db'}"
-        assert tracker.artifact_uri == (Path("runs").resolve() / "mlartifacts").as_uri()
-
-
-def test_a_run_described_anew_is_renamed(runs_dir: Path) -> None:
-    folder = RunFolder(runs_dir / "renamed")
-    begin(folder, tracking(runs_dir))
-    tracker = tracking(runs_dir)
-    tracker.start(folder, Description("grbm sigma_div=4 seed=0", TAGS, PARAMS))
-    assert client(runs_dir).get_run(run_id(folder)).info.run_name == "grbm sigma_div=4 seed=0"
-
-
 def test_a_store_is_the_same_however_much_of_its_address_was_hidden(tmp_path: Path) -> None:
     uri, hidden = (
         "postgresql://u:123/abc@h/db?sslpassword=x",
@@ -504,27 +466,27 @@ def test_a_store_is_the_same_however_much_of_its_address_was_hidden(tmp_path: Pa
     for stored in (hidden, uri, partly, "postgresql://u:***@h/db?sslpassword=x"):
         write_upload_state(folder, UploadState(stored, "e", None, "1", "the run"))
         assert store._sent(folder) == UploadState(hidden, "e", None, "1", "the run")
-    write_upload_state(
-        folder, UploadState("postgresql://u:***@other/db", "e", None, "1", "the run")
-    )
+    write_upload_state(folder, UploadState(f"{hidden}&y=1", "e", None, "1", "the run"))
     assert store._sent(folder).run_id == ""
 
 
-@pytest.mark.parametrize("uri", ["postgresql://u:***@h/db", "https://***@h", "x://h?password=***"])
-def test_a_password_that_is_not_kept_must_be_given(tmp_path: Path, uri: str) -> None:
+@pytest.mark.parametrize(
+    ("state", "key"),
+    [
+        (UploadState("postgresql://u:***@h/db", "e"), "uri"),
+        (UploadState("https://***@h", "e"), "uri"),
+        (UploadState("http://h:5000", "e", "sftp://u:***@h/files"), "artifact_uri"),
+    ],
+)
+def test_a_password_that_is_not_kept_must_be_given(
+    tmp_path: Path, state: UploadState, key: str
+) -> None:
     folder = RunFolder(tmp_path / "run")
-    write_upload_state(folder, UploadState(uri, "e"))
-    with pytest.raises(InputError, match=r"give uri=\.\.\. with it"):
+    write_upload_state(folder, state)
+    with pytest.raises(InputError, match=rf"give {key}=\.\.\. with it"):
         sync.tracking_of(folder, sync.Options(run=folder.path))
-    write_upload_state(folder, UploadState("http://h:5000", "e", "sftp://u:***@h/files"))
-    with pytest.raises(InputError, match=r"give artifact_uri=\.\.\. with it"):
-        sync.tracking_of(folder, sync.Options(run=folder.path))
-    assert (
-        sync.tracking_of(
-            folder, sync.Options(run=folder.path, artifact_uri="sftp://u:pw@h/files")
-        ).uri
-        == "http://h:5000"
-    )
+    given = sync.Options(run=folder.path, **{key: "sftp://u:pw@h/files"})
+    assert sync.tracking_of(folder, given).experiment == "e"
 
 
 @pytest.mark.parametrize(
@@ -539,17 +501,3 @@ def test_a_database_that_nobody_serves_is_reported_at_once(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "(ConnectionRefusedError: " in said
-
-
-def test_many_runs_wait_once_for_a_store_that_is_busy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in "abc":
-        begin(RunFolder(tmp_path / name), NoTracking())
-    monkeypatch.setattr(mlflow_client, "LOCK_WAIT_S", 0.3)
-    monkeypatch.setattr(mlflow_client, "QUIET_WAIT_S", 0.1)
-    with holding(tmp_path / ".mlflow.db.lock"):
-        assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
-    said = capsys.readouterr().err
-    assert said.count("waiting for process") == 1
-    assert said.count("was not sent") == 3

@@ -37,9 +37,6 @@ def rings() -> np.ndarray:
 def test_colours_by_hand() -> None:
     label = np.array([[0, 1, 255]], np.uint8)
     assert colours(label, PALETTE).tolist() == [[[0, 0, 0], [64, 0, 128], list(IGNORED_COLOUR)]]
-
-
-def test_colours_raise_on_a_class_without_colour() -> None:
     with pytest.raises(ValueError, match="label 2 has no colour"):
         colours(np.array([[2]], np.uint8), PALETTE)
 
@@ -49,12 +46,8 @@ def test_overlay_by_hand() -> None:
     label = np.array([[0, 1, 255]], np.uint8)
     # 0.75 * 100 + 0.25 * (64, 0, 128); background and ignored pixels stay.
     assert overlay(rgb, label, PALETTE, 0.25).tolist() == [[[100] * 3, [91, 75, 107], [100] * 3]]
-    assert np.array_equal(overlay(rgb, label, PALETTE, 0.0), rgb)
-
-
-def test_overlay_raises_on_another_size() -> None:
     with pytest.raises(ValueError, match="one size"):
-        overlay(np.zeros((2, 3, 3), np.uint8), np.zeros((2, 2), np.uint8), PALETTE)
+        overlay(rgb, label[:, :2], PALETTE)
 
 
 def test_region_values_by_hand() -> None:
@@ -113,5 +106,4 @@ def test_long_names_are_broken_after_underscores() -> None:
     name = "test_day_1570001920_541752960"
     assert _broken(name, 22) == "test_day_1570001920_\n541752960"
     assert _broken(name, 40) == name
-    assert _broken("00012D", 22) == "00012D"
     assert _broken("x" * 30, 22) == "x" * 30

@@ -29,14 +29,10 @@ def test_provenance_can_be_written_as_json_and_says_where_it_ran() -> None:
     assert entry["cpu_count"] >= 1
 
 
-def test_code_outside_a_checkout_has_no_commit(tmp_path: Path) -> None:
-    (tmp_path / "code.py").write_text("a = 1\n")
-    assert module._code(tmp_path / "code.py")["git_commit"] is None
-
-
-def test_code_of_a_checkout(tmp_path: Path) -> None:
+def test_code_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = tmp_path / "code.py"
     code.write_text("a = 1\n")
+    assert module._code(code)["git_commit"] is None
     git(tmp_path, "init", "-q")
     assert module._code(code)["git_commit"] is None, "not tracked: the commit says nothing of it"
     git(tmp_path, "add", ".")
@@ -51,11 +47,8 @@ def test_code_of_a_checkout(tmp_path: Path) -> None:
     assert dirty["git_dirty"] is True
     assert "+a = 2" in dirty["diff"]
     assert dirty["untracked"] == ["new.py"]
-
-
-def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    assert module._code(Path(module.__file__))["git_commit"] is None
+    assert module._code(code)["git_commit"] is None, "without git"
 
 
 @pytest.mark.parametrize(

@@ -28,27 +28,23 @@ from rgbt.tracking.run_folder import RunFolder, runs_in
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 
 
-def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    write_atomic(path, b"old")
-    write_atomic(path, b"new")
-    assert path.read_bytes() == b"new"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
-
-
-def test_failed_write_keeps_the_old_content(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_write_atomic_is_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     path = tmp_path / "a.json"
-    write_atomic(path, b"old")
+    for content in (b"older", b"old"):
+        write_atomic(path, content)
+    assert path.read_bytes() == b"old"
 
-    def no_disk(_: int) -> None:
-        raise OSError("disk full")
+    def stopped(_: int) -> None:
+        raise error
 
-    monkeypatch.setattr(os, "fsync", no_disk)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(os, "fsync", stopped)
+    with pytest.raises(type(error)):
         write_atomic(path, b"new")
     assert path.read_bytes() == b"old"
+    assert [each.name for each in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_result_exists_only_when_finished(tmp_path: Path) -> None:
@@ -88,6 +84,11 @@ def test_truncate_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
     assert math.isnan(after[1].values["odd"])
     folder.append(30, "train", {"loss": 0.1})
     assert [line.step for line in folder.lines()] == [10, 20, 30]
+    # Lines of an evaluation that was not committed.
+    for step in (20, 30):
+        folder.append(step, "val", {"x": 1.0})
+    folder.truncate_after(30, 20)
+    assert [line.step for line in folder.lines() if line.kind == "val"] == [20]
 
 
 def logged(tmp_path: Path) -> tuple[RunFolder, list[bytes]]:
@@ -144,21 +145,13 @@ def test_lines_and_files_of_before_check_sums_are_read(tmp_path: Path) -> None:
         read_result(folder.path)
 
 
-def test_json_that_is_nested_or_large_without_end_is_refused(tmp_path: Path, monkeypatch) -> None:
-    path = tmp_path / "result.json"
-    path.write_text("[" * 100_000)
-    with pytest.raises(InputError, match="is damaged .it is nested too deeply"):
-        read_result(tmp_path)
-    monkeypatch.setenv("RGBT_MAX_JSON_MB", "1")
-    path.write_text('{"skipped": [' + '"a", ' * 300_000 + '"a"]}')
-    with pytest.raises(InputError, match="holds 2 million bytes.*set RGBT_MAX_JSON_MB=2"):
-        read_result(tmp_path)
-
-
 def test_lock_refuses_a_second_holder_and_names_the_first(tmp_path: Path) -> None:
     first, second = RunFolder(tmp_path), RunFolder(tmp_path)
     assert not first.is_locked()
     with first.lock():
+        (tmp_path / ".last.pt.partial").touch()
+        second.clean()
+        assert (tmp_path / ".last.pt.partial").exists(), "it may be written now"
         assert second.is_locked()
         with pytest.raises(InputError, match=f"process {os.getpid()} on "), second.lock():
             pass
@@ -242,9 +235,17 @@ def test_small_files_come_back(tmp_path: Path) -> None:
     assert [run.path for run in runs_in(tmp_path)] == [folder.path]
 
 
-def test_broken_file_and_missing_folder_are_named(tmp_path: Path) -> None:
-    (tmp_path / "result.json").write_text("{")
-    with pytest.raises(InputError, match=r"result\.json is damaged \(.*\); restore it"):
+def test_damaged_file_and_missing_folder_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "result.json"
+    for text, word in (("{", "is damaged"), ("[" * 100_000, "nested too deeply")):
+        path.write_text(text)
+        with pytest.raises(InputError, match=word):
+            read_result(tmp_path)
+    monkeypatch.setenv("RGBT_MAX_JSON_MB", "1")
+    path.write_text('{"skipped": [' + '"a", ' * 300_000 + '"a"]}')
+    with pytest.raises(InputError, match="set RGBT_MAX_JSON_MB=2"):
         read_result(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         runs_in(tmp_path / "missing")
@@ -271,35 +272,3 @@ def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> N
     (tmp_path / f".run.json.{os.getpid()}").touch()
     folder.clean()
     assert not (tmp_path / f".run.json.{os.getpid()}").exists()
-
-
-def test_nobody_is_disturbed_by_cleaning(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path)
-    with folder.lock():
-        (tmp_path / ".last.pt.partial").touch()
-        RunFolder(tmp_path).clean()
-        assert (tmp_path / ".last.pt.partial").exists()
-
-
-def test_an_interrupted_write_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(_: int) -> None:
-        raise KeyboardInterrupt
-
-    write_atomic(tmp_path / "run.json", b"old")
-    monkeypatch.setattr(os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_atomic(tmp_path / "run.json", b"new")
-    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
-    assert (tmp_path / "run.json").read_bytes() == b"old"
-
-
-def test_lines_of_an_evaluation_that_was_not_committed_are_dropped(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path)
-    for step, kind in ((2, "train"), (2, "val"), (4, "train"), (4, "val"), (4, "test")):
-        folder.append(step, kind, {"x": 1.0})
-    folder.truncate_after(4, 2)
-    assert [(line.step, line.kind) for line in folder.lines()] == [
-        *((2, "train"), (2, "val"), (4, "train"))
-    ]

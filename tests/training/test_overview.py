@@ -45,11 +45,12 @@ def test_a_training_says_what_it_works_with_and_nothing_that_reads_like_a_remark
     assert "rgbt: " not in err, "a driver of a sweep takes that for why a run failed"
 
 
-@pytest.mark.parametrize(("step", "ending"), [(240, "checkpoint of step 240"), (0, "final.pth")])
 def test_an_evaluation_says_in_one_line_what_predicts(
-    setup: TrainingSetup, capsys: pytest.CaptureFixture[str], step: int, ending: str
+    setup: TrainingSetup, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    announce_network(TrainedNetwork(setup.session, step, Path("x"), "final.pth"))
-    (line,) = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"cpu, \d+ threads?, 32-true; .*; " + ending, line)
-    assert network_line(setup.session) in line
+    for step in (240, 0):
+        announce_network(TrainedNetwork(setup.session, step, Path("x"), "final.pth"))
+    first, second = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"cpu, \d+ threads?, 32-true; .*; checkpoint of step 240", first)
+    assert second.endswith("; final.pth")
+    assert network_line(setup.session) in first
