@@ -86,19 +86,16 @@ def _half_planes(homography: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor,
     return rows, lines[..., 2]
 
 
-def _null_direction(rows: Tensor) -> Tensor:
-    """(..., 4), orthogonal to each of three rows (..., 3, 4): signed minors."""
-    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], device=rows.device)
-    minors: Tensor = torch.linalg.det(rows[..., others].movedim(-2, -3))
-    return minors * minors.new_tensor([1.0, -1.0, 1.0, -1.0])
-
-
 def _largest(homography: Tensor, image_hw: tuple[int, int]) -> Tensor:
     rows, bounds = _half_planes(homography, image_hw)
     device, batch = rows.device, torch.arange(len(rows), device=rows.device)
     four = torch.tensor(list(combinations(range(8), 4)), device=device)
     three = torch.tensor(list(combinations(range(8), 3)), device=device)
-    dx1, dx2, dy1, dy2 = _null_direction(rows[:, three]).unbind(-1)
+    # Orthogonal to each of three rows: signed minors.
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], device=device)
+    minors: Tensor = torch.linalg.det(rows[:, three][..., others].movedim(-2, -3))
+    signs = minors.new_tensor([1.0, -1.0, 1.0, -1.0])
+    dx1, dx2, dy1, dy2 = (minors * signs).unbind(-1)
     slope = torch.stack([dy1 - dy2, dy2 - dy1, dx1 - dx2, dx2 - dx1], dim=-1)
     systems = torch.cat([rows[:, four], torch.cat([rows[:, three], slope[:, :, None]], 2)], 1)
     values = torch.cat([bounds[:, four], torch.nn.functional.pad(bounds[:, three], (0, 1))], 1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import check_choice, check_shape
-from rgbt.losses.dice import single
+from rgbt.losses.overlap import single
 
 Judged = Literal["probabilities", "logits", "self_information"]
 """What a discriminator sees of a prediction."""

@@ -36,29 +36,22 @@ class Sampling:
 def mask_losses(
     logits_LPBQhw: Tensor, targets: Targets, matches: Matches, points: Points, sampling: Sampling
 ) -> tuple[Tensor, Tensor]:
-    """Cross-entropy and dice, each a sum over the matched masks of a set.
-
-    Args:
-        logits_LPBQhw: mask logits.
-        targets: of the B images.
-        matches: of the L x P sets.
-        points: source of the points.
-        sampling: how they are drawn.
-
-    Returns:
-        two of (S,) float32.
-    """
+    """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,) float32."""
     device = logits_LPBQhw.device
-    image = torch.from_numpy(matches.image).to(device)
-    query = torch.from_numpy(matches.query).to(device)
-    label = torch.from_numpy(matches.label).to(device)
+    image, label, query = (torch.from_numpy(each).to(device) for each in matches)
     masks = (targets.label[image] == label[:, None, None])[:, None].float()
     bytes_per_set = 8 * len(image) * (sampling.candidates + sampling.fresh)
     step = max(1, CHUNK_BYTES // max(1, bytes_per_set))
 
     parts = []
     first = 0
-    for logits in torch.split(_matched(logits_LPBQhw, image, query), step):
+    # (S, G, h, w) float32 mask logits of the matched queries.
+    layers, passes = logits_LPBQhw.shape[:2]
+    layer = torch.arange(layers, device=device)[:, None, None]
+    stacked = torch.arange(passes, device=device)[:, None]
+    index = query.clamp(min=0).reshape(layers, passes, -1)
+    matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
+    for logits in torch.split(matched_SGhw, step):
         drawn = _choose(logits, points, sampling)
         t = sample(masks, drawn.transpose(0, 1))[:, 0].transpose(0, 1)
         x = _read(logits, drawn)
@@ -97,15 +90,6 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
     t = w * t
     both = (w * s).sum(-1) + t.sum(-1)
     return (w * bce).sum(-1) / total, 1 - (2 * (s * t).sum(-1) + e) / (both + e)
-
-
-def _matched(logits_LPBQhw: Tensor, image: Tensor, query: Tensor) -> Tensor:
-    """(S, G, h, w) float32 mask logits of the matched queries."""
-    layers, passes = logits_LPBQhw.shape[:2]
-    layer = torch.arange(layers, device=image.device)[:, None, None]
-    stacked = torch.arange(passes, device=image.device)[:, None]
-    index = query.clamp(min=0).reshape(layers, passes, -1)
-    return logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
 
 
 def _read(logits_SGhw: Tensor, points_SGN2: Tensor) -> Tensor:

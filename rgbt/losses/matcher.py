@@ -156,16 +156,16 @@ def pairwise_costs(
     Returns:
         (R, Q, K).
     """
+    total: Tensor | float = x.shape[-1]
+    smoothing: Tensor | float = 1.0
+    if weights is not None:
+        total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
 
     def over_points(values: Tensor) -> Tensor:
         if weights is None:
             return values.sum(-1, keepdim=True)
         return values @ weights.values[..., None]
 
-    total: Tensor | float = x.shape[-1]
-    smoothing: Tensor | float = 1.0
-    if weights is not None:
-        total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
     bce = (over_points(F.softplus(x)) - x @ t.mT) / total
     s = x.sigmoid_()
     dice = (2 * (s @ t.mT) + smoothing) / (over_points(s) + t.sum(-1)[:, None] + smoothing)

@@ -8,7 +8,6 @@ one per (layer, pass), layer-major.
 
 from __future__ import annotations
 
-import math
 from itertools import product
 from typing import Literal, Protocol
 
@@ -32,7 +31,7 @@ class Points(Protocol):
 
 
 class PointSource:
-    """Independent uniform points from one generator.
+    """Independent uniform points from one generator, on `device`.
 
     Draws are made set by set in the order of the requests, so that the numbers do not
     depend on how many sets are requested at once. The criterion requests the matcher's points of
@@ -41,34 +40,26 @@ class PointSource:
 
     A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
     image): four coordinates come from one random integer, in half the time of four floats.
-
-    Args:
-        generator: the only source of randomness, on any device.
-        device: where the points are needed.
     """
 
     def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
         self.generator = generator
         self.device = device
 
-    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
-        """See `Points.matcher`."""
-        return self._draw(num_sets, num_images, num_points)
-
     def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """See `Points.loss`."""
-        return self._draw(num_sets, num_masks, num_points)
-
-    def _draw(self, *shape: int) -> Tensor:
-        numbers = 2 * math.prod(shape[1:])
+        """See `Points`."""
+        numbers = 2 * num_masks * num_points
         bits = torch.empty(
-            shape[0], -(-numbers // 4), dtype=torch.int64, device=self.generator.device
+            num_sets, -(-numbers // 4), dtype=torch.int64, device=self.generator.device
         )
         for one_set in bits:
             one_set.random_(generator=self.generator)
         # 63 random bits are four words of 16; the top bit of each is cut, because one is always 0.
         words = bits.view(torch.int16)[:, :numbers].bitwise_and_(0x7FFF).to(self.device)
-        return words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14).reshape(*shape, 2)
+        uniform = words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14)
+        return uniform.reshape(num_sets, num_masks, num_points, 2)
+
+    matcher = loss
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
@@ -76,13 +67,8 @@ def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "
 
     Source: Mask2Former, point_features.py (PointRend), align_corners False.
 
-    Args:
-        maps: (R, C, h, w) float.
-        points: (R, S, N, 2) in [-1, 1], (x, y); every channel of map r is read at points[r].
-        outside: what lies beyond the outermost pixel centres.
-
-    Returns:
-        (R, C, S, N), dtype of `maps`.
+    Every channel of the maps (R, C, h, w) is read at points (R, S, N, 2), (x, y) in [-1, 1];
+    `outside` lies beyond the outermost pixel centres. -> (R, C, S, N), dtype of `maps`.
     """
     return F.grid_sample(maps, points, mode="bilinear", padding_mode=outside, align_corners=False)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import check_range, check_shape
-from rgbt.losses.dice import single
+from rgbt.losses.overlap import single
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
 
@@ -62,7 +62,13 @@ class MaxSquares:
         if self.image_wise_ratio is None:
             value = squares.mean() / 2
         else:
-            weights = _image_wise(probabilities.detach(), self.image_wise_ratio)
+            p, ratio = probabilities.detach(), self.image_wise_ratio
+            classes = p.argmax(1).flatten(1)
+            sizes = p.new_zeros(p.shape[:2])
+            sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
+            total = classes.shape[1]
+            of_class = 1 / (sizes**ratio * total ** (1 - ratio)).clamp(min=1)
+            weights = of_class.gather(1, classes).view_as(squares)
             value = (weights * squares).sum((1, 2)).mean() / (1 if entries else 2)
         return {"max_squares": -self.weight * value / (probabilities.shape[1] if entries else 1)}
 
@@ -94,17 +100,6 @@ class Entropy:
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
         highest = math.log(max(probabilities.shape[1], 2))  # of one class, the entropy is 0
         return {"entropy": self.weight * surprise.sum(1).mean() / highest}
-
-
-def _image_wise(probabilities: Tensor, ratio: float) -> Tensor:
-    """(B, H, W): the w of `MaxSquares`."""
-    classes = probabilities.argmax(1).flatten(1)
-    sizes = probabilities.new_zeros(probabilities.shape[:2])
-    sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
-    total = classes.shape[1]
-    weights = 1 / (sizes**ratio * total ** (1 - ratio)).clamp(min=1)
-    shape = (len(probabilities), *probabilities.shape[2:])
-    return torch.gather(weights, 1, classes).view(shape)
 
 
 def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float) -> Tensor:

@@ -42,20 +42,16 @@ def absent_notes(
     partly = np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist()
     notes = []
     if gone.any():
-        notes.append(f"absent from the {split} split: {_names(classes, gone)} ({COUNTED[absent]})")
+        named = ", ".join(np.array(classes)[gone])
+        notes.append(f"absent from the {split} split: {named} ({COUNTED[absent]})")
     if unlabelled.any():
-        named = _names(classes, unlabelled)
+        named = ", ".join(np.array(classes)[unlabelled])
         notes.append(f"predicted, but not labelled in the {split} split: {named} (IoU 0)")
     if partly:
-        lacks = [f"{classes[each]} ({_regions(~there[:, each])})" for each in partly]
+        lacks = []
+        for each in partly:
+            regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
+            plural = "s" * (len(regions) > 1)
+            lacks.append(f"{classes[each]} (region{plural} {', '.join(regions)})")
         notes.append(f"absent from some regions: {', '.join(lacks)}; {COUNTED[absent]} there")
     return tuple(notes)
-
-
-def _names(classes: Sequence[str], chosen: NDArray[np.bool_]) -> str:
-    return ", ".join(name for name, is_chosen in zip(classes, chosen, strict=True) if is_chosen)
-
-
-def _regions(missing: NDArray[np.bool_]) -> str:
-    numbers = [str(number) for number, is_missing in enumerate(missing, start=1) if is_missing]
-    return f"region{'s' * (len(numbers) > 1)} {', '.join(numbers)}"

@@ -58,8 +58,9 @@ class RegionCounter:
         Raises:
             ValueError: shapes differ, or a prediction is no class.
         """
-        label_HW = _bytes(label)
-        prediction_HW = _bytes(prediction)
+        label_HW, prediction_HW = (
+            torch.as_tensor(each).to(torch.uint8) for each in (label, prediction)
+        )
         if label_HW.dim() != 2 or label_HW.shape != prediction_HW.shape:
             raise ValueError(
                 f"label and prediction: expected two maps H x W of one shape, got "
@@ -86,10 +87,6 @@ class RegionCounter:
             offset = region * self._per_region + lane * self._size
             self._offsets[image_hw] = offset.to(_narrowest(LANES * self._size, signed=True))
         return self._offsets[image_hw]
-
-
-def _bytes(values: NDArray[np.integer] | Tensor) -> Tensor:
-    return torch.as_tensor(values).to(torch.uint8)
 
 
 def _narrowest(size: int, *, signed: bool = False) -> torch.dtype:

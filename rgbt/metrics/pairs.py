@@ -96,11 +96,18 @@ def pair_counts(
         torch.as_tensor(each).to(torch.uint8) for each in (first, second, label)
     )
     valid_HW = None if valid is None else torch.as_tensor(valid).bool().to(torch.uint8)
-    _check_shapes(first_HW, second_HW, label_HW, valid_HW)
+    maps = (first_HW, second_HW, label_HW, valid_HW)
+    shapes = [tuple(each.shape) for each in maps if each is not None]
+    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
+        raise ValueError(
+            "first, second, label and valid: expected maps H x W of one shape, got "
+            f"{', '.join(map(str, shapes))}."
+        )
     if valid_HW is not None:
         first_HW = first_HW * valid_HW
-    _check_classes(first_HW, classes, "first")
-    _check_classes(second_HW, classes, "second")
+    for name, each in (("first", first_HW), ("second", second_HW)):
+        if int(each.max()) >= classes:
+            raise ValueError(f"{name}: expected classes 0..{classes - 1}, got {int(each.max())}.")
     size = (classes + 2) * classes**2
     row_HW = label_HW.clamp(max=classes).to(torch.int16 if LANES * size <= 2**15 else torch.int32)
     if valid_HW is not None:
@@ -168,7 +175,8 @@ def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
     frames = by_set.sum(-3)
     three = np.einsum("...ccc->...c", labelled)
     sizes = frames.sum(-1) + frames.sum(-2) + labelled.sum((-1, -2))
-    overlaps = _diagonal(frames) + _diagonal(labelled.sum(-1)) + _diagonal(labelled.sum(-2))
+    twos = (frames, labelled.sum(-1), labelled.sum(-2))
+    overlaps = sum(np.diagonal(each, axis1=-2, axis2=-1) for each in twos)
     return three, sizes, overlaps
 
 
@@ -186,23 +194,3 @@ def _by_set(pairs: Matrices) -> Scores:
 def _over_sets(scores: Scores) -> Scores:
     """(..., S, K) -> (..., K)."""
     return known_mean(np.swapaxes(scores, -1, -2))
-
-
-def _diagonal(matrices: Scores) -> Scores:
-    return np.diagonal(matrices, axis1=-2, axis2=-1)
-
-
-def _check_shapes(*maps: Tensor | None) -> None:
-    shapes = [tuple(each.shape) for each in maps if each is not None]
-    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
-        raise ValueError(
-            "first, second, label and valid: expected maps H x W of one shape, got "
-            f"{', '.join(map(str, shapes))}."
-        )
-
-
-def _check_classes(prediction_HW: Tensor, classes: int, name: str) -> None:
-    if int(prediction_HW.max()) >= classes:
-        raise ValueError(
-            f"{name}: expected classes 0..{classes - 1}, got {int(prediction_HW.max())}."
-        )

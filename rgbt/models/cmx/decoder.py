@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.stochastic import drop_channels
+from rgbt.models.parts import drop_channels
 
 
 class Projection(nn.Module):
@@ -82,25 +82,13 @@ class MlpDecoder(nn.Module):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
 
     def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
-        """Class scores.
+        """Class scores (N, K, H_1, W_1) of four (N, H_i, W_i, C_i), the largest first.
 
-        Args:
-            maps: four (N, H_i, W_i, C_i), the largest first.
-            generator: draws the dropped channels; only read in training mode with a rate above 0.
-
-        Returns:
-            (N, K, H_1, W_1).
+        `generator` draws the dropped channels, in training mode with a rate above 0 alone.
         """
-        mixed = self.linear_fuse[1:](self._mix(maps))
-        if self.training and self.dropout > 0:
-            mixed = drop_channels(mixed, self.dropout, generator)
-        logits: Tensor = self.linear_pred(mixed)
-        return logits
-
-    def _mix(self, maps: list[Tensor]) -> Tensor:
-        """The convolution over the four projected and enlarged maps, (N, E, H_1, W_1)."""
+        # The convolution over the four projected and enlarged maps, (N, E, H_1, W_1). The release
+        # joins the maps in the order c4, c3, c2, c1.
         weight, bias = (self.linear_fuse.get_parameter(f"0.{name}") for name in ("weight", "bias"))
-        # The release joins the maps in the order c4, c3, c2, c1.
         part4, part3, part2, part1 = weight.flatten(1).chunk(4, 1)
         mixed: Tensor = self.linear_c1(maps[0], part1, bias)
         smaller = (
@@ -112,4 +100,8 @@ class MlpDecoder(nn.Module):
             mixed = mixed + F.interpolate(
                 small, size=mixed.shape[2:], mode="bilinear", align_corners=False
             )
-        return mixed
+        mixed = self.linear_fuse[1:](mixed)
+        if self.training and self.dropout > 0:
+            mixed = drop_channels(mixed, self.dropout, generator)
+        logits: Tensor = self.linear_pred(mixed)
+        return logits

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.stochastic import add_residual
+from rgbt.models.parts import add_residual
 
 BLOCK_NORM_EPS = 1e-6
 """Of the normalisations in front of attention and feed-forward and after a stage; those of patch

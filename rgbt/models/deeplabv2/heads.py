@@ -10,7 +10,7 @@ from annotated_types import Interval, Len
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.models.upsampling import DropRates, UpBlock, enlarge
+from rgbt.models.parts import DropRates, UpBlock, enlarge
 
 Decoder = Literal["basic", "modified_released", "modified_thesis"]
 
