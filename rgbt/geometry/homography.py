@@ -20,14 +20,9 @@ Order = Literal["zyx", "zxy"]
 
 
 def rotation(angles: Tensor, order: Order) -> Tensor:
-    """Rotation matrices of a camera frame with x right, y down and z forward.
+    """Rotation matrices (B, 3, 3) float64 of a camera frame with x right, y down and z forward.
 
-    Args:
-        angles: (B, 3) float, degrees: yaw about y, pitch about x, roll about z; right-handed.
-        order: which product of the three.
-
-    Returns:
-        (B, 3, 3) float64, on the device of `angles`.
+    `angles` (B, 3) float are degrees, right-handed: yaw about y, pitch about x, roll about z.
     """
     check_choice("order", order, ("zyx", "zxy"))
     check_shape("angles", angles, "B 3", **{"3": 3})
@@ -48,13 +43,8 @@ def rotation(angles: Tensor, order: Order) -> Tensor:
 def homography(angles: Tensor, matrix: Tensor, order: Order) -> Tensor:
     """K R K^-1: pixels of the first frame to pixels of the view, w > 0 in front of the camera.
 
-    Args:
-        angles: (B, 3) float, degrees, see `rotation`.
-        matrix: (3, 3) K, from `rgbt.geometry.camera.Camera.matrix`.
-        order: see `rotation`.
-
-    Returns:
-        (B, 3, 3) float64, on the device of `angles`; pixel centres lie at whole numbers.
+    `angles` (B, 3) as of `rotation`, `matrix` (3, 3) K from `rgbt.geometry.camera.Camera.matrix`;
+    (B, 3, 3) float64 on the device of `angles`; pixel centres lie at whole numbers.
     """
     matrix = matrix.to(angles.device, torch.float64)
     inverse: Tensor = torch.linalg.inv_ex(matrix).inverse

@@ -34,16 +34,10 @@ SLACK = 1e-6
 def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -> Tensor:
     """A rectangle of the view inside the picture of the first frame and inside the frame.
 
-    Args:
-        homography: (B, 3, 3) float64, pixels of the first frame to pixels of the view, w > 0 in
-            front of the camera.
-        image_hw: height and width of both frames.
-        rule: "largest" area, or "corners" as released. The latter may hold a few pixels that the
-            first frame does not show (up to 0.3 % in the published views).
-
-    Returns:
-        (B, 4) float64, on the device of `homography`: (left, top, right, bottom) in pixel edges;
-        NaN where there is none (see `check_rectangle`).
+    `homography` (B, 3, 3) float64: pixels of the first frame to pixels of the view, w > 0 in front
+    of the camera; `image_hw` of both frames. "corners", as released, may hold a few pixels that
+    the first frame does not show (up to 0.3 % in the published views). (B, 4) float64: (left, top,
+    right, bottom) in pixel edges; NaN where there is none (see `check_rectangle`).
     """
     check_choice("rectangle", rule, ("largest", "corners"))
     check_shape("homography", homography, "B M N", M=3, N=3)
@@ -52,12 +46,7 @@ def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -
 
 
 def check_rectangle(rectangle: Tensor, angles: Tensor) -> None:
-    """Raise InputError where a view has no rectangle. Waits for the device.
-
-    Args:
-        rectangle: (B, 4) from `inner_rectangle`.
-        angles: (B, 3) degrees, yaw, pitch, roll, for the message.
-    """
+    """Raise InputError where a view has no rectangle, with its angles; waits for the device."""
     empty = rectangle.isnan().any(dim=1)
     if bool(empty.any()):
         yaw, pitch, roll = angles[empty][0].tolist()

@@ -69,12 +69,9 @@ class Warp:
     def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
         """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
 
-        Where a point falls on a pixel, that pixel's value comes back bit by bit.
-
-        Args:
-            values: scores, or images in [0, 1].
-            levels: 255 rounds to 8-bit levels after each interpolation, as images that are kept
-                in bytes; there is no gradient then. None: nothing is rounded.
+        Where a point falls on a pixel, that pixel's value comes back bit by bit. `levels` 255
+        rounds to 8-bit levels after each interpolation, as images that are kept in bytes, without a
+        gradient.
         """
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
@@ -97,13 +94,9 @@ class Warp:
         return self._pixels[1].view(-1, *self.image_hw)
 
     def moved(self, points_yx: Tensor) -> Tensor:
-        """Where pixels of the first frame lie in the second: the nearest pixel of it, if outside.
+        """Where pixels (B, 2) of the first frame lie in the second; the nearest of it, if outside.
 
-        Args:
-            points_yx: (B, 2) row and column, one pixel per frame.
-
-        Returns:
-            (B, 2) int64 row and column.
+        (row, column), one per frame; int64.
         """
         row, column = points_yx.to(self.homography.device, torch.float64).unbind(1)
         points = torch.stack([column, row, torch.ones_like(row)], 1)

@@ -40,15 +40,10 @@ class CrossEntropy:
         batch: Batch,
         generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
     ) -> dict[str, Tensor]:
-        """The part "cross_entropy".
+        """The part "cross_entropy": one value, shape (1,), float32.
 
-        Args:
-            output: with `logits` (B, K, H, W).
-            batch: with `label` (B, H, W), and `confidence` (B, H, W) or None.
-            generator: not drawn from.
-
-        Returns:
-            one value, shape (1,), float32.
+        Of `logits` (B, K, H, W), `label` (B, H, W) and `confidence` (B, H, W) or None; nothing is
+        drawn.
 
         Raises:
             InputError: class weights of another number.

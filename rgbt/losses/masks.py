@@ -74,13 +74,7 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
     Source: Mask2Former, criterion.py; weighted: SpatialSeg, Eqs. (16) and (17).
     Paper: Eq. (16) is printed without its minus sign.
 
-    Args:
-        x: (..., N) float32 logits.
-        t: (..., N) targets in [0, 1].
-        weights: w, total and e of every mask; None for the plain loss.
-
-    Returns:
-        two of (...).
+    (..., N) float32 logits x, (..., N) targets t in [0, 1] -> two of (...).
     """
     bce = F.softplus(x) - x * t
     s = x.sigmoid()

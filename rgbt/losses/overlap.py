@@ -161,10 +161,8 @@ def single(values: Tensor) -> Tensor:
 def target_of(label: Tensor, probabilities: Tensor, form: Form) -> Target:
     """Which pixels count, and as what: all labelled ones; as released, none of the background.
 
-    Args:
-        label: (B, H, W) int64, 255 = ignore.
-        probabilities: (B, K, H, W), for number of classes and dtype.
-        form: see `dice`.
+    (B, H, W) int64, 255 = ignore; `probabilities` (B, K, H, W) give the number of classes and
+    dtype.
     """
     counted = label != IGNORE
     if form == "released":

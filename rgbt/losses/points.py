@@ -77,15 +77,9 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
     """Bilinear values of the binary masks of all classes at points, without making the masks.
 
     The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
-    point are read once, not once per class.
-
-    Args:
-        label: (B, H, W) int64; 255 belongs to no class.
-        points: (S, B, N, 2) in [-1, 1].
-        num_classes: K.
-
-    Returns:
-        (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or outside.
+    point are read once, not once per class. (B, H, W) int64, of which 255 is no class, at points
+    (S, B, N, 2) -> (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or
+    outside.
     """
     height, width = label.shape[1:]
     sets, images, count = points.shape[:3]
@@ -112,13 +106,7 @@ def most_uncertain(logits: Tensor, points: Tensor, keep: int) -> Tensor:
 
     Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.
 
-    Args:
-        logits: (R, N) float32, finite; overwritten.
-        points: (R, N, 2).
-        keep: 0 <= keep <= N.
-
-    Returns:
-        (R, keep, 2).
+    (R, N) float32 logits, finite and overwritten, and (R, N, 2) -> (R, keep, 2).
     """
     # Non-negative floats are ordered like their bits, and integers are selected much faster.
     magnitude = logits.abs_().view(torch.int32)

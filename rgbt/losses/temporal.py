@@ -82,9 +82,9 @@ class TemporalLoss:
         Args:
             first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
             second: frame 2, of the same sizes.
-            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only with
-                `reads_warped` in the record. Whether a gradient goes through it is for the caller
-                to decide.
+            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only where the
+            record
+                says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
                 "con" and "con_acc".
             generator: of the segmentation loss, frame 1 first.

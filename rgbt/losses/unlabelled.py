@@ -48,13 +48,9 @@ class MaxSquares:
     image_wise_ratio: Share | None
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "max_squares".
+        """The part "max_squares", () <= 0, float32 for half precision too.
 
-        Args:
-            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype.
-
-        Returns:
-            () times `weight`, <= 0, float32 for half precision too.
+        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
         """
         probabilities = single(probabilities)
         squares = probabilities.square().sum(1)
@@ -87,14 +83,9 @@ class Entropy:
     weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "entropy".
+        """The part "entropy", () float32 for half precision too; the gradient is finite at 0 too.
 
-        Args:
-            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype. Its
-                gradient is finite at 0 too.
-
-        Returns:
-            () times `weight`, float32 for half precision too.
+        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
         """
         probabilities = single(probabilities)
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
@@ -109,13 +100,8 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
 
     Source: MaxSquareLoss and its release (t = 0.95).
 
-    Args:
-        probabilities: p (B, K, H, W) of the main head.
-        aux_probabilities: q (B, K, H, W) of the auxiliary head.
-        threshold: t in [0, 1].
-
-    Returns:
-        (B, H, W) int64; no gradient goes through it.
+    p and q, (B, K, H, W), are those of the main and of the auxiliary head, t in [0, 1] is
+    `threshold`; (B, H, W) int64, through which no gradient goes.
 
     Raises:
         InputError: a threshold out of range.

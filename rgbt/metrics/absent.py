@@ -24,16 +24,9 @@ def absent_notes(
     A class is absent where it is neither labelled nor predicted. One that is predicted although no
     label holds it has an IoU of 0 with either convention (see `rgbt.metrics.scores`).
 
-    Args:
-        by_region: (R, K, K) counts of all images, rows = label, columns = prediction.
-        classes: K names.
-        scored: (K,), which classes means are over; the others are not mentioned.
-        split: name of the split.
-        absent: the convention of the table.
-
-    Returns:
-        at most three sentences without a full stop: absent classes, classes that are predicted
-        only, and classes that some regions lack.
+    Of the (R, K, K) counts of all images, K names and the scored ones (K,), the others not being
+    mentioned: at most three sentences without a full stop, about absent classes, classes that are
+    predicted only, and classes that some regions lack.
     """
     labelled, predicted = by_region.sum(-1) > 0, by_region.sum(-2) > 0
     there = labelled | predicted

@@ -43,17 +43,12 @@ class RegionCounter:
     def __call__(
         self, label: NDArray[np.integer] | Tensor, prediction: NDArray[np.integer] | Tensor
     ) -> NDArray[np.int64]:
-        """Confusion matrices of one image, one per region.
+        """(R, K, K) counts of one image, rows = label, columns = prediction; those of images add.
 
         Source: SpatialSeg release, metric code (a confusion matrix per region); pixels whose label
         is no class (255 = ignore) are left out.
 
-        Args:
-            label: (H, W) integer, 0..255; K and above is ignored.
-            prediction: (H, W) integer, 0..K-1.
-
-        Returns:
-            (R, K, K) counts, rows = label, columns = prediction. Matrices of several images add.
+        (H, W) integer labels 0..255, of which K and above are ignored, and predictions 0..K-1.
 
         Raises:
             ValueError: shapes differ, or a prediction is no class.

@@ -130,13 +130,9 @@ def tc(pairs: Matrices, absent: Absent) -> Scores:
 
     Source: Temporal, Fig. 4; release, evaluation code.
 
-    Args:
-        pairs: (..., S (K + 1), K, K), summed over images.
-        absent: a class that neither frame of a set shows: "released" 0 (the release, whose
-            denominator has 1e-10 more); "exclude" NaN, left out of the mean over the sets.
-
-    Returns:
-        (..., K) fractions 0..1; NaN where no set shows the class.
+    (..., S (K + 1), K, K), summed over images -> (..., K) fractions 0..1. `absent`, for a class
+    that neither frame of a set shows: "released" 0 (the release, whose denominator has 1e-10 more);
+    "exclude" NaN, left out of the mean over the sets; NaN where no set shows the class.
 
     Raises:
         ValueError: the rows are no whole number of sets.

@@ -113,13 +113,10 @@ class Inputs(nn.Module):
 
 
 def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:
-    """Cells to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
+    """Cells (N, h, w) to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
 
-    Args:
-        masks: (N, h, w) bool each.
-        count: N that is expected.
-        image_hw: the padded size that the cells divide.
-        unit: side of a square, pixels: 1 for pixels, 4 for the tokens of a Swin.
+    `count` is the N that is expected, `image_hw` the padded size, `unit` 1 for pixels or 4 for the
+    tokens of a Swin.
 
     Raises:
         InputError: cells that are not squares of a multiple of `unit` pixels.

@@ -23,12 +23,7 @@ LEAKY_SLOPE = 0.2
 
 
 class ConvUnit(nn.Module):
-    """3x3 convolution, batch normalisation, leaky ReLU.
-
-    Args:
-        dilation: of the convolution; its padding too.
-        activation: whether there is a leaky ReLU.
-    """
+    """3x3 convolution (dilated, padded alike), batch normalisation, and a leaky ReLU if asked."""
 
     def __init__(
         self, in_channels: int, out_channels: int, *, dilation: int = 1, activation: bool = True

@@ -136,13 +136,9 @@ class PSPNet(nn.Module):
 class PSPNetEncoder(nn.Module):
     """ResNet whose last two stages are dilated instead of strided.
 
-    Stem and first two stages exist once per image. The first block of a dilated stage is not
-    dilated; after two branches the third stage keeps its width, so that it has no projection.
-
-    Args:
-        channels: of each image, one or two.
-        depths: bottlenecks per stage.
-        width: channels of the stem.
+    Stem and first two stages exist once per image of so many `channels`. The first block of a
+    dilated stage is not dilated; after two branches the third stage keeps its width and has no
+    projection.
     """
 
     def __init__(

@@ -39,11 +39,8 @@ class Bottleneck(nn.Module):
 
     Source: He et al., Deep Residual Learning, Fig. 5 right.
 
-    Args:
-        width: of the 3x3 convolution; four times as many leave the block.
-        stride: of the block.
-        dilation: of the 3x3 convolution; its padding too.
-        stride_at: "3x3" as torchvision, "1x1" as in Caffe's ResNet (DeepLab v2).
+    `width` is that of the 3x3 convolution, which is dilated; four times as many channels leave the
+    block. Its stride is at the "3x3" as torchvision has it, or the "1x1" as in Caffe (DeepLab v2).
     """
 
     def __init__(

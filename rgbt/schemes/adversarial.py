@@ -122,12 +122,7 @@ class Adversarial:
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """The segmentation's phases, then the discriminator's; or one of both kinds.
-
-        Args:
-            batch: of both domains, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """The segmentation's phases, then the discriminator's; or one of both kinds."""
         seen: dict[str, Tensor] = {}
         if self.alternates and batch.step % 2 == 0:
             with torch.no_grad():

@@ -70,12 +70,7 @@ class CRM:
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase: the criterion of the supervised passes and the distillation terms.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase: the criterion of the supervised passes and the distillation terms."""
         output, passes = self._forward(batch, generator_of)
         # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
         modality = [self.modality_weight] * (len(self.views) - 1)

@@ -33,12 +33,7 @@ class Supervised:
         self.options = options_of(domains.source)
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of the loss.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase with the parts of the loss."""
         height, width = batch.rgb.shape[-2:]
         masks = None
         if self.hides_cells:

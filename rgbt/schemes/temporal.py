@@ -87,12 +87,7 @@ class Temporal:
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of Eq. 4.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase with the parts of Eq. 4."""
         image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
         angles = self.view.draw(len(batch.name), generator_of("virtual view"))
         warp = self.view.warp(angles, image_hw)

@@ -42,12 +42,7 @@ class LabelledDomains:
         return self.passes.record_with(Requirement("domains", "target_labels", True))
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser.
-
-        Args:
-            batch: of both domains, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase, or one per optimiser, of images in [0, 1]."""
         yield from self.passes.phases(
             lambda: self.passes.supervised("source", batch.source, generator_of)[1],
             lambda: self.passes.supervised("target", batch.target, generator_of)[1],

@@ -1,18 +1,15 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.losses import matcher as module
-from rgbt.losses.matcher import Matcher, assign, pairwise_costs, targets_of
-from rgbt.losses.points import PointSource
+from rgbt.losses.matcher import assign, pairwise_costs, targets_of
 from rgbt.losses.spatial import PointWeights
+from tests.losses.problems import seeded
 
 
 def test_targets_are_padded_and_counted() -> None:
@@ -44,7 +41,7 @@ def test_pairwise_costs_by_hand() -> None:
 
 
 def test_pairwise_costs_against_the_printed_formula() -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     x = 4 * torch.randn(2, 3, 50, generator=generator)
     t = torch.rand(2, 4, 50, generator=generator)
     w = PointWeights(
@@ -63,7 +60,7 @@ def test_pairwise_costs_against_the_printed_formula() -> None:
 
 
 def test_assignment_is_the_cheapest_of_all() -> None:
-    cost = torch.randn(6, 2, 4, 3, generator=torch.Generator().manual_seed(3))
+    cost = torch.randn(6, 2, 4, 3, generator=seeded(3))
     targets = targets_of(torch.tensor([[[0, 2]], [[1, 255]]]), (1, 2), 3, None)
     matches = assign(cost, targets)
     assert matches.image.tolist() == [0, 0, 1]
@@ -94,19 +91,3 @@ def test_costs_that_are_not_finite(bad: float) -> None:
     targets = targets_of(torch.tensor([[[0, 1]]]), (1, 2), 2, None)
     with pytest.raises(RunError, match="matching cost"):
         assign(torch.full((1, 1, 3, 2), bad), targets)
-
-
-def test_matches_do_not_depend_on_the_chunks(make_problem: Any, monkeypatch: Any) -> None:
-    output, batch = make_problem(3, 4, 2)
-    matcher = Matcher(num_points=32, class_weight=2.0, mask_weight=5.0, dice_weight=5.0)
-    targets = targets_of(batch.label, (24, 32), 5, None)
-
-    def match() -> Any:
-        generator = torch.Generator().manual_seed(0)
-        points = PointSource(generator, device=torch.device("cpu"))
-        aux = output.aux
-        return matcher(aux["class_logits"], aux["mask_logits"], targets, points).query
-
-    whole = match()
-    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
-    assert np.array_equal(whole, match())

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -16,9 +13,9 @@ from rgbt.config.compose import conf_dir, register_resolvers
 from rgbt.maskers.masker import Masker
 from rgbt.maskers.pattern import complementary, random_complementary
 from rgbt.randomness import torch_generator
+from tests.models.golden import FOLDER
 
-SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
-GOLDEN = SHARED / "golden" / "losses.npz"
+GOLDEN = FOLDER / "losses.npz"
 VARIANTS = ["none", "crm", "irm", "square", "grbm_paper", "grbm_released"]
 
 
@@ -117,12 +114,6 @@ def test_pattern_probabilities_in_their_order() -> None:
     assert [m.flatten().tolist() for m in only_rgb] == [[True, False], [False, False]]
     assert [m.flatten().tolist() for m in both] == [[True, False], [False, True]]
     assert torch.equal(complementary(taken).thermal, both.thermal)
-
-
-def test_square_covers_a_quarter() -> None:
-    masks = configured("square", pairing="comp")((240, 320), centres(50), torch_generator(0, "m"))
-    assert masks.rgb.shape[1:] == (64, 80)
-    assert (masks.rgb.double().mean((1, 2)) == 0.25).all()
 
 
 def test_paper_gaussian_hides_its_expected_share() -> None:
@@ -255,8 +246,3 @@ def test_grid_of_the_padded_crop() -> None:
     assert configured("grbm_paper").grid_hw((240, 320)) == (4, 5)
     assert configured("grbm_paper", "demo").grid_hw((120, 160)) == (4, 5)
     assert configured("crm").grid_hw((216, 320)) == (7, 10)
-
-
-def test_centres_must_be_pairs() -> None:
-    with pytest.raises(ValueError, match="centre_yx"):
-        configured("crm")((240, 320), torch.zeros(4, 3), torch_generator(0, "m"))

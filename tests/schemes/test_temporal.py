@@ -12,14 +12,13 @@ from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss
 from rgbt.models.mask2former.model import Mask2Former, semantic_logits
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import Batch, Frame, Output
-from tests.models.test_mask2former import images, nano
+from tests.models.plain import images
+from tests.models.test_mask2former import nano
 
 B, K, HW = 3, 4, (48, 64)
 
@@ -79,10 +78,6 @@ class Recorded:
         if warped is not None:
             parts.append((warped - second.logits.softmax(1)).square().mean())
         return {str(number): part for number, part in enumerate(parts)}
-
-
-class Segmentation(Recorded):
-    record = Record(frames=2)
 
 
 def view(**changes: Any) -> VirtualView:
@@ -157,21 +152,6 @@ def test_outputs_gradients_and_statistics_are_those_of_two_calls(
         torch.testing.assert_close(mine, theirs)
     for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
         torch.testing.assert_close(mine, theirs)
-
-
-def test_one_call_would_change_what_is_normalised() -> None:
-    """What the test above would not see if statistics of frames were near enough to be equal."""
-    net = Net(nn.BatchNorm2d(6))
-    temporal = scheme(net)
-    step(temporal)
-    loss: Any = temporal.loss
-    frames = loss.first.batch, loss.second.batch
-    joint = Net(nn.BatchNorm2d(6))(*(torch.cat([getattr(f, n) for f in frames]) for n in NAMES))
-    assert (joint.logits[:B] - loss.first.logits).abs().max() > 1e-3
-    assert int(net.norm.num_batches_tracked) == 2
-
-
-NAMES = ("rgb", "thermal")
 
 
 def test_the_second_frame_is_the_view_of_the_first() -> None:
@@ -261,21 +241,12 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
         assert touched.tolist() == [False, False, True, True]
 
 
-def test_a_loss_that_reads_no_warped_prediction_is_given_none() -> None:
-    temporal = scheme(Net(nn.Identity()), loss=Segmentation())
-    step(temporal)
-    assert temporal.loss.warped is None
-
-
 def test_background_views_count_every_pixel() -> None:
     temporal = scheme(Net(nn.Identity()), view=view(mode="rotation", outside="background"))
     step(temporal)
     loss: Any = temporal.loss
     assert loss.valid.all()
     assert (loss.second.batch.label < K).all()
-
-
-# ---- networks that predict masks ------------------------------------------------------------
 
 
 class MaskLoss(Recorded):
@@ -332,13 +303,6 @@ def test_dense_logits_are_the_logarithm_of_semantic_scores(hw: tuple[int, int]) 
     assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)
 
 
-def test_dense_logits_are_those_of_evaluation() -> None:
-    net, (rgb, thermal) = nano().eval(), images(2, 60, 84)
-    output = net(rgb, thermal)
-    assert output.logits is not None
-    torch.testing.assert_close(net.dense_logits(output, (60, 84)).exp(), output.logits)
-
-
 def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
     classes = torch.tensor([[[200.0, -200.0, 0.0]]], requires_grad=True)
     masks = torch.full((1, 1, 8, 8), 3.0, requires_grad=True)
@@ -352,37 +316,3 @@ def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
 
 
 # ---- what is required -----------------------------------------------------------------------
-
-
-def test_temporal_requires_two_frames_and_whole_images() -> None:
-    record = record_of(scheme(Net(nn.Identity())))
-    assert [(each.node, each.key, each.value) for each in record.requires] == [
-        ("loss", "frames", 2),
-        ("masker", "hides_cells", False),
-    ]
-    assert record.frames == 2
-    assert record.camera == view().camera
-
-
-def test_temporal_with_masks_requires_dense_logits() -> None:
-    net = Net(nn.Identity())
-    net.record = Record(outputs="masks")
-    required = record_of(scheme(net)).requires[-1]
-    assert (required.node, required.key) == ("model", "dense_logits")
-    assert not required.is_met_by(net.record)
-    assert required.is_met_by(nano().record)
-
-
-def test_the_loss_of_the_papers_goes_through_the_scheme() -> None:
-    loss = TemporalLoss(
-        segmentation=CrossEntropy(class_weights=None),
-        alpha=1.0,
-        beta=2.0,
-        second="con",
-        form="paper",
-    )
-    net = Net(nn.BatchNorm2d(6))
-    parts = step(scheme(net, loss=loss))
-    assert set(parts) == {"cross_entropy_1", "cross_entropy_2", "dice_1", "con"}
-    torch.stack(list(parts.values())).sum().backward()
-    assert all(each.any() for each in gradients(net)[:1])

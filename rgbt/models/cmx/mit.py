@@ -131,14 +131,10 @@ class MitBlock(nn.Module):
 
 
 def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn.Module]:
-    """Patch embedding, blocks and normalisation of a stage, by their released names.
+    """Patch embedding, blocks and normalisation of stage 0..3, by their released names.
 
     The release keeps them side by side (`block1`, `extra_block1`), not in one module per stage.
-
-    Args:
-        shape: sizes.
-        stage: 0..3.
-        in_channels: of the image, for stage 0.
+    `in_channels` are those of the image, for stage 0.
     """
     dim = shape.embed_dims[stage]
     before = shape.embed_dims[stage - 1] if stage else in_channels
@@ -157,11 +153,8 @@ def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn
 def drop_rates(depths: tuple[int, int, int, int], last: float, stage2: Stage2) -> Tensor:
     """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
 
-    Args:
-        depths: blocks per stage.
-        last: rate of the last block; rates rise evenly from 0.
-        stage2: "released": stage 2 has one rate per stream, that of its first block for RGB and
-            the next one on the ramp for thermal; "ramp": no exception.
+    Rates rise evenly from 0 to `last`. `stage2` "released": stage 2 has one rate per stream, that
+    of its first block for RGB and the next one on the ramp for thermal; "ramp": no exception.
     """
     rates = torch.linspace(0, last, sum(depths)).repeat(2, 1)
     if stage2 == "released":

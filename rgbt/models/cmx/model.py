@@ -30,10 +30,7 @@ class CmxEncoder(nn.Module):
     The next stage continues with what the rectification returns; the decoder reads what the fusion
     returns.   Source: CMX, Sec. III-A.
 
-    Args:
-        shape: sizes of a stream.
-        thermal_channels: of the thermal image.
-        drop_rates: (2, blocks) probabilities of stochastic depth, RGB's and thermal's; None: none.
+    `drop_rates` (2, blocks): probabilities of stochastic depth, RGB's and thermal's; None: none.
     """
 
     def __init__(
@@ -53,14 +50,10 @@ class CmxEncoder(nn.Module):
         self.apply(initialise)
 
     def forward(self, images: Images, generator: torch.Generator | None) -> list[Tensor]:
-        """Fused maps of the four stages.
+        """Fused maps of the four stages, (N, h, w, C_s): H and W over 4, 8, 16, 32, rounded up.
 
-        Args:
-            images: (N, 3, H, W) and (N, c, H, W) normalised.
-            generator: draws stochastic depth; only read in training mode with rates.
-
-        Returns:
-            four (N, h, w, C_s), h and w being H and W over 4, 8, 16, 32, rounded up.
+        `images` are (N, 3, H, W) and (N, c, H, W), normalised; `generator` draws stochastic depth,
+        in training mode with rates alone.
         """
         rgb, thermal = (image.permute(0, 2, 3, 1).contiguous() for image in images)
         # Factors of every residual by stream and stage, (blocks, 2, N, 1, 1, 1) each.

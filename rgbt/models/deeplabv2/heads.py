@@ -72,12 +72,8 @@ class AtrousPyramid(nn.Module):
     """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
 
     Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
-    MaxSquareLoss and the thesis leave their loop early, so that only the first two count, while
-    the others still belong to the parameters; ADVENT sums all.
-
-    Args:
-        rates: dilations, one convolution each.
-        summed_rates: those that count.
+    MaxSquareLoss and the thesis leave their loop early, so that only the first two (`summed_rates`)
+    count, while the others still belong to the parameters; ADVENT sums all.
     """
 
     def __init__(

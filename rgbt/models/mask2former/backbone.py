@@ -19,12 +19,8 @@ class RgbtBackbone(nn.Module):
     Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
     a single modality leave as the branch normalised them.
 
-    Args:
-        shape: sizes of a branch.
-        share_start: stages from this index on (0..4) are the RGB branch's own in both branches;
-            embedding, output normalisations and mask token never are. 4 shares nothing.
-        fusion: "max" or "add".
-        thermal_channels: of the thermal image.
+    Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding, output
+    normalisations and mask token never are. 4 shares nothing.
     """
 
     def __init__(

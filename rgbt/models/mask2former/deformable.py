@@ -53,12 +53,7 @@ class DeformableAttention(nn.Module):
 
         out_q = W_o sum_j a_qj  value(reference_q + offset_qj),   sum_j a_qj = 1 per head
 
-    Source: Deformable DETR, Eq. (3).
-
-    Args:
-        dim: channels C.
-        heads: M; divides `dim`.
-        num_levels: E.
+    Source: Deformable DETR, Eq. (3). `dim` is C, `heads` M, which divides it, `num_levels` E.
     """
 
     def __init__(self, dim: int, *, heads: int, num_levels: int) -> None:
@@ -88,15 +83,10 @@ class DeformableAttention(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, query: Tensor, tokens: Tensor, levels: Levels) -> Tensor:
-        """Attention of all tokens to all levels.
+        """Attention of all tokens to all levels: (B, S, C) -> (B, S, C).
 
-        Args:
-            query: (B, S, C), tokens with their position code.
-            tokens: (B, S, C).
-            levels: rows and columns of each level; S is the sum of their products.
-
-        Returns:
-            (B, S, C).
+        `query` are the tokens with their position code; S is the sum of rows x columns of the
+        levels.
         """
         batch, length, dim = tokens.shape
         sizes = [rows * columns for rows, columns in levels]

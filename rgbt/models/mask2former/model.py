@@ -196,13 +196,8 @@ class Mask2Former(nn.Module):
     def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
         """Class scores of every pixel in training, for losses that compare dense predictions.
 
-        Args:
-            output: of one pass and view, see `forward`.
-            image_hw: size of the images.
-
-        Returns:
-            (B, K, H, W) float32: logarithm of the semantic scores, so that their softmax is the
-            share of a class in the sum over classes.
+        `output` is of one pass and view. (B, K, H, W) float32: logarithm of the semantic scores, so
+        that their softmax is the share of a class in the sum over classes.
         """
         scores = semantic_logits(
             output.aux["class_logits"][-1, 0],
@@ -222,14 +217,8 @@ def semantic_logits(
 
     Source: Mask2Former release, semantic inference; the no-object class is dropped.
 
-    Args:
-        class_logits: (B, Q, K + 1).
-        mask_logits: (B, Q, h, w).
-        image_hw: size to return.
-        padded: size that h, w stand for; the image is its top left part.
-
-    Returns:
-        (B, K, H, W) float32, >= 0.
+    (B, Q, K + 1) and (B, Q, h, w), which stands for an image of size `padded` whose top left part
+    is `image_hw`, -> (B, K, H, W) float32, >= 0.
     """
     with torch.autocast(class_logits.device.type, enabled=False):
         masks = F.interpolate(

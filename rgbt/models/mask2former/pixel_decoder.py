@@ -104,9 +104,8 @@ class PixelDecoder(nn.Module):
 
     Source: Mask2Former, Sec. 3.2 and 4.1; MSDeformAttn variant of its release.
 
-    Args:
-        widths: channels of the features at strides 4, 8, 16, 32.
-        fp32: run in single precision under autocast too.   Released: true.
+    `widths` are channels at strides 4, 8, 16, 32; `fp32` runs it in single precision under autocast
+    too (released: true).
     """
 
     def __init__(

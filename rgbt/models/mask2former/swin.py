@@ -116,14 +116,9 @@ class WindowAttention(nn.Module):
         self.register_buffer("relative_position_index", index, persistent=False)
 
     def forward(self, x: Tensor, shift: int) -> Tensor:
-        """Attention in every window of a map, before the output projection.
+        """Attention in every window of (N, H, W, C), before the output projection.
 
-        Args:
-            x: (N, H, W, C), H and W multiples of the window, rolled by -`shift` already.
-            shift: tokens the map was rolled by.
-
-        Returns:
-            (N, H, W, C).
+        H and W are multiples of the window; the map has been rolled by -`shift` already.
         """
         n, height, width, dim = x.shape
         side, rows, columns = self.window, height // self.window, width // self.window
@@ -236,10 +231,7 @@ class Stage(nn.Module):
 class Swin(nn.Module):
     """One modality's branch: four maps at strides 4, 8, 16, 32, each layer-normalised.
 
-    Args:
-        in_channels: channels of the image, 3 for RGB and 1 for thermal.
-        shape: sizes.
-        shared: stages to use instead of own ones, by index (Python objects are shared).
+    `shared` are stages to use instead of own ones, by index (Python objects are shared).
     """
 
     def __init__(self, in_channels: int, *, shape: SwinShape, shared: dict[int, Stage]) -> None:
@@ -257,15 +249,12 @@ class Swin(nn.Module):
     def forward(
         self, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
     ) -> list[Tensor]:
-        """Normalised maps of the four stages.
+        """Normalised maps of the four stages, (N, C_s, H/s, W/s), channels last in memory.
 
         Args:
             image: (N, c, H, W) normalised, sides multiples of 32.
             hidden: (N, H/4, W/4) bool, True = the token is replaced by the mask token; None: none.
             generator: draws stochastic depth; only read in training mode with a rate above 0.
-
-        Returns:
-            four (N, C_s, H/s, W/s), s = 4, 8, 16, 32, channels last in memory.
         """
         x = self.patch_embed(image)
         if hidden is not None:
