@@ -165,20 +165,19 @@ class Warp:
     def _pixels(self) -> tuple[Tensor, Tensor]:
         """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
         height, width = self.image_hw
-        x, y = self._composed if self.resampling == "once" else self._source(*self._picked)
+        if self.resampling == "once":
+            x, y = self._composed
+        else:  # canvas pixels that OpenCV's nearest resize takes from the rectangle
+            left, top, right, bottom = self.rectangle[..., None].unbind(1)
+            columns, rows = self._whole()
+            picked = _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
+            x, y = self._source(*picked)
         inside = self._within(x, y)
         column, row = (
             (torch.where(inside, at, 0.0) + 0.5).floor_().clamp_(0, side - 1).long()
             for at, side in ((x, width), (y, height))
         )
         return row.mul_(width).add_(column).flatten(1), inside.flatten(1)
-
-    @property
-    def _picked(self) -> tuple[Tensor, Tensor]:
-        """Canvas pixels (B, W), (B, H) that OpenCV's nearest resize takes from the rectangle."""
-        left, top, right, bottom = self.rectangle[..., None].unbind(1)
-        columns, rows = self._whole()
-        return _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
 
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:

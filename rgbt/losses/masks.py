@@ -52,7 +52,13 @@ def mask_losses(
     index = query.clamp(min=0).reshape(layers, passes, -1)
     matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
     for logits in torch.split(matched_SGhw, step):
-        drawn = _choose(logits, points, sampling)
+        # (S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones.
+        drawn = points.loss(len(logits), len(image), sampling.candidates + sampling.fresh)
+        candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
+        with torch.no_grad():
+            values = _read(logits, candidates).flatten(0, 1)
+            kept = most_uncertain(values, candidates.flatten(0, 1), sampling.kept)
+        drawn = torch.cat([kept.reshape(*fresh.shape[:2], sampling.kept, 2), fresh], dim=2)
         t = sample(masks, drawn.transpose(0, 1))[:, 0].transpose(0, 1)
         x = _read(logits, drawn)
         weights = None if targets.spatial is None else targets.spatial.at(drawn, image, first)
@@ -90,14 +96,3 @@ def _read(logits_SGhw: Tensor, points_SGN2: Tensor) -> Tensor:
     """(S, G, N) every mask at its own points."""
     values = sample(logits_SGhw.flatten(0, 1)[:, None], points_SGN2.flatten(0, 1)[:, None])
     return values.reshape(points_SGN2.shape[:-1])
-
-
-@torch.no_grad()
-def _choose(logits_SGhw: Tensor, points: Points, sampling: Sampling) -> Tensor:
-    """(S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones."""
-    sets, masks = logits_SGhw.shape[:2]
-    drawn = points.loss(sets, masks, sampling.candidates + sampling.fresh)
-    candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
-    values = _read(logits_SGhw, candidates).flatten(0, 1)
-    kept = most_uncertain(values, candidates.flatten(0, 1), sampling.kept)
-    return torch.cat([kept.reshape(sets, masks, sampling.kept, 2), fresh], dim=2)

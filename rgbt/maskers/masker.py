@@ -171,22 +171,17 @@ class Masker:
         optional = {"sigma_height"} if "sigma_div" in needed else set()
         if self.pairing == "rand_comp":
             optional.add("pattern_probabilities")
+        variant = f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
         for name, value in vars(self).items():
             if name == "sampler" or name in optional:
                 continue
             if name in needed and value is None:
-                raise InputError(f"masker.{name} needs a value with {self._variant()}; it is null.")
+                raise InputError(f"masker.{name} needs a value with {variant}; it is null.")
             if name not in needed and value is not None:
                 raise InputError(
-                    f"masker.{name} has no effect with {self._variant()}; set masker.{name}=null "
+                    f"masker.{name} has no effect with {variant}; set masker.{name}=null "
                     f"(it is {value})."
                 )
-        self._check_values()
-
-    def _variant(self) -> str:
-        return f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
-
-    def _check_values(self) -> None:
         if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
             raise InputError(
                 f"masker.sigma_height must hold one cell of masker.patch_size={self.patch_size} "

@@ -47,7 +47,7 @@ def test_values_from_the_weights_alone() -> None:
     net, pair = nano("mfnet").eval(), images(2)
     randomise(net)
     expected = logits_of(net, *pair)
-    assert expected.std() > 0.1
+    assert expected.std() > 0.05
     torch.testing.assert_close(net(*pair).logits, expected, rtol=1e-4, atol=1e-5)
 
 

@@ -6,6 +6,7 @@ take as it is (channels last), so that nothing is copied between the two.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,18 +84,6 @@ class MitAttention(nn.Module):
         return mixed
 
 
-class Depthwise(nn.Module):
-    """A 3x3 convolution of every channel alone, under the released name `dwconv.dwconv`."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.dwconv = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, H, W, C) -> (N, H, W, C)."""
-        return convolve(self.dwconv, x)
-
-
 class MixFfn(nn.Module):
     """Linear, depthwise 3x3 convolution, exact GELU, linear.
 
@@ -104,12 +93,13 @@ class MixFfn(nn.Module):
     def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
         self.fc1 = nn.Linear(dim, hidden)
-        self.dwconv = Depthwise(hidden)
+        depthwise = nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)
+        self.dwconv = nn.Sequential(OrderedDict(dwconv=depthwise))  # the released name
         self.fc2 = nn.Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, H, W, C) -> (N, H, W, C)."""
-        out: Tensor = self.fc2(F.gelu(self.dwconv(self.fc1(x))))
+        out: Tensor = self.fc2(F.gelu(convolve(self.dwconv, self.fc1(x))))
         return out
 
 

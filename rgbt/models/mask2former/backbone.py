@@ -81,18 +81,13 @@ class RgbtBackbone(nn.Module):
         """The maps of one level along the batch: every view of the first pass, then the next."""
         by_view: list[tuple[Tensor, ...]] = []
         for view in views:
-            if view == "rgbt":
-                fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
-                by_view.append(self._normalise(level, fused, passes))
-            else:
+            if view != "rgbt":
                 by_view.append(maps[view][level].chunk(passes))
-        parts = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    def _normalise(self, level: int, fused: Tensor, passes: int) -> tuple[Tensor, ...]:
-        """Batch normalisation of each pass; without batch statistics all are one call."""
-        norm = self.norm_layers[LEVELS[level]]
-        if self.training:
-            return tuple(norm(part) for part in fused.chunk(passes))
-        normalised: Tensor = norm(fused)
-        return normalised.chunk(passes)
+                continue
+            fused, norm = self.fuse(maps["rgb"][level], maps["thermal"][level]), LEVELS[level]
+            # Without batch statistics all passes are one call.
+            parts = fused.chunk(passes) if self.training else (fused,)
+            normed = [self.norm_layers[norm](part) for part in parts]
+            by_view.append(tuple(normed) if self.training else normed[0].chunk(passes))
+        joined = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
+        return torch.cat(joined) if len(joined) > 1 else joined[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Annotated, Literal
 
 import torch
@@ -13,7 +14,7 @@ from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
-from rgbt.models.mask2former.decoder import Predictions, Predictor
+from rgbt.models.mask2former.decoder import Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
 from rgbt.models.parts import check_heads
@@ -23,20 +24,6 @@ from rgbt.types import VIEWS, MaskPair, Output, View
 
 FAINTEST = 1e-6
 """Smallest semantic score whose logarithm is taken."""
-
-
-class Mask2FormerHead(nn.Module):
-    """Pixel decoder, then query decoder."""
-
-    def __init__(self, pixel_decoder: PixelDecoder, predictor: Predictor) -> None:
-        super().__init__()
-        self.pixel_decoder = pixel_decoder
-        self.predictor = predictor
-
-    def forward(self, features: list[Tensor]) -> Predictions:
-        """Features at strides 4, 8, 16, 32 -> predictions of all layers."""
-        predictions: Predictions = self.predictor(self.pixel_decoder(features))
-        return predictions
 
 
 class Mask2Former(nn.Module):
@@ -128,7 +115,8 @@ class Mask2Former(nn.Module):
             heads=attention_heads,
             ffn_dim=decoder_ffn_dim,
         )
-        self.sem_seg_head = Mask2FormerHead(pixel_decoder, predictor)
+        parts = {"pixel_decoder": pixel_decoder, "predictor": predictor}
+        self.sem_seg_head = nn.Sequential(OrderedDict(parts))
         self.inputs = inputs
 
     def forward(
