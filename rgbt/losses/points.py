@@ -9,7 +9,7 @@ one per (layer, pass), layer-major.
 from __future__ import annotations
 
 from itertools import product
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,19 +18,7 @@ from torch.nn import functional as F
 from rgbt.types import IGNORE
 
 
-class Points(Protocol):
-    """Where points come from: drawn (`PointSource`) or, in tests, replayed."""
-
-    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
-        """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
-        ...
-
-    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
-        ...
-
-
-class PointSource:
+class Points:
     """Independent uniform points from one generator, on `device`.
 
     Draws are made set by set in the order of the requests, so that the numbers do not
@@ -47,7 +35,7 @@ class PointSource:
         self.device = device
 
     def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """See `Points`."""
+        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
         numbers = 2 * num_masks * num_points
         bits = torch.empty(
             num_sets, -(-numbers // 4), dtype=torch.int64, device=self.generator.device
@@ -60,6 +48,7 @@ class PointSource:
         return uniform.reshape(num_sets, num_masks, num_points, 2)
 
     matcher = loss
+    """The same for the matching costs, with images in the place of masks."""
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:

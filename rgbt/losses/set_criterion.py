@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError, check_shape
 from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
-from rgbt.losses.points import Points, PointSource
+from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import Record, Requirement
@@ -95,7 +95,7 @@ class SetCriterion:
                 (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
                 the prediction.
             batch: with `label` (B, H, W), H <= 4h and W <= 4w; the weighted loss reads `position`.
-            generator: draws the points (order: `rgbt.losses.points.PointSource`).
+            generator: draws the points (order: `rgbt.losses.points.Points`).
 
         Returns:
             name -> (P,) float32.
@@ -105,7 +105,7 @@ class SetCriterion:
             RunError: predictions that are not finite.
             ValueError: shapes or labels that do not fit.
         """
-        return self.compare(output, batch, PointSource(generator, device=batch.label.device))
+        return self.compare(output, batch, Points(generator, device=batch.label.device))
 
     def compare(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
         """As `__call__`, at given points."""

@@ -172,7 +172,7 @@ def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
     three = np.einsum("...ccc->...c", labelled)
     sizes = frames.sum(-1) + frames.sum(-2) + labelled.sum((-1, -2))
     twos = (frames, labelled.sum(-1), labelled.sum(-2))
-    overlaps = sum(np.diagonal(each, axis1=-2, axis2=-1) for each in twos)
+    overlaps: Scores = np.sum([np.diagonal(x, axis1=-2, axis2=-1) for x in twos], axis=0)
     return three, sizes, overlaps
 
 

@@ -7,7 +7,7 @@ import torch
 
 from rgbt.losses import masks, matcher
 from rgbt.losses.masks import mask_and_dice
-from rgbt.losses.points import PointSource
+from rgbt.losses.points import Points
 from rgbt.losses.spatial import PointWeights
 from tests.losses.problems import criterion_of, problem_of, seeded
 
@@ -29,14 +29,6 @@ def test_weighted_losses_by_hand() -> None:
     bce, dice = mask_and_dice(x, t, w)
     assert torch.allclose(bce, torch.tensor([3.5 * math.log(2)]))
     assert torch.allclose(dice, torch.tensor([11 / 15]))
-
-
-def test_weights_of_one_are_the_plain_losses() -> None:
-    generator = seeded(0)
-    x, t = torch.randn(4, 30, generator=generator), torch.rand(4, 30, generator=generator)
-    ones = PointWeights(torch.ones(4, 30), torch.full((4,), 30.0), torch.ones(4))
-    for plain, weighted in zip(mask_and_dice(x, t, None), mask_and_dice(x, t, ones), strict=True):
-        assert torch.allclose(plain, weighted)
 
 
 def test_large_logits_stay_finite() -> None:
@@ -62,7 +54,7 @@ def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
     criterion = criterion_of()
 
     def losses() -> torch.Tensor:
-        points = PointSource(seeded(0), device=torch.device("cpu"))
+        points = Points(seeded(0), device=torch.device("cpu"))
         return torch.stack(list(criterion.compare(output, batch, points).values()))
 
     whole = losses()

@@ -27,19 +27,6 @@ def test_unknown_labels_are_refused(value: int) -> None:
         assign(torch.zeros(1, 1, 4, 3), targets)
 
 
-def test_pairwise_costs_by_hand() -> None:
-    # One query with logits 0 everywhere, two points, target 1 on one of them: s = 1/2, BCE is
-    # log 2, the dice cost 1 - (2 * 1/2 + 1) / (1 + 1 + 1) = 1/3.
-    x, t = torch.zeros(1, 1, 2), torch.tensor([[[1.0, 0.0]]])
-    cost = pairwise_costs(x.clone(), t, None, 5.0, 7.0)
-    assert torch.allclose(cost, 5 * torch.tensor(2.0).log() + 7 / 3)
-    # Weights 1 and 3, divided by their sum, no smoothing: BCE is log 2 again, the dice cost
-    # 1 - 2 * 1/2 / (2 + 1) = 2/3.
-    w = PointWeights(torch.tensor([[1.0, 3.0]]), torch.tensor([4.0]), torch.tensor([0.0]))
-    cost = pairwise_costs(x, t * w.values[:, None], w, 5.0, 7.0)
-    assert torch.allclose(cost, 5 * torch.tensor(2.0).log() + 7 * 2 / 3)
-
-
 def test_pairwise_costs_against_the_printed_formula() -> None:
     generator = seeded(0)
     x = 4 * torch.randn(2, 3, 50, generator=generator)
@@ -79,11 +66,6 @@ def test_more_targets_than_queries() -> None:
     cost = torch.tensor([[[[5.0, 1.0, 4.0], [5.0, 2.0, 3.0]]]])
     # Queries 0 and 1 take classes 1 and 2 (1 + 3 = 4); class 0 is left without one.
     assert assign(cost, targets).query.tolist() == [[-1, 0, 1]]
-
-
-def test_no_targets_at_all() -> None:
-    targets = targets_of(torch.full((2, 1, 3), 255), (1, 3), 3, None)
-    assert assign(torch.zeros(5, 2, 4, 3), targets).query.shape == (5, 0)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

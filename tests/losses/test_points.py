@@ -3,14 +3,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rgbt.losses.points import PointSource, class_shares, most_uncertain, sample
+from rgbt.losses.points import Points, class_shares, most_uncertain, sample
 from tests.losses.problems import seeded
 
 CPU = torch.device("cpu")
 
 
-def source(seed: int = 0) -> PointSource:
-    return PointSource(seeded(seed), device=CPU)
+def source(seed: int = 0) -> Points:
+    return Points(seeded(seed), device=CPU)
 
 
 @pytest.mark.parametrize("count", [1, 3, 64])
@@ -52,12 +52,6 @@ def test_class_shares_equal_the_sampled_one_hot_label() -> None:
     one_hot = torch.stack([label == k for k in range(4)], 1).float()
     expected = sample(one_hot, points.transpose(0, 1)).permute(2, 0, 1, 3)
     assert torch.allclose(class_shares(label, points, 4), expected, atol=1e-5)
-
-
-def test_class_shares_by_hand() -> None:
-    label = torch.tensor([[[2, 0]]])
-    points = torch.tensor([[[[0.25, 0.0], [-0.5, 0.0]]]])
-    assert class_shares(label, points, 3)[0, 0].T.tolist() == [[0.75, 0.0, 0.25], [0.0, 0.0, 1.0]]
 
 
 def test_most_uncertain_keeps_the_smallest_magnitudes() -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from rgbt.checks import InputError, RunError
 from rgbt.losses import set_criterion as module
 from rgbt.losses.masks import Sampling
-from rgbt.losses.points import PointSource
+from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN, SpatialWeight
 from rgbt.types import Output
 from tests.benchmarks.reference_criterion import Replayed, reference_criterion
@@ -28,7 +28,7 @@ def replayed(sampling: Sampling, sets: tuple[int, int], batch: Any) -> Any:
     """The same draws for the batched criterion and for the reference, 64 matcher points."""
     layers, passes = sets
     targets = sum(len(set(label.unique().tolist()) - {255}) for label in batch.label)
-    source = PointSource(seeded(5), device=torch.device("cpu"))
+    source = Points(seeded(5), device=torch.device("cpu"))
     matcher = source.matcher(layers * passes, len(batch.label), 64)
     loss = source.loss(layers * passes, targets, sampling.candidates + sampling.fresh)
     return Replayed(matcher, loss, passes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
@@ -74,15 +73,6 @@ def test_image_wise_weights_against_loops(ratio: float) -> None:
     total = by_loops(p, ratio)
     assert squares(p, "pixels", ratio).item() == pytest.approx(total / (2 * 3), rel=1e-9)
     assert squares(p, "entries", ratio).item() == pytest.approx(total / (3 * 4), rel=1e-9)
-
-
-def test_image_wise_weights_by_hand() -> None:
-    """Four pixels, three of class 0: with r = 1/2 they weigh 1 / sqrt(12), the other 1 / 2."""
-    p = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]]).T.reshape(1, 2, 2, 2)
-    expected = 3 / math.sqrt(12) + 1 / 2
-    assert squares(p, "entries", 0.5).item() == pytest.approx(-expected / 2)
-    # Without any class: every pixel 1 / H, as without the ratio.
-    assert squares(p, "pixels", 0.0).item() == pytest.approx(squares(p).item()) == -0.5
 
 
 @pytest.mark.parametrize("ratio", [None, 0.2])

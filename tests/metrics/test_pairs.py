@@ -196,14 +196,6 @@ def test_the_mean_is_over_sets_not_over_their_pixels(absent, expected: float) ->
     assert tc(sum(sets), absent)[0] == pytest.approx(1 / 10)
 
 
-def test_sums_do_not_overflow_the_stored_type() -> None:
-    counts = np.full((3, 2, 2), 2**30, np.int32)
-    np.testing.assert_allclose(tc(counts, "released"), [1 / 3, 1 / 3])
-    # Of 12 equal cells each prediction says a class in 6, the label in 4; two of them share 3 + 2
-    # + 2, all three 1: 16 - 7 + 1.
-    np.testing.assert_allclose(ca(counts, "released"), [1 / 10, 1 / 10])
-
-
 def test_rows_that_are_no_whole_number_of_sets() -> None:
     with pytest.raises(ValueError, match="expected S x 4 rows .* got 5"):
         tc(np.zeros((5, 3, 3)), "released")

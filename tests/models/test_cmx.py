@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.models.cmx.decoder import MlpDecoder
-from rgbt.models.cmx.fusion import CrossAttention, Rectification
 from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn, drop_rates
 from rgbt.models.cmx.model import CMX
 from tests.models import plain
@@ -108,66 +107,6 @@ def test_feed_forward_sees_its_neighbours_only() -> None:
                     total = total + wide[y, z] * kernel[:, y - r + 1, z - c + 1]
             gelu = 0.5 * total * (1 + torch.erf(total / math.sqrt(2)))
             torch.testing.assert_close(layer(x)[0, r, c], layer.fc2(gelu), rtol=1e-4, atol=1e-5)
-
-
-def test_rectification_by_hand() -> None:
-    """Without weights every sigmoid is 1/2; biases turn single weights into 1 and 0."""
-    module = Rectification(2)
-    for parameter in module.parameters():
-        nn.init.zeros_(parameter)
-    x1, x2 = normal(1, 2, 3, 2, seed=1), normal(1, 2, 3, 2, seed=2)
-    out1, out2 = module(x1, x2)
-    torch.testing.assert_close(out1, x1 + 0.5 * x2)
-    torch.testing.assert_close(out2, x2 + 0.5 * x1)
-
-    # Channels: x1 counts fully, x2 not at all. Places: both half.
-    module.channel_weights.mlp[2].bias.data = torch.tensor([99.0, 99.0, -99.0, -99.0])
-    out1, out2 = module(x1, x2)
-    torch.testing.assert_close(out1, x1 + 0.5 * (0 + 0.5) * x2)
-    torch.testing.assert_close(out2, x2 + 0.5 * (1 + 0.5) * x1)
-    # Places: x2 counts fully, x1 not at all.
-    module.spatial_weights.mlp[2].bias.data = torch.tensor([-99.0, 99.0])
-    out1, out2 = module(x1, x2)
-    torch.testing.assert_close(out1, x1 + 0.5 * (0 + 1) * x2)
-    torch.testing.assert_close(out2, x2 + 0.5 * (1 + 0) * x1)
-
-
-def test_channel_weights_see_means_then_maxima() -> None:
-    """The first linear map passes its inputs on, the second reads one of the four blocks."""
-    weights = Rectification(2).channel_weights
-    first, second = weights.mlp[0], weights.mlp[2]
-    nn.init.eye_(first.weight)
-    x1, x2 = normal(1, 2, 3, 2, seed=1).abs(), normal(1, 2, 3, 2, seed=2).abs()
-    blocks = (x1.mean((1, 2)), x2.mean((1, 2)), x1.amax((1, 2)), x2.amax((1, 2)))
-    for number, block in enumerate(blocks):
-        nn.init.zeros_(second.weight)
-        second.weight.data[:2, 2 * number : 2 * number + 2] = torch.eye(2)
-        first.bias.data.zero_()
-        second.bias.data.zero_()
-        found = weights(x1, x2)
-        torch.testing.assert_close(found[0].flatten(), block.sigmoid().flatten())
-        torch.testing.assert_close(found[1].flatten(), torch.full((2,), 0.5))
-
-
-def test_cross_attention_by_loops() -> None:
-    """Two heads of two channels: each stream meets the other's context, columns sum to 1."""
-    layer: CrossAttention = randomise(CrossAttention(4, 2))
-    u1, u2 = normal(2, 5, 4, seed=1), normal(2, 5, 4, seed=2)
-    for queries, other, kv, found in zip(
-        (u1, u2), (u2, u1), (layer.kv2, layer.kv1), layer(u1, u2), strict=True
-    ):
-        k, v = kv(other)[..., :4], kv(other)[..., 4:]
-        for n in range(2):
-            for head in range(2):
-                context = torch.zeros(2, 2)
-                for a in range(2):
-                    for b in range(2):
-                        context[a, b] = k[n, :, 2 * head + a] @ v[n, :, 2 * head + b] / math.sqrt(2)
-                context = context.exp() / context.exp().sum(0)
-                part = slice(2 * head, 2 * head + 2)
-                torch.testing.assert_close(
-                    found[n, :, part], queries[n, :, part] @ context, rtol=1e-4, atol=1e-5
-                )
 
 
 def decoder() -> tuple[MlpDecoder, list[Tensor]]:
