@@ -55,39 +55,23 @@ class QueryAttention(nn.Module):
         return projected
 
 
-class CrossAttentionLayer(nn.Module):
-    """Queries read one level; added, then normalised."""
+class AttentionLayer(nn.Module):
+    """Queries read one level, or each other; added, then normalised.
 
-    def __init__(self, dim: int, heads: int) -> None:
+    `name` is that of the attention in the release.
+    """
+
+    def __init__(self, name: str, dim: int, heads: int) -> None:
         super().__init__()
-        self.multihead_attn = QueryAttention(dim, heads)
+        self.add_module(name, QueryAttention(dim, heads))
         self.norm = nn.LayerNorm(dim)
 
     def forward(
-        self,
-        queries: Tensor,
-        query_position: Tensor,
-        memory: tuple[Tensor, Tensor],
-        allowed: Tensor,
+        self, queries: Tensor, placed: Tensor, memory: tuple[Tensor, Tensor], allowed: Tensor | None
     ) -> Tensor:
-        """(B, Q, C) -> (B, Q, C); `memory` is (keys, values), each (B, S, C)."""
-        read = self.multihead_attn(queries + query_position, *memory, allowed)
-        out: Tensor = self.norm(queries + read)
-        return out
-
-
-class SelfAttentionLayer(nn.Module):
-    """Queries read each other; added, then normalised."""
-
-    def __init__(self, dim: int, heads: int) -> None:
-        super().__init__()
-        self.self_attn = QueryAttention(dim, heads)
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, queries: Tensor, query_position: Tensor) -> Tensor:
-        """(B, Q, C) -> (B, Q, C)."""
-        placed = queries + query_position
-        out: Tensor = self.norm(queries + self.self_attn(placed, placed, queries, None))
+        """(B, Q, C), without and with position, and keys and values (B, S, C) -> (B, Q, C)."""
+        attention, norm = self.children()
+        out: Tensor = norm(queries + attention(placed, *memory, allowed))
         return out
 
 
@@ -143,10 +127,10 @@ class Predictor(nn.Module):
         super().__init__()
         dim, count = hidden_dim, range(num_layers)
         self.transformer_self_attention_layers = nn.ModuleList(
-            SelfAttentionLayer(dim, heads) for _ in count
+            AttentionLayer("self_attn", dim, heads) for _ in count
         )
         self.transformer_cross_attention_layers = nn.ModuleList(
-            CrossAttentionLayer(dim, heads) for _ in count
+            AttentionLayer("multihead_attn", dim, heads) for _ in count
         )
         self.transformer_ffn_layers = nn.ModuleList(FfnLayer(dim, ffn_dim) for _ in count)
         self.decoder_norm = nn.LayerNorm(dim)
@@ -187,8 +171,9 @@ class Predictor(nn.Module):
             ):  # read where the own mask has probability 1/2 or more, if anywhere
                 inside = _mask_logits(embeds[-1], pyramid, reduced[level]) >= 0
                 allowed = inside | ~inside.any(-1, keepdim=True)
-            queries = cross_attention(queries, position, memories[level], allowed)
-            queries = ffn(self_attention(queries, position))
+            queries = cross_attention(queries, queries + position, memories[level], allowed)
+            placed = queries + position
+            queries = ffn(self_attention(queries, placed, (placed, queries), None))
             normed.append(self.decoder_norm(queries))
             embeds.append(self.mask_embed(normed[-1]))
 
