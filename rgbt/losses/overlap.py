@@ -50,17 +50,9 @@ def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
     gradient, so that agreement costs the share of absent classes.   Released: pixels labelled 0
     are left out, yet K still divides: the range ends at the share of foreground classes present.
 
-    Args:
-        probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype.
-        label: (B, H, W) int64; 255 is left out.
-        form: see above.
-
-    Returns:
-        () in [0, 1], float32 for half precision too. Where no pixel counts: 1 (paper), 0
-        (released), with a gradient of 0.
-
-    Raises:
-        ValueError: shapes that do not fit.
+    p (B, K, H, W) in [0, 1] sums to 1 over K, any float dtype; y (B, H, W) int64, 255 is left
+    out. () in [0, 1], float32 for half precision too. Where no pixel counts: 1 (paper), 0
+    (released), with a gradient of 0. ValueError: shapes that do not fit.
     """
     sizes = check_shape("probabilities", probabilities, "B K H W")
     check_shape("label", label, "B H W", **{letter: sizes[letter] for letter in "BHW"})
@@ -82,18 +74,10 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
     In both forms, a class that neither frame predicts costs 1 (agreement of m classes of K costs
     1 - m / K) and agreement in doubt costs more than agreement without.
 
-    Args:
-        warped: p, (B, K, H, W) probabilities of the first frame, brought into the second.
-        second: q, (B, K, H, W) probabilities of the second frame.
-        valid: (B, H, W) bool, pixels that count; a pixel needs no label to count.
-        form: see above.
-
-    Returns:
-        () in [0, 1], float32 for half precision too; 1, with a gradient of 0, where no pixel is
-        valid. It can be differentiated once.
-
-    Raises:
-        ValueError: shapes that do not fit.
+    p and q (B, K, H, W): probabilities of the first frame, brought into the second, and of the
+    second; `valid` (B, H, W) bool: pixels that count, labelled or not. () in [0, 1], float32 for
+    half precision too; 1, with a gradient of 0, where no pixel is valid. It can be differentiated
+    once. ValueError: shapes that do not fit.
     """
     _check(second, valid=valid, warped=warped)
     pairs = single(warped), single(second), valid
@@ -114,18 +98,9 @@ def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor
     Paper: f = 2, so that full agreement costs 1/3; a class without a pixel costs 1.   Released:
     f = 3; pixels labelled 0 are left out, a class without a pixel costs 0, K still divides.
 
-    Args:
-        warped: p, (B, K, H, W) probabilities of the first frame, brought into the second.
-        second: q, (B, K, H, W) probabilities of the second frame.
-        label: (B, H, W) int64, of the second frame; 255 is left out.
-        form: see above.
-
-    Returns:
-        () float32 for half precision too, in [1/3, 1] (paper) or [0, 1] (released). Where no pixel
-        counts: 1 (paper), 0 (released), with a gradient of 0.
-
-    Raises:
-        ValueError: shapes that do not fit.
+    p and q as in `con`; y (B, H, W) int64 of the second frame, 255 is left out. () float32 for
+    half precision too, in [1/3, 1] (paper) or [0, 1] (released). Where no pixel counts: 1 (paper),
+    0 (released), with a gradient of 0. ValueError: shapes that do not fit.
     """
     num_classes = _check(second, label=label, warped=warped)
     warped, second = single(warped), single(second)

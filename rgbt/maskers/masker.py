@@ -93,16 +93,12 @@ class Masker:
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> MaskPair:
-        """Masks for a batch, one independent draw per sample.
+        """(B, h, w) bool cells of the padded crop, True = hidden, one independent draw per sample.
 
         Args:
             image_hw: size of the crop in pixels, before padding.
             centre_yx: (B, 2), pixel of the crop nearest to the centre of the original image.
             generator: on the device of `centre_yx`.
-
-        Returns:
-            `MaskPair` of (B, h, w) bool cells of the padded crop, True = hidden. Sampler "none":
-            nothing hidden, in cells of 32 pixels.
 
         Raises:
             InputError: the patch size does not divide the padded crop.

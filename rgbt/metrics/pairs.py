@@ -70,16 +70,10 @@ def pair_counts(
     One histogram over ``(min(label, K) K + first) K + second``, in numbers as narrow as they fit;
     pixels that do not count have a row K + 1, which is dropped.
 
-    Args:
-        first: (H, W) integer 0..K-1, prediction of the first frame as the protocol compares it;
-            anything 0..255 where not `valid`.
-        second: (H, W) integer 0..K-1, prediction of the second frame.
-        label: (H, W) integer 0..255, of the second frame; K and above is no class.
-        num_classes: K, 1..255.
-        valid: (H, W) bool, pixels that count; None: all.
-
-    Returns:
-        (K + 1, K, K): label (row K: no class), first, second. Those of several images add.
+    (H, W) integer predictions 0..K-1 of the first frame, as the protocol compares it (anything
+    0..255 where not `valid`), and of the second; its label 0..255, K and above is no class; `valid`
+    (H, W) bool, pixels that count, None: all. (K + 1, K, K): label (row K: no class), first,
+    second; those of several images add. K is 1..255.
 
     Raises:
         ValueError: shapes differ, or a prediction that counts is no class.
