@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import check_choice, check_shape
+from rgbt.checks import check_shape
 
 Order = Literal["zyx", "zxy"]
 """Order of the elementary rotations in the product: "zyx" = Rz Ry Rx, Eq. 1 of the paper;
@@ -24,7 +24,6 @@ def rotation(angles: Tensor, order: Order) -> Tensor:
 
     `angles` (B, 3) float are degrees, right-handed: yaw about y, pitch about x, roll about z.
     """
-    check_choice("order", order, ("zyx", "zxy"))
     check_shape("angles", angles, "B 3", **{"3": 3})
     radians = torch.deg2rad(angles.double())
     (cy, cx, cz), (sy, sx, sz) = radians.cos().unbind(1), radians.sin().unbind(1)

@@ -22,7 +22,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, check_choice, check_shape
+from rgbt.checks import InputError, check_shape
 
 Rule = Literal["largest", "corners"]
 """How the rectangle is found; see the module."""
@@ -39,7 +39,6 @@ def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -
     the first frame does not show (up to 0.3 % in the published views). (B, 4) float64: (left, top,
     right, bottom) in pixel edges; NaN where there is none (see `check_rectangle`).
     """
-    check_choice("rectangle", rule, ("largest", "corners"))
     check_shape("homography", homography, "B M N", M=3, N=3)
     find = _largest if rule == "largest" else _by_corners
     return find(homography.double(), image_hw)

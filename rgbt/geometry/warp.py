@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_choice, check_shape
+from rgbt.checks import check_shape
 from rgbt.geometry.padding import pad_to
 
 Resampling = Literal["once", "twice"]
@@ -47,7 +47,6 @@ class Warp:
     resampling: Resampling
 
     def __post_init__(self) -> None:
-        check_choice("resampling", self.resampling, ("once", "twice"))
         batch = check_shape("homography", self.homography, "B M N", M=3, N=3)["B"]
         check_shape("rectangle", self.rectangle, "B S", B=batch, S=4)
 

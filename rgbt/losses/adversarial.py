@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_choice, check_shape
+from rgbt.checks import check_shape
 from rgbt.losses.overlap import single
 
 Judged = Literal["probabilities", "logits", "self_information"]
 """What a discriminator sees of a prediction."""
-
-JUDGED: tuple[Judged, ...] = ("probabilities", "logits", "self_information")
 
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:
@@ -53,11 +51,7 @@ def judged(logits: Tensor, how: Judged) -> Tensor:
         self_information    -p log p / log K                   ADVENT, Sec. 3.2
 
     (B, K, H, W) class scores, any float dtype -> the same shape, float32 for half precision too.
-
-    Raises:
-        InputError: no such map.
     """
-    check_choice("judged", how, JUDGED)
     sizes = check_shape("logits", logits, "B K H W")
     logits = single(logits)
     if how == "logits":

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import check_range, check_shape
+from rgbt.checks import check_shape
 from rgbt.losses.overlap import single
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
@@ -104,10 +104,8 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
     `threshold`; (B, H, W) int64, through which no gradient goes.
 
     Raises:
-        InputError: a threshold out of range.
         ValueError: the shapes differ.
     """
-    check_range("threshold", threshold, 0.0, 1.0)
     sizes = check_shape("probabilities", probabilities, "B K H W")
     check_shape("aux_probabilities", aux_probabilities, "B K H W", **sizes)
     p, q = probabilities.detach(), aux_probabilities.detach()

@@ -10,7 +10,7 @@ import torch
 from annotated_types import Interval
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
 from rgbt.losses.adversarial import judged as judged_map
 from rgbt.ranges import NonNegative
@@ -84,7 +84,6 @@ class Adversarial:
     gradients: Gradients
 
     def __post_init__(self) -> None:
-        check_choice("scheme.verdict_loss", self.verdict_loss, VERDICT_LOSSES)
         source_value, target_value = self.source_value, self.target_value
         outside = min(source_value, target_value) < 0 or max(source_value, target_value) > 1
         if self.verdict_loss == "cross_entropy" and outside:

@@ -342,7 +342,6 @@ def test_accumulated_steps_are_the_mean_of_their_batches(tmp_path: Path, case: s
 
 NETWORK = network(False)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "verdict loss": ({"verdict_loss": "least_square"}, "did you mean 'least_squares'"),
     "no probability": (
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
         r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
