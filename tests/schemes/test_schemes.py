@@ -10,6 +10,7 @@ from rgbt.requirements import Record
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import Batch, MaskPair, Output
+from tests.losses.problems import batch_of
 
 ONE = Domains(
     source=Domain(split="train", view=None, head=None, labels="given"),
@@ -21,15 +22,7 @@ B, Q, K = 2, 3, 4
 
 
 def batch() -> Batch:
-    return Batch(
-        rgb=torch.zeros(B, 3, 32, 32),
-        thermal=torch.zeros(B, 1, 32, 32),
-        label=torch.zeros(B, 32, 32, dtype=torch.int64),
-        name=("a", "b"),
-        centre_yx=torch.zeros(B, 2, dtype=torch.int64),
-        position=None,
-        original_hw=torch.full((B, 2), 32),
-    )
+    return batch_of(torch.zeros(B, 32, 32, dtype=torch.int64))
 
 
 def generator_of(purpose: str) -> torch.Generator:

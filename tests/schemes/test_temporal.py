@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import Batch, Frame, Output
+from tests.losses.problems import batch_of
 from tests.models.plain import images
 from tests.models.test_mask2former import nano
 
@@ -30,15 +32,7 @@ def generator_of(purpose: str) -> torch.Generator:
 def batch(count: int = B, hw: tuple[int, int] = HW) -> Batch:
     rgb, thermal = images(count, *hw)
     label = torch.randint(K, (count, *hw), generator=torch.Generator().manual_seed(5))
-    return Batch(
-        rgb=rgb,
-        thermal=thermal,
-        label=label,
-        name=tuple("abcdefgh"[:count]),
-        centre_yx=torch.zeros(count, 2, dtype=torch.int64),
-        position=None,
-        original_hw=torch.tensor([hw]).expand(count, 2),
-    )
+    return replace(batch_of(label), rgb=rgb, thermal=thermal)
 
 
 class Net(nn.Module):
