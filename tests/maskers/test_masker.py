@@ -149,6 +149,9 @@ def test_tracked_anchor_follows_the_centre_of_each_sample() -> None:
     # Pixel 63 lies beside the edge between cells 0 and 1: their middles are nearest.
     found = at_pixels([[30, 63]], ratio=0.1, cell_position="centre")
     assert found == [[0, 0, 0], [0, 0, 1]]
+    # Pixel 64, whose middle lies at 64.5, is nearer to the middle of cell 1 than to that of cell 0.
+    found = at_pixels([[31, 64]] * 200, ratio=0.05, cell_position="centre")
+    assert sum(column == 1 for _, _, column in found) > 180
 
 
 CASES = {
