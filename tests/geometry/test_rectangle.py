@@ -120,6 +120,17 @@ def test_a_shift_leaves_the_overlap_and_a_zoom_the_frame() -> None:
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
 
 
+def test_a_diamond_has_the_rectangle_of_half_its_size() -> None:
+    """A square turned by 45 degrees about its centre: an inscribed square of half its area."""
+    c, middle = 0.5**0.5, 49.5
+    turn = [[c, -c, middle], [c, c, middle - 2 * c * middle], [0, 0, 1]]
+    found = inner_rectangle(torch.tensor([turn], dtype=torch.float64), (100, 100), "largest")
+    # The frame cuts the diamond's tips at 50 from the centre, its half diagonal is 70.7.
+    side = 50 * 2**0.5
+    expected = [[49.5 - side / 2] * 2 + [49.5 + side / 2] * 2]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_larger_is_found_by_looking(seed: int) -> None:
     views = random_views(10, seed)
@@ -127,6 +138,20 @@ def test_nothing_larger_is_found_by_looking(seed: int) -> None:
     for h, rectangle in zip(views, found, strict=True):
         assert inside_by(rectangle, outline(h, HW)) > -2e-6
         assert float(area(rectangle)) == pytest.approx(searched(h, HW), rel=1e-6)
+
+
+def test_nothing_larger_is_found_in_wild_views() -> None:
+    """Turns far beyond the paper's, and frames of other shapes."""
+    for seed, hw in enumerate([(48, 64), (100, 30), (37, 211)]):
+        generator = torch.Generator().manual_seed(seed)
+        matrix = torch.tensor([[60, 0, hw[1] / 2], [0, 70, hw[0] / 2], [0, 0, 1]])
+        limits = torch.tensor([15.0, 15.0, 60.0])
+        angles = (2 * torch.rand(6, 3, generator=generator) - 1) * limits
+        views = homography(angles, matrix, "zyx")
+        found = inner_rectangle(views, hw, "largest")
+        for h, rectangle in zip(views, found, strict=True):
+            assert inside_by(rectangle, outline(h, hw)) > -2e-6
+            assert float(area(rectangle)) == pytest.approx(searched(h, hw), rel=1e-6)
 
 
 @pytest.mark.parametrize("rule", ["largest", "corners"])
