@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import check_choice, check_shape
+from rgbt.checks import check_shape
 
 Order = Literal["zyx", "zxy"]
 """Order of the elementary rotations in the product: "zyx" = Rz Ry Rx, Eq. 1 of the paper;
@@ -20,16 +20,10 @@ Order = Literal["zyx", "zxy"]
 
 
 def rotation(angles: Tensor, order: Order) -> Tensor:
-    """Rotation matrices of a camera frame with x right, y down and z forward.
+    """Rotation matrices (B, 3, 3) float64 of a camera frame with x right, y down and z forward.
 
-    Args:
-        angles: (B, 3) float, degrees: yaw about y, pitch about x, roll about z; right-handed.
-        order: which product of the three.
-
-    Returns:
-        (B, 3, 3) float64, on the device of `angles`.
+    `angles` (B, 3) float are degrees, right-handed: yaw about y, pitch about x, roll about z.
     """
-    check_choice("order", order, ("zyx", "zxy"))
     check_shape("angles", angles, "B 3", **{"3": 3})
     radians = torch.deg2rad(angles.double())
     (cy, cx, cz), (sy, sx, sz) = radians.cos().unbind(1), radians.sin().unbind(1)
@@ -48,13 +42,8 @@ def rotation(angles: Tensor, order: Order) -> Tensor:
 def homography(angles: Tensor, matrix: Tensor, order: Order) -> Tensor:
     """K R K^-1: pixels of the first frame to pixels of the view, w > 0 in front of the camera.
 
-    Args:
-        angles: (B, 3) float, degrees, see `rotation`.
-        matrix: (3, 3) K, from `rgbt.geometry.camera.Camera.matrix`.
-        order: see `rotation`.
-
-    Returns:
-        (B, 3, 3) float64, on the device of `angles`; pixel centres lie at whole numbers.
+    `angles` (B, 3) as of `rotation`, `matrix` (3, 3) K from `rgbt.geometry.camera.Camera.matrix`;
+    (B, 3, 3) float64 on the device of `angles`; pixel centres lie at whole numbers.
     """
     matrix = matrix.to(angles.device, torch.float64)
     inverse: Tensor = torch.linalg.inv_ex(matrix).inverse

@@ -22,7 +22,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError, check_choice, check_shape
+from rgbt.checks import InputError, check_shape
 
 Rule = Literal["largest", "corners"]
 """How the rectangle is found; see the module."""
@@ -34,30 +34,18 @@ SLACK = 1e-6
 def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -> Tensor:
     """A rectangle of the view inside the picture of the first frame and inside the frame.
 
-    Args:
-        homography: (B, 3, 3) float64, pixels of the first frame to pixels of the view, w > 0 in
-            front of the camera.
-        image_hw: height and width of both frames.
-        rule: "largest" area, or "corners" as released. The latter may hold a few pixels that the
-            first frame does not show (up to 0.3 % in the published views).
-
-    Returns:
-        (B, 4) float64, on the device of `homography`: (left, top, right, bottom) in pixel edges;
-        NaN where there is none (see `check_rectangle`).
+    `homography` (B, 3, 3) float64: pixels of the first frame to pixels of the view, w > 0 in front
+    of the camera; `image_hw` of both frames. "corners", as released, may hold a few pixels that
+    the first frame does not show (up to 0.3 % in the published views). (B, 4) float64: (left, top,
+    right, bottom) in pixel edges; NaN where there is none (see `check_rectangle`).
     """
-    check_choice("rectangle", rule, ("largest", "corners"))
     check_shape("homography", homography, "B M N", M=3, N=3)
     find = _largest if rule == "largest" else _by_corners
     return find(homography.double(), image_hw)
 
 
 def check_rectangle(rectangle: Tensor, angles: Tensor) -> None:
-    """Raise InputError where a view has no rectangle. Waits for the device.
-
-    Args:
-        rectangle: (B, 4) from `inner_rectangle`.
-        angles: (B, 3) degrees, yaw, pitch, roll, for the message.
-    """
+    """Raise InputError where a view has no rectangle, with its angles; waits for the device."""
     empty = rectangle.isnan().any(dim=1)
     if bool(empty.any()):
         yaw, pitch, roll = angles[empty][0].tolist()
@@ -86,19 +74,16 @@ def _half_planes(homography: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor,
     return rows, lines[..., 2]
 
 
-def _null_direction(rows: Tensor) -> Tensor:
-    """(..., 4), orthogonal to each of three rows (..., 3, 4): signed minors."""
-    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], device=rows.device)
-    minors: Tensor = torch.linalg.det(rows[..., others].movedim(-2, -3))
-    return minors * minors.new_tensor([1.0, -1.0, 1.0, -1.0])
-
-
 def _largest(homography: Tensor, image_hw: tuple[int, int]) -> Tensor:
     rows, bounds = _half_planes(homography, image_hw)
     device, batch = rows.device, torch.arange(len(rows), device=rows.device)
     four = torch.tensor(list(combinations(range(8), 4)), device=device)
     three = torch.tensor(list(combinations(range(8), 3)), device=device)
-    dx1, dx2, dy1, dy2 = _null_direction(rows[:, three]).unbind(-1)
+    # Orthogonal to each of three rows: signed minors.
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], device=device)
+    minors: Tensor = torch.linalg.det(rows[:, three][..., others].movedim(-2, -3))
+    signs = minors.new_tensor([1.0, -1.0, 1.0, -1.0])
+    dx1, dx2, dy1, dy2 = (minors * signs).unbind(-1)
     slope = torch.stack([dy1 - dy2, dy2 - dy1, dx1 - dx2, dx2 - dx1], dim=-1)
     systems = torch.cat([rows[:, four], torch.cat([rows[:, three], slope[:, :, None]], 2)], 1)
     values = torch.cat([bounds[:, four], torch.nn.functional.pad(bounds[:, three], (0, 1))], 1)

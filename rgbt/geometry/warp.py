@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_choice, check_shape
+from rgbt.checks import check_shape
 from rgbt.geometry.padding import pad_to
 
 Resampling = Literal["once", "twice"]
@@ -47,7 +47,6 @@ class Warp:
     resampling: Resampling
 
     def __post_init__(self) -> None:
-        check_choice("resampling", self.resampling, ("once", "twice"))
         batch = check_shape("homography", self.homography, "B M N", M=3, N=3)["B"]
         check_shape("rectangle", self.rectangle, "B S", B=batch, S=4)
 
@@ -69,12 +68,9 @@ class Warp:
     def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
         """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
 
-        Where a point falls on a pixel, that pixel's value comes back bit by bit.
-
-        Args:
-            values: scores, or images in [0, 1].
-            levels: 255 rounds to 8-bit levels after each interpolation, as images that are kept
-                in bytes; there is no gradient then. None: nothing is rounded.
+        Where a point falls on a pixel, that pixel's value comes back bit by bit. `levels` 255
+        rounds to 8-bit levels after each interpolation, as images that are kept in bytes, without a
+        gradient.
         """
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
@@ -97,13 +93,9 @@ class Warp:
         return self._pixels[1].view(-1, *self.image_hw)
 
     def moved(self, points_yx: Tensor) -> Tensor:
-        """Where pixels of the first frame lie in the second: the nearest pixel of it, if outside.
+        """Where pixels (B, 2) of the first frame lie in the second; the nearest of it, if outside.
 
-        Args:
-            points_yx: (B, 2) row and column, one pixel per frame.
-
-        Returns:
-            (B, 2) int64 row and column.
+        (row, column), one per frame; int64.
         """
         row, column = points_yx.to(self.homography.device, torch.float64).unbind(1)
         points = torch.stack([column, row, torch.ones_like(row)], 1)
@@ -172,20 +164,19 @@ class Warp:
     def _pixels(self) -> tuple[Tensor, Tensor]:
         """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
         height, width = self.image_hw
-        x, y = self._composed if self.resampling == "once" else self._source(*self._picked)
+        if self.resampling == "once":
+            x, y = self._composed
+        else:  # canvas pixels that OpenCV's nearest resize takes from the rectangle
+            left, top, right, bottom = self.rectangle[..., None].unbind(1)
+            columns, rows = self._whole()
+            picked = _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
+            x, y = self._source(*picked)
         inside = self._within(x, y)
         column, row = (
             (torch.where(inside, at, 0.0) + 0.5).floor_().clamp_(0, side - 1).long()
             for at, side in ((x, width), (y, height))
         )
         return row.mul_(width).add_(column).flatten(1), inside.flatten(1)
-
-    @property
-    def _picked(self) -> tuple[Tensor, Tensor]:
-        """Canvas pixels (B, W), (B, H) that OpenCV's nearest resize takes from the rectangle."""
-        left, top, right, bottom = self.rectangle[..., None].unbind(1)
-        columns, rows = self._whole()
-        return _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
 
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -10,26 +10,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_choice, check_shape
-from rgbt.losses.dice import single
+from rgbt.checks import check_shape
+from rgbt.losses.overlap import single
 
 Judged = Literal["probabilities", "logits", "self_information"]
 """What a discriminator sees of a prediction."""
 
-JUDGED: tuple[Judged, ...] = ("probabilities", "logits", "self_information")
-
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:
-    """Mean of ``(value - D)^2``.
+    """Mean of ``(value - D)^2`` over verdicts D of any shape and float dtype; () float32.
 
     Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
-
-    Args:
-        verdicts: of the discriminator, any shape and float dtype.
-        value: that they should have.
-
-    Returns:
-        () float32 for half precision too.
     """
     return (value - single(verdicts)).square().mean()
 
@@ -39,8 +30,7 @@ def cross_entropy(verdicts: Tensor, value: float) -> Tensor:
 
     Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
 
-    Arguments as in `least_squares`, verdicts not squashed and `value` in [0, 1]; finite for every
-    finite verdict.
+    As `least_squares`, verdicts not squashed and `value` in [0, 1]; finite for finite verdicts.
     """
     verdicts = single(verdicts)
     return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
@@ -60,17 +50,8 @@ def judged(logits: Tensor, how: Judged) -> Tensor:
         logits              the class scores                   HeatNet
         self_information    -p log p / log K                   ADVENT, Sec. 3.2
 
-    Args:
-        logits: (B, K, H, W) class scores; any float dtype.
-        how: see above.
-
-    Returns:
-        (B, K, H, W), float32 for half precision too.
-
-    Raises:
-        InputError: no such map.
+    (B, K, H, W) class scores, any float dtype -> the same shape, float32 for half precision too.
     """
-    check_choice("judged", how, JUDGED)
     sizes = check_shape("logits", logits, "B K H W")
     logits = single(logits)
     if how == "logits":

@@ -37,15 +37,9 @@ class WithAuxiliary:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The parts of `loss`, and those of the auxiliary scores as <part>_aux.
+        """The weighted parts of `loss`, and those of `aux["aux_logits"]` as <part>_aux.
 
-        Args:
-            output: with `aux["aux_logits"]` of the shape of its logits.
-            batch: see `loss`.
-            generator: of `loss`, the scores first.
-
-        Returns:
-            weighted parts, shapes as those of `loss`.
+        `generator` is drawn from for the scores first; shapes as those of `loss`.
         """
         parts = self.loss(output, batch, generator)
         auxiliary = self.loss(Output(output.aux["aux_logits"], {}), batch, generator)

@@ -40,15 +40,10 @@ class CrossEntropy:
         batch: Batch,
         generator: torch.Generator,  # noqa: ARG002 - what every loss is called with
     ) -> dict[str, Tensor]:
-        """The part "cross_entropy".
+        """The part "cross_entropy": one value, shape (1,), float32.
 
-        Args:
-            output: with `logits` (B, K, H, W).
-            batch: with `label` (B, H, W), and `confidence` (B, H, W) or None.
-            generator: not drawn from.
-
-        Returns:
-            one value, shape (1,), float32.
+        Of `logits` (B, K, H, W), `label` (B, H, W) and `confidence` (B, H, W) or None; nothing is
+        drawn.
 
         Raises:
             InputError: class weights of another number.
@@ -64,19 +59,18 @@ class CrossEntropy:
                 "classes; give one per class."
             )
         weights = torch.tensor(given, device=output.logits.device)
-        total = _total(output.logits.float(), batch, weights)
+        logits = output.logits.float()
+        if batch.confidence is None:
+            total = F.cross_entropy(
+                logits, batch.label, weights, ignore_index=IGNORE, reduction="sum"
+            )
+        else:
+            check_shape("confidence", batch.confidence, "B H W", **{k: sizes[k] for k in "BHW"})
+            costs = F.cross_entropy(
+                logits, batch.label, weights, ignore_index=IGNORE, reduction="none"
+            )
+            total = (batch.confidence * costs).sum()
         kept = batch.label[batch.label != IGNORE]
         # The smallest float only matters where nothing is labelled and the sum is 0.
         normaliser = weights[kept].sum().clamp(min=torch.finfo(torch.float32).tiny)
         return {"cross_entropy": (total / normaliser).reshape(1)}
-
-
-def _total(logits: Tensor, batch: Batch, weights: Tensor) -> Tensor:
-    """() the sum over labelled pixels of ``-q c_y log softmax(s)_y``."""
-    if batch.confidence is None:
-        return F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="sum")
-    check_shape(
-        "confidence", batch.confidence, "B H W", **dict(zip("BHW", batch.label.shape, strict=True))
-    )
-    costs = F.cross_entropy(logits, batch.label, weights, ignore_index=IGNORE, reduction="none")
-    return (batch.confidence * costs).sum()

@@ -11,19 +11,12 @@ from rgbt.checks import check_shape
 
 
 def sdc(teacher: Tensor, student: Tensor) -> Tensor:
-    """Self-distillation of complementary representations.
-
-        SDC = mean |stopgrad(teacher) - student|
+    """Self-distillation of complementary representations: ``mean |stopgrad(teacher) - student|``.
 
     Source: CRM, Eq. (2).   Released: final layer only, raw logits, mean over all entries including
     the no-object column, teacher without gradient.
 
-    Args:
-        teacher: (B, Q, K+1) class logits of the clean RGB-T pass, final layer.
-        student: (B, Q, K+1) class logits of the masked RGB-T pass, final layer.
-
-    Returns:
-        () float32; no gradient reaches `teacher`.
+    (B, Q, K+1) class logits of the clean and of the masked RGB-T pass -> () float32.
 
     Raises:
         ValueError: the shapes differ.
@@ -34,12 +27,8 @@ def sdc(teacher: Tensor, student: Tensor) -> Tensor:
 
 
 def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Self-distillation of non-local representations.
+    """Self-distillation of non-local representations: `sdc` of `rgb` plus `sdc` of `thermal`.
 
-        SDN = mean |stopgrad(teacher) - rgb| + mean |stopgrad(teacher) - thermal|
-
-    Source: CRM, Eq. (3); release as in `sdc`.
-
-    `rgb` and `thermal` are the masked pass predicted from one image alone; shapes as in `sdc`.
+    Source: CRM, Eq. (3). `rgb` and `thermal`: the masked pass predicted from one image alone.
     """
     return sdc(teacher, rgb) + sdc(teacher, thermal)

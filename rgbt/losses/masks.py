@@ -36,30 +36,29 @@ class Sampling:
 def mask_losses(
     logits_LPBQhw: Tensor, targets: Targets, matches: Matches, points: Points, sampling: Sampling
 ) -> tuple[Tensor, Tensor]:
-    """Cross-entropy and dice, each a sum over the matched masks of a set.
-
-    Args:
-        logits_LPBQhw: mask logits.
-        targets: of the B images.
-        matches: of the L x P sets.
-        points: source of the points.
-        sampling: how they are drawn.
-
-    Returns:
-        two of (S,) float32.
-    """
+    """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,) float32."""
     device = logits_LPBQhw.device
-    image = torch.from_numpy(matches.image).to(device)
-    query = torch.from_numpy(matches.query).to(device)
-    label = torch.from_numpy(matches.label).to(device)
+    image, label, query = (torch.from_numpy(each).to(device) for each in matches)
     masks = (targets.label[image] == label[:, None, None])[:, None].float()
     bytes_per_set = 8 * len(image) * (sampling.candidates + sampling.fresh)
     step = max(1, CHUNK_BYTES // max(1, bytes_per_set))
 
     parts = []
     first = 0
-    for logits in torch.split(_matched(logits_LPBQhw, image, query), step):
-        drawn = _choose(logits, points, sampling)
+    # (S, G, h, w) float32 mask logits of the matched queries.
+    layers, passes = logits_LPBQhw.shape[:2]
+    layer = torch.arange(layers, device=device)[:, None, None]
+    stacked = torch.arange(passes, device=device)[:, None]
+    index = query.clamp(min=0).reshape(layers, passes, -1)
+    matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
+    for logits in torch.split(matched_SGhw, step):
+        # (S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones.
+        drawn = points.loss(len(logits), len(image), sampling.candidates + sampling.fresh)
+        candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
+        with torch.no_grad():
+            values = _read(logits, candidates).flatten(0, 1)
+            kept = most_uncertain(values, candidates.flatten(0, 1), sampling.kept)
+        drawn = torch.cat([kept.reshape(*fresh.shape[:2], sampling.kept, 2), fresh], dim=2)
         t = sample(masks, drawn.transpose(0, 1))[:, 0].transpose(0, 1)
         x = _read(logits, drawn)
         weights = None if targets.spatial is None else targets.spatial.at(drawn, image, first)
@@ -81,13 +80,7 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
     Source: Mask2Former, criterion.py; weighted: SpatialSeg, Eqs. (16) and (17).
     Paper: Eq. (16) is printed without its minus sign.
 
-    Args:
-        x: (..., N) float32 logits.
-        t: (..., N) targets in [0, 1].
-        weights: w, total and e of every mask; None for the plain loss.
-
-    Returns:
-        two of (...).
+    (..., N) float32 logits x, (..., N) targets t in [0, 1] -> two of (...).
     """
     bce = F.softplus(x) - x * t
     s = x.sigmoid()
@@ -99,27 +92,7 @@ def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[T
     return (w * bce).sum(-1) / total, 1 - (2 * (s * t).sum(-1) + e) / (both + e)
 
 
-def _matched(logits_LPBQhw: Tensor, image: Tensor, query: Tensor) -> Tensor:
-    """(S, G, h, w) float32 mask logits of the matched queries."""
-    layers, passes = logits_LPBQhw.shape[:2]
-    layer = torch.arange(layers, device=image.device)[:, None, None]
-    stacked = torch.arange(passes, device=image.device)[:, None]
-    index = query.clamp(min=0).reshape(layers, passes, -1)
-    return logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
-
-
 def _read(logits_SGhw: Tensor, points_SGN2: Tensor) -> Tensor:
     """(S, G, N) every mask at its own points."""
     values = sample(logits_SGhw.flatten(0, 1)[:, None], points_SGN2.flatten(0, 1)[:, None])
     return values.reshape(points_SGN2.shape[:-1])
-
-
-@torch.no_grad()
-def _choose(logits_SGhw: Tensor, points: Points, sampling: Sampling) -> Tensor:
-    """(S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones."""
-    sets, masks = logits_SGhw.shape[:2]
-    drawn = points.loss(sets, masks, sampling.candidates + sampling.fresh)
-    candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
-    values = _read(logits_SGhw, candidates).flatten(0, 1)
-    kept = most_uncertain(values, candidates.flatten(0, 1), sampling.kept)
-    return torch.cat([kept.reshape(sets, masks, sampling.kept, 2), fresh], dim=2)

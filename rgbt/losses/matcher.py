@@ -103,15 +103,8 @@ class Matcher:
     ) -> Matches:
         """Match every layer, pass and image.
 
-        Args:
-            class_logits: (L, P, B, Q, K+1).
-            mask_logits: (L, P, B, Q, h, w).
-            targets: of the B images.
-            points: source of the points.
-
-        Raises:
-            RunError: a cost that is not finite.
-            ValueError: a label that is neither a class nor 255.
+        (L, P, B, Q, K+1) class and (L, P, B, Q, h, w) mask logits against the targets of the B
+        images, at points from `points`. Errors as of `assign`.
         """
         layers, passes, images, queries = class_logits.shape[:4]
         step = max(1, CHUNK_BYTES // (4 * images * queries * self.num_points))
@@ -144,7 +137,7 @@ class Matcher:
 def pairwise_costs(
     x: Tensor, t: Tensor, weights: PointWeights | None, mask_weight: float, dice_weight: float
 ) -> Tensor:
-    """Mask and dice cost of every query against every target (formula: `Matcher`).
+    """(R, Q, K): mask and dice cost of every query against every target (formula: `Matcher`).
 
     Args:
         x: (R, Q, N) float32 mask logits at points; overwritten.
@@ -152,20 +145,17 @@ def pairwise_costs(
         weights: (R, N) weights of the points and their sums; None for the plain cost.
         mask_weight: b.
         dice_weight: d.
-
-    Returns:
-        (R, Q, K).
     """
+    total: Tensor | float = x.shape[-1]
+    smoothing: Tensor | float = 1.0
+    if weights is not None:
+        total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
 
     def over_points(values: Tensor) -> Tensor:
         if weights is None:
             return values.sum(-1, keepdim=True)
         return values @ weights.values[..., None]
 
-    total: Tensor | float = x.shape[-1]
-    smoothing: Tensor | float = 1.0
-    if weights is not None:
-        total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
     bce = (over_points(F.softplus(x)) - x @ t.mT) / total
     s = x.sigmoid_()
     dice = (2 * (s @ t.mT) + smoothing) / (over_points(s) + t.sum(-1)[:, None] + smoothing)
@@ -175,9 +165,7 @@ def pairwise_costs(
 def assign(cost: Tensor, targets: Targets) -> Matches:
     """Cheapest assignment of queries to the classes present, for every set and image.
 
-    Args:
-        cost: (S, B, Q, K) float32 on any device.
-        targets: of the B images.
+    `cost` is (S, B, Q, K) float32 on any device.
 
     Raises:
         RunError: a cost that is not finite.

@@ -8,9 +8,8 @@ one per (layer, pass), layer-major.
 
 from __future__ import annotations
 
-import math
 from itertools import product
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -19,20 +18,8 @@ from torch.nn import functional as F
 from rgbt.types import IGNORE
 
 
-class Points(Protocol):
-    """Where points come from: drawn (`PointSource`) or, in tests, replayed."""
-
-    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
-        """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
-        ...
-
-    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
-        ...
-
-
-class PointSource:
-    """Independent uniform points from one generator.
+class Points:
+    """Independent uniform points from one generator, on `device`.
 
     Draws are made set by set in the order of the requests, so that the numbers do not
     depend on how many sets are requested at once. The criterion requests the matcher's points of
@@ -41,34 +28,27 @@ class PointSource:
 
     A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
     image): four coordinates come from one random integer, in half the time of four floats.
-
-    Args:
-        generator: the only source of randomness, on any device.
-        device: where the points are needed.
     """
 
     def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
         self.generator = generator
         self.device = device
 
-    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
-        """See `Points.matcher`."""
-        return self._draw(num_sets, num_images, num_points)
-
     def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """See `Points.loss`."""
-        return self._draw(num_sets, num_masks, num_points)
-
-    def _draw(self, *shape: int) -> Tensor:
-        numbers = 2 * math.prod(shape[1:])
+        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
+        numbers = 2 * num_masks * num_points
         bits = torch.empty(
-            shape[0], -(-numbers // 4), dtype=torch.int64, device=self.generator.device
+            num_sets, -(-numbers // 4), dtype=torch.int64, device=self.generator.device
         )
         for one_set in bits:
             one_set.random_(generator=self.generator)
         # 63 random bits are four words of 16; the top bit of each is cut, because one is always 0.
         words = bits.view(torch.int16)[:, :numbers].bitwise_and_(0x7FFF).to(self.device)
-        return words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14).reshape(*shape, 2)
+        uniform = words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14)
+        return uniform.reshape(num_sets, num_masks, num_points, 2)
+
+    matcher = loss
+    """The same for the matching costs, with images in the place of masks."""
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
@@ -76,13 +56,8 @@ def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "
 
     Source: Mask2Former, point_features.py (PointRend), align_corners False.
 
-    Args:
-        maps: (R, C, h, w) float.
-        points: (R, S, N, 2) in [-1, 1], (x, y); every channel of map r is read at points[r].
-        outside: what lies beyond the outermost pixel centres.
-
-    Returns:
-        (R, C, S, N), dtype of `maps`.
+    Every channel of the maps (R, C, h, w) is read at points (R, S, N, 2), (x, y) in [-1, 1];
+    `outside` lies beyond the outermost pixel centres. -> (R, C, S, N), dtype of `maps`.
     """
     return F.grid_sample(maps, points, mode="bilinear", padding_mode=outside, align_corners=False)
 
@@ -91,15 +66,9 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
     """Bilinear values of the binary masks of all classes at points, without making the masks.
 
     The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
-    point are read once, not once per class.
-
-    Args:
-        label: (B, H, W) int64; 255 belongs to no class.
-        points: (S, B, N, 2) in [-1, 1].
-        num_classes: K.
-
-    Returns:
-        (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or outside.
+    point are read once, not once per class. (B, H, W) int64, of which 255 is no class, at points
+    (S, B, N, 2) -> (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or
+    outside.
     """
     height, width = label.shape[1:]
     sets, images, count = points.shape[:3]
@@ -126,13 +95,7 @@ def most_uncertain(logits: Tensor, points: Tensor, keep: int) -> Tensor:
 
     Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.
 
-    Args:
-        logits: (R, N) float32, finite; overwritten.
-        points: (R, N, 2).
-        keep: 0 <= keep <= N.
-
-    Returns:
-        (R, keep, 2).
+    (R, N) float32 logits, finite and overwritten, and (R, N, 2) -> (R, keep, 2).
     """
     # Non-negative floats are ordered like their bits, and integers are selected much faster.
     magnitude = logits.abs_().view(torch.int32)

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError, check_shape
 from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
-from rgbt.losses.points import Points, PointSource
+from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import Record, Requirement
@@ -95,7 +95,7 @@ class SetCriterion:
                 (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
                 the prediction.
             batch: with `label` (B, H, W), H <= 4h and W <= 4w; the weighted loss reads `position`.
-            generator: draws the points (order: `rgbt.losses.points.PointSource`).
+            generator: draws the points (order: `rgbt.losses.points.Points`).
 
         Returns:
             name -> (P,) float32.
@@ -105,7 +105,7 @@ class SetCriterion:
             RunError: predictions that are not finite.
             ValueError: shapes or labels that do not fit.
         """
-        return self.compare(output, batch, PointSource(generator, device=batch.label.device))
+        return self.compare(output, batch, Points(generator, device=batch.label.device))
 
     def compare(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
         """As `__call__`, at given points."""
@@ -129,7 +129,12 @@ class SetCriterion:
             targets = targets_of(batch.label, padded_hw, self.num_classes, spatial)
             matches = self.matcher(class_logits, mask_logits, targets, points)
             mask, dice = mask_losses(mask_logits, targets, matches, points, self.sampling)
-            count = self._count(len(matches.image), mask.device)
+            # Targets of the batch, averaged over the processes, at least 1.
+            count = torch.tensor(float(len(matches.image)), device=mask.device)
+            if distributed.is_available() and distributed.is_initialized():
+                distributed.all_reduce(count)
+                count = count / distributed.get_world_size()
+            count = count.clamp(min=1)
             parts = {"mask": mask / count, "dice": dice / count}
             parts["class"] = self._class_loss(class_logits, matches)
         return {name: values.reshape(-1, passes) for name, values in parts.items()}
@@ -169,11 +174,3 @@ class SetCriterion:
         logits = logits_LPBQC.float().reshape(layers * passes, images * queries, -1)
         each = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
         return each.sum(1) / weights[label_SQ].sum(1)
-
-    def _count(self, num_targets: int, device: torch.device) -> Tensor:
-        """() float32: targets of the batch, averaged over the processes, at least 1."""
-        count = torch.tensor(float(num_targets), device=device)
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.all_reduce(count)
-            count = count / distributed.get_world_size()
-        return count.clamp(min=1)

@@ -89,15 +89,9 @@ class PointWeights(NamedTuple):
 
 
 def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight) -> Tensor:
-    """Weight of every pixel of a padded crop (SpatialSeg, Eqs. 14 and 15; see `SpatialWeight`).
+    """(B, 1, *padded_hw) float32: weight of every pixel of a crop padded at the bottom and right.
 
-    Args:
-        batch: with `position` and `original_hw`.
-        padded_hw: size to pad to, bottom and right.
-        settings: active settings.
-
-    Returns:
-        (B, 1, *padded_hw) float32.
+    SpatialSeg, Eqs. 14 and 15; see `SpatialWeight`. The settings are active.
 
     Raises:
         InputError: the batch does not say where its pixels come from.
@@ -127,14 +121,10 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
 
 
 class SpatialMap:
-    """The weights of one batch, read at points.
+    """The weights of one batch, read at points; see `weight_map`.
 
-    Args:
-        batch: see `weight_map`.
-        padded_hw: see `weight_map`.
-        settings: active settings.
-        num_passes: P, stacked passes of the batch, for `passes: fused`: the clean RGB-T pass is
-            the first; a masked RGB-T pass, if any, is the last, after one or three clean ones.
+    `num_passes` is P, stacked passes of the batch, for `passes: fused`: the clean RGB-T pass is the
+    first; a masked RGB-T pass, if any, is the last, after one or three clean ones.
     """
 
     def __init__(
@@ -149,12 +139,10 @@ class SpatialMap:
         self.weighted_P = self.weighted_P.to(self.map_B1HW.device)
 
     def at(self, points: Tensor, image: Tensor, first_set: int) -> PointWeights:
-        """Weights at points.
+        """Weights at points (S, G, N, 2), see `rgbt.losses.points`.
 
-        Args:
-            points: (S, G, N, 2), see `rgbt.losses.points`.
-            image: (G,) int64, which image of the batch each of the G columns belongs to.
-            first_set: number of the first of the S sets; pass = set modulo P.
+        `image` (G,) int64 says which image of the batch each of the G columns belongs to;
+        `first_set` is the number of the first of the S sets; pass = set modulo P.
         """
         maps = self.map_B1HW[image]
         values = sample(maps, points.transpose(0, 1), outside="border")[:, 0].transpose(0, 1)

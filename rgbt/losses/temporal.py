@@ -12,14 +12,10 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError
-from rgbt.losses.consistency import con, con_acc
-from rgbt.losses.dice import Form, dice, single
+from rgbt.losses.overlap import Form, con, con_acc, dice, single
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import IGNORE, Frame, Loss
-
-Second = Literal["none", "dice", "con", "con_acc"]
-"""What the second frame costs beside its segmentation loss."""
 
 OWN = ("dice", "con", "con_acc")
 
@@ -37,8 +33,8 @@ class TemporalLoss:
         segmentation: seg, of each frame by itself. Paper and released: cross-entropy.
         alpha: finite, >= 0; with 0, the Dice loss of the first frame is not computed.
         beta: finite, >= 0; 0 if and only if `second` is "none".
-        second: X: Dice loss of the second frame (`rgbt.losses.dice`), or the first prediction
-            against the second (`rgbt.losses.consistency`).
+        second: X: Dice loss of the second frame (`rgbt.losses.overlap`), or the first prediction
+            against the second (there).
         form: of the Dice and the consistency losses, see there.
 
     Raises:
@@ -48,7 +44,7 @@ class TemporalLoss:
     segmentation: Loss
     alpha: NonNegative
     beta: NonNegative
-    second: Second
+    second: Literal["none", "dice", "con", "con_acc"]
     form: Form
 
     def __post_init__(self) -> None:
@@ -86,9 +82,9 @@ class TemporalLoss:
         Args:
             first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
             second: frame 2, of the same sizes.
-            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only with
-                `reads_warped` in the record. Whether a gradient goes through it is for the caller
-                to decide.
+            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only where the
+            record
+                says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
                 "con" and "con_acc".
             generator: of the segmentation loss, frame 1 first.
@@ -112,21 +108,15 @@ class TemporalLoss:
         if self.second == "dice":
             parts["dice_2"] = self.beta * self._dice(second)
         elif self.second != "none":
-            parts[self.second] = self.beta * self._against(second, warped, valid)
+            if warped is None:
+                raise ValueError(f"warped: needed for the part {self.second}, got None.")
+            p = single(second.logits).softmax(1)
+            if self.second == "con":
+                value = con(warped, p, valid, self.form)
+            else:
+                value = con_acc(warped, p, second.batch.label.where(valid, IGNORE), self.form)
+            parts[self.second] = self.beta * value
         return parts
 
     def _dice(self, frame: Frame) -> Tensor:
-        return dice(_probabilities(frame), frame.batch.label, self.form)
-
-    def _against(self, second: Frame, warped: Tensor | None, valid: Tensor) -> Tensor:
-        if warped is None:
-            raise ValueError(f"warped: needed for the part {self.second}, got None.")
-        probabilities = _probabilities(second)
-        if self.second == "con":
-            return con(warped, probabilities, valid, self.form)
-        label = second.batch.label.where(valid, IGNORE)
-        return con_acc(warped, probabilities, label, self.form)
-
-
-def _probabilities(frame: Frame) -> Tensor:
-    return single(frame.logits).softmax(1)
+        return dice(single(frame.logits).softmax(1), frame.batch.label, self.form)

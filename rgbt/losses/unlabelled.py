@@ -9,8 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rgbt.checks import check_range, check_shape
-from rgbt.losses.dice import single
+from rgbt.checks import check_shape
+from rgbt.losses.overlap import single
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
 
@@ -48,13 +48,9 @@ class MaxSquares:
     image_wise_ratio: Share | None
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "max_squares".
+        """The part "max_squares", () <= 0, float32 for half precision too.
 
-        Args:
-            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype.
-
-        Returns:
-            () times `weight`, <= 0, float32 for half precision too.
+        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
         """
         probabilities = single(probabilities)
         squares = probabilities.square().sum(1)
@@ -62,7 +58,13 @@ class MaxSquares:
         if self.image_wise_ratio is None:
             value = squares.mean() / 2
         else:
-            weights = _image_wise(probabilities.detach(), self.image_wise_ratio)
+            p, ratio = probabilities.detach(), self.image_wise_ratio
+            classes = p.argmax(1).flatten(1)
+            sizes = p.new_zeros(p.shape[:2])
+            sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
+            total = classes.shape[1]
+            of_class = 1 / (sizes**ratio * total ** (1 - ratio)).clamp(min=1)
+            weights = of_class.gather(1, classes).view_as(squares)
             value = (weights * squares).sum((1, 2)).mean() / (1 if entries else 2)
         return {"max_squares": -self.weight * value / (probabilities.shape[1] if entries else 1)}
 
@@ -81,30 +83,14 @@ class Entropy:
     weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "entropy".
+        """The part "entropy", () float32 for half precision too; the gradient is finite at 0 too.
 
-        Args:
-            probabilities: (B, K, H, W) in [0, 1], summing to 1 over K; any float dtype. Its
-                gradient is finite at 0 too.
-
-        Returns:
-            () times `weight`, float32 for half precision too.
+        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
         """
         probabilities = single(probabilities)
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
         highest = math.log(max(probabilities.shape[1], 2))  # of one class, the entropy is 0
         return {"entropy": self.weight * surprise.sum(1).mean() / highest}
-
-
-def _image_wise(probabilities: Tensor, ratio: float) -> Tensor:
-    """(B, H, W): the w of `MaxSquares`."""
-    classes = probabilities.argmax(1).flatten(1)
-    sizes = probabilities.new_zeros(probabilities.shape[:2])
-    sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
-    total = classes.shape[1]
-    weights = 1 / (sizes**ratio * total ** (1 - ratio)).clamp(min=1)
-    shape = (len(probabilities), *probabilities.shape[2:])
-    return torch.gather(weights, 1, classes).view(shape)
 
 
 def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float) -> Tensor:
@@ -114,19 +100,12 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
 
     Source: MaxSquareLoss and its release (t = 0.95).
 
-    Args:
-        probabilities: p (B, K, H, W) of the main head.
-        aux_probabilities: q (B, K, H, W) of the auxiliary head.
-        threshold: t in [0, 1].
-
-    Returns:
-        (B, H, W) int64; no gradient goes through it.
+    p and q, (B, K, H, W), are those of the main and of the auxiliary head, t in [0, 1] is
+    `threshold`; (B, H, W) int64, through which no gradient goes.
 
     Raises:
-        InputError: a threshold out of range.
         ValueError: the shapes differ.
     """
-    check_range("threshold", threshold, 0.0, 1.0)
     sizes = check_shape("probabilities", probabilities, "B K H W")
     check_shape("aux_probabilities", aux_probabilities, "B K H W", **sizes)
     p, q = probabilities.detach(), aux_probabilities.detach()

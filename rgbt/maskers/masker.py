@@ -93,16 +93,12 @@ class Masker:
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> MaskPair:
-        """Masks for a batch, one independent draw per sample.
+        """(B, h, w) bool cells of the padded crop, True = hidden, one independent draw per sample.
 
         Args:
             image_hw: size of the crop in pixels, before padding.
             centre_yx: (B, 2), pixel of the crop nearest to the centre of the original image.
             generator: on the device of `centre_yx`.
-
-        Returns:
-            `MaskPair` of (B, h, w) bool cells of the padded crop, True = hidden. Sampler "none":
-            nothing hidden, in cells of 32 pixels.
 
         Raises:
             InputError: the patch size does not divide the padded crop.
@@ -171,22 +167,17 @@ class Masker:
         optional = {"sigma_height"} if "sigma_div" in needed else set()
         if self.pairing == "rand_comp":
             optional.add("pattern_probabilities")
+        variant = f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
         for name, value in vars(self).items():
             if name == "sampler" or name in optional:
                 continue
             if name in needed and value is None:
-                raise InputError(f"masker.{name} needs a value with {self._variant()}; it is null.")
+                raise InputError(f"masker.{name} needs a value with {variant}; it is null.")
             if name not in needed and value is not None:
                 raise InputError(
-                    f"masker.{name} has no effect with {self._variant()}; set masker.{name}=null "
+                    f"masker.{name} has no effect with {variant}; set masker.{name}=null "
                     f"(it is {value})."
                 )
-        self._check_values()
-
-    def _variant(self) -> str:
-        return f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
-
-    def _check_values(self) -> None:
         if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
             raise InputError(
                 f"masker.sigma_height must hold one cell of masker.patch_size={self.patch_size} "

@@ -15,14 +15,7 @@ from rgbt.types import MaskPair
 
 
 def num_taken(grid_hw: tuple[int, int], ratio: float) -> int:
-    """How many cells a mask takes: ``ceil(h w ratio)``.
-
-    Source: CRM release, mask generator.
-
-    Args:
-        grid_hw: cells per column and row.
-        ratio: share of the cells, 0..1.
-    """
+    """How many cells a mask takes: ``ceil(h w ratio)`` (CRM release, mask generator)."""
     # 20 * 0.55 is 11.000000000000002 in binary; that excess must not cost a cell.
     return math.ceil(grid_hw[0] * grid_hw[1] * ratio - 1e-9)
 
@@ -36,14 +29,9 @@ def gaussian_log_weight(
 
     Source: SpatialSeg, Sec. IV-B, Eq. 8 (o = 0).
 
-    Args:
-        grid_hw: (h, w) cells.
-        centre_yx: (B, 2) float, c in cells.
-        sigma_cells: sigma in cells, > 0.
-        cell_offset: o, where in a cell its position is measured: 0 its index, 0.5 its middle.
-
-    Returns:
-        (B, h, w) float32, 0 at the centre and negative elsewhere.
+    Centres (B, 2) float and sigma > 0 are in cells; `cell_offset` o says where in a cell its
+    position is measured: 0 its index, 0.5 its middle. (B, h, w) float32, 0 at the centre, negative
+    elsewhere.
     """
     height, width = grid_hw
     y = torch.arange(height, device=centre_yx.device) + cell_offset
@@ -60,13 +48,7 @@ def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> T
     The same distribution in one step (Efraimidis and Spirakis, Information Processing Letters 97,
     2006): take the `count` largest of ``log w - log e`` with independent exponential e.
 
-    Args:
-        log_weight: (B, h, w) float; all zero draws uniformly.
-        count: 0..h w.
-        generator: on the device of `log_weight`.
-
-    Returns:
-        (B, h, w) bool.
+    (B, h, w) float, all zero to draw uniformly -> (B, h, w) bool.
     """
     waiting = torch.empty_like(log_weight).exponential_(generator=generator)
     keys = (log_weight - waiting.log()).flatten(1)
@@ -76,16 +58,9 @@ def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> T
 
 
 def bernoulli(log_probability: Tensor, generator: torch.Generator) -> Tensor:
-    """Every cell independently with its own probability; the number taken varies.
+    """Every cell of (B, h, w), <= 0, independently with its own probability; their number varies.
 
     Source: SpatialSeg, Sec. IV-B, Eq. 9.
-
-    Args:
-        log_probability: (B, h, w) float, <= 0.
-        generator: on the device of `log_probability`.
-
-    Returns:
-        (B, h, w) bool.
     """
     uniform = torch.rand(log_probability.shape, generator=generator, device=log_probability.device)
     return uniform < log_probability.exp()
@@ -100,14 +75,7 @@ def square(
     Released: rows and columns of the slice are exchanged and the mask is in pixels where tokens are
     expected, so the released square mask stops with a size mismatch.
 
-    Args:
-        batch: B.
-        grid_hw: (h, w) cells.
-        ratio: share of each side, 0..1; rounded to whole cells.
-        generator: gives the device of the result.
-
-    Returns:
-        (B, h, w) bool.
+    Sides are rounded to whole cells; (B, h, w) bool on the device of `generator`.
     """
     inside = [_interval(batch, length, round(length * ratio), generator) for length in grid_hw]
     return inside[0][:, :, None] & inside[1][:, None, :]
@@ -122,12 +90,9 @@ def _interval(batch: int, length: int, extent: int, generator: torch.Generator) 
 
 
 def complementary(taken: Tensor) -> MaskPair:
-    """RGB hides the taken cells, thermal all others.
+    """RGB hides the taken cells (B, h, w), thermal all others.
 
     Source: CRM, Sec. 3.2 (there 1 keeps a cell; here True hides it); SpatialSeg, Eqs 6 and 10.
-
-    Args:
-        taken: (B, h, w) bool.
     """
     return MaskPair(rgb=taken, thermal=~taken)
 
@@ -142,10 +107,7 @@ def random_complementary(
     Source: SpatialSeg, Eq. 11, and the default of both releases (`rand_comp`), each pattern with
     probability 1/3. The CRM paper describes the third alone (`complementary`).
 
-    Args:
-        taken: m, (B, h, w) bool.
-        probabilities: of the three patterns in this order, sum 1.
-        generator: on the device of `taken`.
+    `taken` m is (B, h, w) bool; the probabilities, in this order, sum to 1.
     """
     batch = len(taken)
     weights = torch.tensor(probabilities, device=taken.device)

@@ -51,13 +51,10 @@ class Sketch(NamedTuple):
 
 
 def sketch(masker: AnyMasker, examples: Iterable[Example], seed: int, draws: int = DRAWS) -> Sketch:
-    """Masked images of `examples`, and how often each cell is hidden.
+    """Masked images of training examples, and how often each cell is hidden.
 
-    Args:
-        masker: any variant.
-        examples: one or more training examples.
-        seed: every mask is derived from it.
-        draws: number of masks behind the frequencies, all for the centre of the first example.
+    Every mask is derived from `seed`; the frequencies are those of `draws` masks for the centre of
+    the first example.
     """
     shown = tuple(examples)
     centres = torch.tensor([example.centre_yx for example in shown])

@@ -24,16 +24,9 @@ def absent_notes(
     A class is absent where it is neither labelled nor predicted. One that is predicted although no
     label holds it has an IoU of 0 with either convention (see `rgbt.metrics.scores`).
 
-    Args:
-        by_region: (R, K, K) counts of all images, rows = label, columns = prediction.
-        classes: K names.
-        scored: (K,), which classes means are over; the others are not mentioned.
-        split: name of the split.
-        absent: the convention of the table.
-
-    Returns:
-        at most three sentences without a full stop: absent classes, classes that are predicted
-        only, and classes that some regions lack.
+    Of the (R, K, K) counts of all images, K names and the scored ones (K,), the others not being
+    mentioned: at most three sentences without a full stop, about absent classes, classes that are
+    predicted only, and classes that some regions lack.
     """
     labelled, predicted = by_region.sum(-1) > 0, by_region.sum(-2) > 0
     there = labelled | predicted
@@ -42,20 +35,16 @@ def absent_notes(
     partly = np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist()
     notes = []
     if gone.any():
-        notes.append(f"absent from the {split} split: {_names(classes, gone)} ({COUNTED[absent]})")
+        named = ", ".join(np.array(classes)[gone])
+        notes.append(f"absent from the {split} split: {named} ({COUNTED[absent]})")
     if unlabelled.any():
-        named = _names(classes, unlabelled)
+        named = ", ".join(np.array(classes)[unlabelled])
         notes.append(f"predicted, but not labelled in the {split} split: {named} (IoU 0)")
     if partly:
-        lacks = [f"{classes[each]} ({_regions(~there[:, each])})" for each in partly]
+        lacks = []
+        for each in partly:
+            regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
+            plural = "s" * (len(regions) > 1)
+            lacks.append(f"{classes[each]} (region{plural} {', '.join(regions)})")
         notes.append(f"absent from some regions: {', '.join(lacks)}; {COUNTED[absent]} there")
     return tuple(notes)
-
-
-def _names(classes: Sequence[str], chosen: NDArray[np.bool_]) -> str:
-    return ", ".join(name for name, is_chosen in zip(classes, chosen, strict=True) if is_chosen)
-
-
-def _regions(missing: NDArray[np.bool_]) -> str:
-    numbers = [str(number) for number, is_missing in enumerate(missing, start=1) if is_missing]
-    return f"region{'s' * (len(numbers) > 1)} {', '.join(numbers)}"

@@ -43,23 +43,19 @@ class RegionCounter:
     def __call__(
         self, label: NDArray[np.integer] | Tensor, prediction: NDArray[np.integer] | Tensor
     ) -> NDArray[np.int64]:
-        """Confusion matrices of one image, one per region.
+        """(R, K, K) counts of one image, rows = label, columns = prediction; those of images add.
 
         Source: SpatialSeg release, metric code (a confusion matrix per region); pixels whose label
         is no class (255 = ignore) are left out.
 
-        Args:
-            label: (H, W) integer, 0..255; K and above is ignored.
-            prediction: (H, W) integer, 0..K-1.
-
-        Returns:
-            (R, K, K) counts, rows = label, columns = prediction. Matrices of several images add.
+        (H, W) integer labels 0..255, of which K and above are ignored, and predictions 0..K-1.
 
         Raises:
             ValueError: shapes differ, or a prediction is no class.
         """
-        label_HW = _bytes(label)
-        prediction_HW = _bytes(prediction)
+        label_HW, prediction_HW = (
+            torch.as_tensor(each).to(torch.uint8) for each in (label, prediction)
+        )
         if label_HW.dim() != 2 or label_HW.shape != prediction_HW.shape:
             raise ValueError(
                 f"label and prediction: expected two maps H x W of one shape, got "
@@ -86,10 +82,6 @@ class RegionCounter:
             offset = region * self._per_region + lane * self._size
             self._offsets[image_hw] = offset.to(_narrowest(LANES * self._size, signed=True))
         return self._offsets[image_hw]
-
-
-def _bytes(values: NDArray[np.integer] | Tensor) -> Tensor:
-    return torch.as_tensor(values).to(torch.uint8)
 
 
 def _narrowest(size: int, *, signed: bool = False) -> torch.dtype:

@@ -156,14 +156,7 @@ class Counts:
 
 
 def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray[np.bool_]:
-    """Which classes take part in means over classes.
-
-    Args:
-        classes: K names.
-        unscored: those that are left out.
-
-    Returns:
-        (K,), True for at least one.
+    """(K,) bool: which classes take part in means over classes, at least one.
 
     Raises:
         ValueError: `unscored` names what is no class, or every class.

@@ -79,15 +79,9 @@ def parse(metric: str) -> ParsedMetric:
 
 
 def value(metric: str, counts: Counts, absent: Absent) -> float:
-    """The score called `metric`.
+    """The score called `metric`: percent 0..100; the variance in squared percent points.
 
-    Args:
-        metric: a name, see the module docstring.
-        counts: of one evaluation.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-
-    Returns:
-        percent 0..100; the variance in squared percent points. NaN: nothing to score.
+    NaN: nothing to score. `absent`: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
         InputError: no such metric, class or region, a metric that such counts do not have, or
@@ -107,10 +101,10 @@ def values(
         asked: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images.
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+        absent: see `value`.
 
     Returns:
-        (...) percent; the variance in squared percent points. NaN: nothing to score.
+        (...), units as of `value`.
 
     Raises:
         InputError: no such class or region, or a metric that such counts do not have.

@@ -70,16 +70,10 @@ def pair_counts(
     One histogram over ``(min(label, K) K + first) K + second``, in numbers as narrow as they fit;
     pixels that do not count have a row K + 1, which is dropped.
 
-    Args:
-        first: (H, W) integer 0..K-1, prediction of the first frame as the protocol compares it;
-            anything 0..255 where not `valid`.
-        second: (H, W) integer 0..K-1, prediction of the second frame.
-        label: (H, W) integer 0..255, of the second frame; K and above is no class.
-        num_classes: K, 1..255.
-        valid: (H, W) bool, pixels that count; None: all.
-
-    Returns:
-        (K + 1, K, K): label (row K: no class), first, second. Those of several images add.
+    (H, W) integer predictions 0..K-1 of the first frame, as the protocol compares it (anything
+    0..255 where not `valid`), and of the second; its label 0..255, K and above is no class; `valid`
+    (H, W) bool, pixels that count, None: all. (K + 1, K, K): label (row K: no class), first,
+    second; those of several images add. K is 1..255.
 
     Raises:
         ValueError: shapes differ, or a prediction that counts is no class.
@@ -96,11 +90,18 @@ def pair_counts(
         torch.as_tensor(each).to(torch.uint8) for each in (first, second, label)
     )
     valid_HW = None if valid is None else torch.as_tensor(valid).bool().to(torch.uint8)
-    _check_shapes(first_HW, second_HW, label_HW, valid_HW)
+    maps = (first_HW, second_HW, label_HW, valid_HW)
+    shapes = [tuple(each.shape) for each in maps if each is not None]
+    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
+        raise ValueError(
+            "first, second, label and valid: expected maps H x W of one shape, got "
+            f"{', '.join(map(str, shapes))}."
+        )
     if valid_HW is not None:
         first_HW = first_HW * valid_HW
-    _check_classes(first_HW, classes, "first")
-    _check_classes(second_HW, classes, "second")
+    for name, each in (("first", first_HW), ("second", second_HW)):
+        if int(each.max()) >= classes:
+            raise ValueError(f"{name}: expected classes 0..{classes - 1}, got {int(each.max())}.")
     size = (classes + 2) * classes**2
     row_HW = label_HW.clamp(max=classes).to(torch.int16 if LANES * size <= 2**15 else torch.int32)
     if valid_HW is not None:
@@ -123,13 +124,9 @@ def tc(pairs: Matrices, absent: Absent) -> Scores:
 
     Source: Temporal, Fig. 4; release, evaluation code.
 
-    Args:
-        pairs: (..., S (K + 1), K, K), summed over images.
-        absent: a class that neither frame of a set shows: "released" 0 (the release, whose
-            denominator has 1e-10 more); "exclude" NaN, left out of the mean over the sets.
-
-    Returns:
-        (..., K) fractions 0..1; NaN where no set shows the class.
+    (..., S (K + 1), K, K), summed over images -> (..., K) fractions 0..1. `absent`, for a class
+    that neither frame of a set shows: "released" 0 (the release, whose denominator has 1e-10 more);
+    "exclude" NaN, left out of the mean over the sets; NaN where no set shows the class.
 
     Raises:
         ValueError: the rows are no whole number of sets.
@@ -168,7 +165,8 @@ def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:
     frames = by_set.sum(-3)
     three = np.einsum("...ccc->...c", labelled)
     sizes = frames.sum(-1) + frames.sum(-2) + labelled.sum((-1, -2))
-    overlaps = _diagonal(frames) + _diagonal(labelled.sum(-1)) + _diagonal(labelled.sum(-2))
+    twos = (frames, labelled.sum(-1), labelled.sum(-2))
+    overlaps: Scores = np.sum([np.diagonal(x, axis1=-2, axis2=-1) for x in twos], axis=0)
     return three, sizes, overlaps
 
 
@@ -186,23 +184,3 @@ def _by_set(pairs: Matrices) -> Scores:
 def _over_sets(scores: Scores) -> Scores:
     """(..., S, K) -> (..., K)."""
     return known_mean(np.swapaxes(scores, -1, -2))
-
-
-def _diagonal(matrices: Scores) -> Scores:
-    return np.diagonal(matrices, axis1=-2, axis2=-1)
-
-
-def _check_shapes(*maps: Tensor | None) -> None:
-    shapes = [tuple(each.shape) for each in maps if each is not None]
-    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
-        raise ValueError(
-            "first, second, label and valid: expected maps H x W of one shape, got "
-            f"{', '.join(map(str, shapes))}."
-        )
-
-
-def _check_classes(prediction_HW: Tensor, classes: int, name: str) -> None:
-    if int(prediction_HW.max()) >= classes:
-        raise ValueError(
-            f"{name}: expected classes 0..{classes - 1}, got {int(prediction_HW.max())}."
-        )

@@ -42,15 +42,10 @@ def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> Reg
 def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionMap:
     """Nested centred rectangles of equal area steps; index 0 is the innermost.
 
-    The rectangle around regions 0..r-1 has the area ``r H W / R``.
-    Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); region 1 is the centre.
-    Released: sides in the ratio 3:4 for every image, numbered from the outside
-    (``aspect: released_3_4`` is the same map with our numbers). For images of 3:4 both are equal.
-
-    Args:
-        image_hw: (H, W) pixels.
-        regions: R.
-        aspect: "image" gives the rectangles the image's own aspect; "released_3_4" as above.
+    The rectangle around regions 0..r-1 has the area ``r H W / R``; R is `regions`.
+    Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); region 1 is the centre; `aspect` "image" gives the
+    rectangles the image's own. Released: sides in the ratio 3:4 for every image, numbered from the
+    outside ("released_3_4" is the same map with our numbers). For images of 3:4 both are equal.
 
     Raises:
         InputError: the released rectangles do not fit into the image, or a region is empty.
@@ -71,20 +66,11 @@ def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionM
 def ring_rectangle(
     image_hw: tuple[int, int], regions: int, inner: int, aspect: Aspect
 ) -> tuple[slice, slice]:
-    """Rows and columns of the rectangle around the `inner` innermost of `regions` regions.
+    """Rows and columns, half open, of the rectangle around the `inner` innermost regions.
 
     Its sides are ``H sqrt(r / R)`` and ``W sqrt(r / R)`` ("image"), or ``3 s`` and ``4 s`` with
     ``12 s^2 = r H W / R`` ("released_3_4"); bounds are cut to integers as in the SpatialSeg
     release. Squares are kept as whole fractions: no rounding decides where an edge falls.
-
-    Args:
-        image_hw: (H, W) pixels.
-        regions: R.
-        inner: r, 1..R.
-        aspect: see `ring_map`.
-
-    Returns:
-        (rows, columns), half open.
     """
     height, width = image_hw
     if aspect == "image":

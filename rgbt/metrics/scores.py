@@ -97,11 +97,8 @@ def variance(region_scores: ArrayLike) -> Scores:
 
     Source: SpatialSeg, Eq. 19.
 
-    Args:
-        region_scores: (..., R) fractions; regions that are NaN (no class to score) are left out.
-
-    Returns:
-        (...) >= 0; NaN where every region is NaN.
+    (..., R) fractions -> (...); regions that are NaN (no class to score) are left out, NaN where
+    all are.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
     distances = percents - known_mean(percents)[..., None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -42,12 +44,10 @@ class Critic(nn.Module):
         self.in_channels = in_channels
         self.upsample = upsample
         self.align_corners = align_corners
-        widths = [base_width * factor for factor in (1, 2, 4, 8)]
-        self.conv1 = nn.Conv2d(in_channels, widths[0], 4, stride=2, padding=1)
-        self.conv2 = nn.Conv2d(widths[0], widths[1], 4, stride=2, padding=1)
-        self.conv3 = nn.Conv2d(widths[1], widths[2], 4, stride=2, padding=1)
-        self.conv4 = nn.Conv2d(widths[2], widths[3], 4, stride=2, padding=1)
-        self.classifier = nn.Conv2d(widths[3], 1, 4, stride=2, padding=1)
+        widths = (in_channels, *(base_width * factor for factor in (1, 2, 4, 8)), 1)
+        self.conv1, self.conv2, self.conv3, self.conv4, self.classifier = (
+            nn.Conv2d(before, after, 4, stride=2, padding=1) for before, after in pairwise(widths)
+        )
 
     @property
     def record(self) -> Record:
@@ -58,18 +58,14 @@ class Critic(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Verdicts, not squashed; which number stands for which domain is the loss's choice.
 
-        Args:
-            x: (N, in_channels, H, W), sides of at least 32.
-
-        Returns:
-            (N, 1, h, w) with h = H // 32 and w = W // 32, or 32 times that with `upsample`:
-            H and W where they are multiples of 32, a little less otherwise.
+        (N, in_channels, H, W), sides of at least 32 -> (N, 1, h, w) with h = H // 32, w = W // 32,
+        or 32 times that with `upsample`: H and W, or a little less where 32 does not divide them.
 
         Raises:
             InputError: a map that is too small.
             ValueError: another number of channels.
         """
-        sizes = check_shape("map", x, "N C H W", C=self.conv1.in_channels)
+        sizes = check_shape("map", x, "N C H W", C=self.in_channels)
         if min(sizes["H"], sizes["W"]) < STRIDE:
             raise InputError(
                 f"a discriminator judges maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} x "

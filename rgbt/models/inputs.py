@@ -17,9 +17,6 @@ from rgbt.geometry.padding import pad_to, padded_hw
 from rgbt.ranges import GreyLevel
 from rgbt.types import MaskPair, View
 
-LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in the luma of ITU-R BT.601."""
-
 
 class Images(NamedTuple):
     """Normalised images: rgb (N, 3, H', W') and thermal (N, c, H', W'), padded with 0."""
@@ -37,17 +34,16 @@ class Inputs(nn.Module):
     Args:
         rgb_order: "rgb"; "bgr" as OpenCV reads files; or "gray": all three channels are the luma
             0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
-        rgb_mean: in grey levels 0..255, in the order of `rgb_order`.
-        rgb_std: likewise, > 0.
-        thermal_mean: in grey levels 0..255, one value per channel that the network's thermal
-            branch takes: the single thermal channel is repeated for three.
-        thermal_std: likewise, > 0, as many values.
+        rgb_mean: in grey levels 0..255, in the order of `rgb_order`; as `rgb_std`, > 0.
+        rgb_std: see there.
+        thermal_mean: one value per channel that the network's thermal branch takes: the single
+            thermal channel is repeated for three; as `thermal_std`, > 0.
+        thermal_std: see there.
         thermal_scale: "fixed": 255 is white; "image_max": every image is divided by its own
             maximum first (an image of zeros stays one).
 
     Raises:
-        InputError: deviations that are not positive; not 1 or 3 thermal channels; lists of
-            different length.
+        InputError: not 1 or 3 thermal channels; lists of different length.
     """
 
     rgb_mean: Tensor
@@ -73,9 +69,8 @@ class Inputs(nn.Module):
             )
         self.rgb_order = rgb_order
         self.thermal_scale = thermal_scale
-        named: dict[str, tuple[float, ...]] = {"rgb_mean": rgb_mean, "rgb_std": rgb_std}
-        named |= {"thermal_mean": thermal_mean, "thermal_std": thermal_std}
-        for name, values in named.items():
+        names = ("rgb_mean", "rgb_std", "thermal_mean", "thermal_std")
+        for name, values in zip(names, (rgb_mean, rgb_std, thermal_mean, thermal_std), strict=True):
             scaled = torch.tensor(values).view(-1, 1, 1) / 255
             self.register_buffer(name, scaled, persistent=False)
 
@@ -89,91 +84,66 @@ class Inputs(nn.Module):
     ) -> Images:
         """Normalised images; hidden pixels and padding are 0: the mean, or black where that is 0.
 
-        Args:
-            rgb: (N, 3, H, W) float in [0, 1].
-            thermal: (N, 1, H, W) float in [0, 1].
-            masks: cells of the image padded to multiples of 32, (N, h, w) bool each,
-                True = the pixels are hidden; None: nothing is.
-            multiple: sides are padded at the bottom and right to multiples of this.
-
-        Raises:
-            ValueError: shapes that do not fit each other.
-            InputError: mask cells that do not divide the padded image.
+        Arguments and errors as `rgbt.models` says; sides are padded at the bottom and right to
+        multiples of `multiple`.
         """
         sizes = check_shape("rgb", rgb, "N C H W", C=3)
         check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
         if self.rgb_order == "bgr":
             rgb = rgb.flip(1)
         elif self.rgb_order == "gray":
-            luma = torch.tensor(LUMA, dtype=rgb.dtype, device=rgb.device).view(1, 3, 1, 1)
+            luma = rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
             rgb = (rgb * luma).sum(1, keepdim=True).expand_as(rgb)
         if self.thermal_scale == "image_max":
             # The smallest float only matters where the whole image is 0.
             brightest = thermal.amax((1, 2, 3), keepdim=True)
             thermal = thermal / brightest.clamp(min=torch.finfo(thermal.dtype).tiny)
-        images = Images(
+        images = [
             (rgb - self.rgb_mean) / self.rgb_std,
             (thermal - self.thermal_mean) / self.thermal_std,
-        )
+        ]
         hw = sizes["H"], sizes["W"]
         if masks is not None:
             cells = expand_cells(masks, sizes["N"], padded_hw(hw))
-            images = Images(
-                *(
-                    image.masked_fill(hidden[:, None, : hw[0], : hw[1]], 0.0)
-                    for image, hidden in zip(images, cells, strict=True)
-                )
-            )
-        full = padded_hw(hw, multiple)
-        return Images(*(pad_to(image, full) for image in images))
+            images = [
+                image.masked_fill(hidden[:, None, : hw[0], : hw[1]], 0.0)
+                for image, hidden in zip(images, cells, strict=True)
+            ]
+        return Images(*(pad_to(image, padded_hw(hw, multiple)) for image in images))
 
 
 def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:
-    """Cells to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
+    """Cells (N, h, w) to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
 
-    Args:
-        masks: (N, h, w) bool each.
-        count: N that is expected.
-        image_hw: the padded size that the cells divide.
-        unit: side of a square, pixels: 1 for pixels, 4 for the tokens of a Swin.
+    `count` is the N that is expected, `image_hw` the padded size, `unit` 1 for pixels or 4 for the
+    tokens of a Swin.
 
     Raises:
         InputError: cells that are not squares of a multiple of `unit` pixels.
         ValueError: another N.
     """
-    rgb, thermal = (
-        _expand(name, mask, (count, *image_hw), unit)
-        for name, mask in zip(MaskPair._fields, masks, strict=True)
-    )
-    return MaskPair(rgb, thermal)
-
-
-def _expand(name: str, mask: Tensor, size: tuple[int, int, int], unit: int) -> Tensor:
-    count, height, width = size
-    sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
-    grid = sizes["h"], sizes["w"]
-    cell = height // grid[0]
-    if cell % unit or (grid[0] * cell, grid[1] * cell) != (height, width):
-        raise InputError(
-            f"masker: a grid of {grid[0]} x {grid[1]} cells does not divide the padded image of "
-            f"{height} x {width} pixels into squares of a multiple of {unit} pixels "
-            f"(patch size {height / grid[0]:g} x {width / grid[1]:g}); choose a "
-            "masker.patch_size that divides both sides."
-        )
-    repeat = cell // unit
-    return mask.repeat_interleave(repeat, 1).repeat_interleave(repeat, 2)
+    height, width = image_hw
+    found = []
+    for name, mask in zip(MaskPair._fields, masks, strict=True):
+        sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
+        h, w = sizes["h"], sizes["w"]
+        cell = height // h
+        if cell % unit or (h * cell, w * cell) != image_hw:
+            raise InputError(
+                f"masker: a grid of {h} x {w} cells does not divide the padded image of "
+                f"{height} x {width} pixels into squares of a multiple of {unit} pixels "
+                f"(patch size {height / h:g} x {width / w:g}); choose a "
+                "masker.patch_size that divides both sides."
+            )
+        found.append(mask.repeat_interleave(cell // unit, 1).repeat_interleave(cell // unit, 2))
+    return MaskPair(*found)
 
 
 def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
     """The one view that is requested of a network without stacked views.
 
-    Args:
-        views: as a network's `forward` got them; empty takes the first of `known`.
-        known: what the network predicts from.
-        network: its name for the message.
-
-    Raises:
-        InputError: more than one view, or one that the network does not have.
+    `views` as its `forward` got them (empty: the first of `known`), its views, and its name.
+    InputError: more than one view, or one that it does not have.
     """
     requested = views or known[:1]
     if len(requested) > 1 or requested[0] not in known:

@@ -5,8 +5,6 @@ Parameter names are those of the authors' PyTorch release; "inf" (infrared) is t
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -24,22 +22,8 @@ LEAKY_SLOPE = 0.2
 """Of every leaky ReLU, as released."""
 
 
-class MFNetFeatures(NamedTuple):
-    """Features of an encoder at strides 2, 4, 8 (before they are pooled) and 16."""
-
-    half: Tensor
-    quarter: Tensor
-    eighth: Tensor
-    last: Tensor
-
-
 class ConvUnit(nn.Module):
-    """3x3 convolution, batch normalisation, leaky ReLU.
-
-    Args:
-        dilation: of the convolution; its padding too.
-        activation: whether there is a leaky ReLU.
-    """
+    """3x3 convolution (dilated, padded alike), batch normalisation, and a leaky ReLU if asked."""
 
     def __init__(
         self, in_channels: int, out_channels: int, *, dilation: int = 1, activation: bool = True
@@ -63,19 +47,17 @@ class MiniInception(nn.Module):
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
-        half = out_channels // 2
-        self.conv1_left = ConvUnit(in_channels, half)
-        self.conv1_right = ConvUnit(in_channels, half, dilation=2)
-        self.conv2_left = ConvUnit(out_channels, half)
-        self.conv2_right = ConvUnit(out_channels, half, dilation=2)
-        self.conv3_left = ConvUnit(out_channels, half)
-        self.conv3_right = ConvUnit(out_channels, half, dilation=2)
+        for level, channels in enumerate((in_channels, out_channels, out_channels), start=1):
+            for side, dilation in (("left", 1), ("right", 2)):
+                unit = ConvUnit(channels, out_channels // 2, dilation=dilation)
+                self.add_module(f"conv{level}_{side}", unit)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, H, W) -> (N, out, H, W)."""
-        x = torch.cat((self.conv1_left(x), self.conv1_right(x)), 1)
-        x = torch.cat((self.conv2_left(x), self.conv2_right(x)), 1)
-        return torch.cat((self.conv3_left(x), self.conv3_right(x)), 1)
+        left1, right1, left2, right2, left3, right3 = self.children()
+        for left, right in ((left1, right1), (left2, right2), (left3, right3)):
+            x = torch.cat((left(x), right(x)), 1)
+        return x
 
 
 class MFNet(nn.Module):
@@ -95,7 +77,7 @@ class MFNet(nn.Module):
         inputs: normalisation of the images.
 
     Raises:
-        InputError: widths that are not positive, or odd where a mini-inception halves them.
+        InputError: widths that are odd where a mini-inception halves them.
     """
 
     record = Record(views=("rgbt",))
@@ -111,7 +93,9 @@ class MFNet(nn.Module):
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        _check(rgb_widths, thermal_widths, decoder_width)
+        for name, widths in (("rgb_widths", rgb_widths), ("thermal_widths", thermal_widths)):
+            if widths[3] % 2:
+                raise InputError(f"model.{name}: the last must be even, got {list(widths)}.")
         self.num_classes = num_classes
         self._add_encoder("rgb", 3, rgb_widths)
         self._add_encoder("inf", inputs.thermal_channels, thermal_widths)
@@ -158,7 +142,9 @@ class MFNet(nn.Module):
         for name, unit in units.items():
             self.add_module(f"{name}_{suffix}", unit)
 
-    def _encode(self, suffix: str, image: Tensor) -> MFNetFeatures:
+    def _encode(self, suffix: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Features at strides 2, 4, 8 (before they are pooled) and 16."""
+
         def unit(name: str, x: Tensor) -> Tensor:
             result: Tensor = self.get_submodule(f"{name}_{suffix}")(x)
             return result
@@ -166,19 +152,9 @@ class MFNet(nn.Module):
         half = unit("conv2_2", unit("conv2_1", F.max_pool2d(unit("conv1", image), 2)))
         quarter = unit("conv3_2", unit("conv3_1", F.max_pool2d(half, 2)))
         eighth = unit("conv4", F.max_pool2d(quarter, 2))
-        return MFNetFeatures(half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2)))
+        return half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2))
 
 
 def doubled(x: Tensor) -> Tensor:
     """Every pixel four times: (N, C, H, W) -> (N, C, 2 H, 2 W)."""
     return F.interpolate(x, scale_factor=2.0, mode="nearest")
-
-
-def _check(rgb: tuple[int, ...], thermal: tuple[int, ...], decoder_width: int) -> None:
-    for name, widths in (("rgb_widths", rgb), ("thermal_widths", thermal)):
-        if min(widths) < 1 or widths[3] % 2:
-            raise InputError(
-                f"model.{name} must be positive, the last one even, got {list(widths)}."
-            )
-    if decoder_width < 1:
-        raise InputError(f"model.decoder_width must be positive, got {decoder_width}.")

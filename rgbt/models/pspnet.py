@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.inputs import Images, Inputs, only_view
+from rgbt.models.parts import DropRates, UpBlock, enlarge
 from rgbt.models.resnet import bottleneck_stage
-from rgbt.models.upsampling import DropRates, UpBlock, enlarge
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
 from rgbt.requirements import Record
 from rgbt.types import MaskPair, Output, View
@@ -24,12 +24,9 @@ BINS = (1, 2, 3, 6)
 BRANCHES = ("", "_2")
 """What the released names of the first and second branch end with."""
 
-Modalities = Literal["late_fusion", "early_fusion", "rgb", "thermal"]
-VIEWS_OF: dict[str, tuple[View, ...]] = {
-    "late_fusion": ("rgbt",),
-    "early_fusion": ("rgbt",),
-    "rgb": ("rgb",),
-    "thermal": ("thermal",),
+VIEW_OF: dict[str, View] = {
+    **{"late_fusion": "rgbt", "early_fusion": "rgbt"},
+    **{"rgb": "rgb", "thermal": "thermal"},
 }
 
 
@@ -63,7 +60,7 @@ class PSPNet(nn.Module):
         depths: Depths,
         base_width: BaseWidth,
         decoder_width: Channels,
-        modalities: Modalities,
+        modalities: Literal["late_fusion", "early_fusion", "rgb", "thermal"],
         dropout: DropRates,
         align_corners: bool,
         inputs: Inputs,
@@ -81,19 +78,24 @@ class PSPNet(nn.Module):
             "thermal": (thermal,),
         }
         self.feats = PSPNetEncoder(channels[modalities], depths, base_width)
-        pooled, wide, narrow = 16 * base_width, 4 * decoder_width, decoder_width
+        pooled, narrow = 16 * base_width, decoder_width
         self.psp = PyramidPooling(32 * base_width, pooled, align_corners=align_corners)
-        self.up_1 = UpBlock(pooled, wide, align_corners=align_corners)
-        self.up_2 = UpBlock(wide, narrow, align_corners=align_corners)
+        self.up_1 = UpBlock(pooled, 4 * narrow, align_corners=align_corners)
+        self.up_2 = UpBlock(4 * narrow, narrow, align_corners=align_corners)
         self.up_3 = UpBlock(narrow, narrow, align_corners=align_corners)
         self.final = nn.Sequential(nn.Conv2d(narrow, num_classes, 1))
-        self.apply(_initialise)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.normal_(module.weight, 0.0, 0.02)
+            elif isinstance(module, nn.BatchNorm2d):
+                nn.init.normal_(module.weight, 1.0, 0.02)
+                nn.init.zeros_(module.bias)
         self.inputs = inputs
 
     @staticmethod
     def record_from(*, modalities: str, **_: object) -> Record:
         """What it returns, and what it predicts from."""
-        return Record(views=VIEWS_OF[modalities], pretrained_parts=("feats.",))
+        return Record(views=(VIEW_OF[modalities],), pretrained_parts=("feats.",))
 
     def forward(
         self,
@@ -134,13 +136,9 @@ class PSPNet(nn.Module):
 class PSPNetEncoder(nn.Module):
     """ResNet whose last two stages are dilated instead of strided.
 
-    Stem and first two stages exist once per image. The first block of a dilated stage is not
-    dilated; after two branches the third stage keeps its width, so that it has no projection.
-
-    Args:
-        channels: of each image, one or two.
-        depths: bottlenecks per stage.
-        width: channels of the stem.
+    Stem and first two stages exist once per image of so many `channels`. The first block of a
+    dilated stage is not dilated; after two branches the third stage keeps its width and has no
+    projection.
     """
 
     def __init__(
@@ -162,16 +160,13 @@ class PSPNetEncoder(nn.Module):
     def forward(self, images: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Features by the name of their stage, see `PSPNet.forward`."""
         found = [self._branch(*each) for each in zip(self.branches, images, strict=True)]
-        stem, layer1, layer2 = (_concatenated(maps) for maps in zip(*found, strict=True))
+        stem, layer1, layer2 = (
+            torch.cat(maps, 1) if len(maps) > 1 else maps[0] for maps in zip(*found, strict=True)
+        )
         layer3 = self.layer3(layer2)
         layer4 = self.layer4(layer3)
-        return {
-            "layer4": layer4,
-            "layer3": layer3,
-            "layer2": layer2,
-            "layer1": layer1,
-            "stem": stem,
-        }
+        names = ("layer4", "layer3", "layer2", "layer1", "stem")
+        return dict(zip(names, (layer4, layer3, layer2, layer1, stem), strict=True))
 
     def _branch(self, end: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         conv1, bn1, layer1, layer2 = (
@@ -212,16 +207,3 @@ class PyramidPooling(nn.Module):
                 small, size=x.shape[2:], mode="bilinear", align_corners=self.align_corners
             )
         return F.relu(result)
-
-
-def _concatenated(maps: tuple[Tensor, ...]) -> Tensor:
-    return torch.cat(maps, 1) if len(maps) > 1 else maps[0]
-
-
-def _initialise(module: nn.Module) -> None:
-    """As `PSPNet` says; biases of convolutions and slopes are left alone."""
-    if isinstance(module, nn.Conv2d):
-        nn.init.normal_(module.weight, 0.0, 0.02)
-    elif isinstance(module, nn.BatchNorm2d):
-        nn.init.normal_(module.weight, 1.0, 0.02)
-        nn.init.zeros_(module.bias)

@@ -20,8 +20,6 @@ class BasicBlock(nn.Module):
     Source: He et al., Deep Residual Learning, Fig. 5 left.
     """
 
-    expansion = 1
-
     def __init__(self, in_channels: int, width: int, *, stride: int = 1) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(in_channels, width, 3, stride=stride, padding=1, bias=False)
@@ -41,14 +39,9 @@ class Bottleneck(nn.Module):
 
     Source: He et al., Deep Residual Learning, Fig. 5 right.
 
-    Args:
-        width: of the 3x3 convolution; four times as many leave the block.
-        stride: of the block.
-        dilation: of the 3x3 convolution; its padding too.
-        stride_at: "3x3" as torchvision, "1x1" as in Caffe's ResNet (DeepLab v2).
+    `width` is that of the 3x3 convolution, which is dilated; four times as many channels leave the
+    block. Its stride is at the "3x3" as torchvision has it, or the "1x1" as in Caffe (DeepLab v2).
     """
-
-    expansion = 4
 
     def __init__(
         self,
@@ -97,24 +90,15 @@ def bottleneck_stage(
     dilations: tuple[int, int] = (1, 1),
     stride_at: StrideAt = "3x3",
 ) -> nn.Sequential:
-    """Bottlenecks of one width, the first strided.
+    """Bottlenecks of one width, the first strided; 4 * width channels leave the stage.
 
-    Args:
-        in_channels: of the first block.
-        width: of the 3x3 convolutions; 4 * width channels leave the stage.
-        blocks: how many, at least 1.
-        stride: of the first block.
-        dilations: of the first block, and of the others.
-        stride_at: see `Bottleneck`.
+    `dilations` are those of the first block and of the others.
     """
-    first = Bottleneck(
-        in_channels, width, stride=stride, dilation=dilations[0], stride_at=stride_at
-    )
-    others = (
-        Bottleneck(4 * width, width, dilation=dilations[1], stride_at=stride_at)
-        for _ in range(blocks - 1)
-    )
-    return nn.Sequential(first, *others)
+    first, others = dilations
+    made = [Bottleneck(in_channels, width, stride=stride, dilation=first, stride_at=stride_at)]
+    for _ in range(blocks - 1):
+        made.append(Bottleneck(4 * width, width, dilation=others, stride_at=stride_at))
+    return nn.Sequential(*made)
 
 
 def basic_stage(in_channels: int, width: int, blocks: int, *, stride: int = 1) -> nn.Sequential:

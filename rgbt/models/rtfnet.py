@@ -34,53 +34,38 @@ BASIC = (18, 34)
 """Depths of basic blocks; the others have bottlenecks, which end in four times as many channels."""
 
 
-class UpceptionA(nn.Module):
-    """1x1, 3x3 and 3x3 convolution and the identity: neither size nor channels change.
+class Upception(nn.Module):
+    """1x1, 3x3 and a third convolution, added to a shortcut.
 
-    Source: RTFNet, Upception block A.
-    """
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(channels)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(channels)
-        self.conv3 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn3 = nn.BatchNorm2d(channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) -> the same shape, >= 0."""
-        y = F.relu(self.bn1(self.conv1(x)))
-        y = F.relu(self.bn2(self.conv2(y)))
-        return F.relu(self.bn3(self.conv3(y)) + x)
-
-
-class UpceptionB(nn.Module):
-    """1x1, 3x3 and transposed convolution and a transposed shortcut: twice the size.
-
-    Source: RTFNet, Upception block B.
+    Source: RTFNet, Upception block A (3x3 convolution, identity) and block B (`up`: transposed
+    convolution, transposed shortcut: twice the size).
 
     Args:
         relu: whether the sum passes a ReLU.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, *, relu: bool) -> None:
+    def __init__(self, in_channels: int, channels: int, *, up: bool, relu: bool = True) -> None:
         super().__init__()
         self.relu = relu
-        self.conv1 = nn.Conv2d(in_channels, out_channels, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(out_channels)
-        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(out_channels)
-        self.conv3 = nn.ConvTranspose2d(out_channels, out_channels, 2, stride=2, bias=False)
-        self.bn3 = nn.BatchNorm2d(out_channels)
-        self.upsample = nn.Sequential(
-            nn.ConvTranspose2d(in_channels, out_channels, 2, stride=2, bias=False),
-            nn.BatchNorm2d(out_channels),
+        self.conv1 = nn.Conv2d(in_channels, channels, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.conv3 = (
+            nn.ConvTranspose2d(channels, channels, 2, stride=2, bias=False)
+            if up
+            else nn.Conv2d(channels, channels, 3, padding=1, bias=False)
         )
+        self.bn3 = nn.BatchNorm2d(channels)
+        self.upsample: nn.Module = nn.Identity()
+        if up:
+            self.upsample = nn.Sequential(
+                nn.ConvTranspose2d(in_channels, channels, 2, stride=2, bias=False),
+                nn.BatchNorm2d(channels),
+            )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, in, H, W) -> (N, out, 2 H, 2 W)."""
+        """(N, in, H, W) -> (N, out, H, W), with `up` (N, out, 2 H, 2 W)."""
         y = F.relu(self.bn1(self.conv1(x)))
         y = F.relu(self.bn2(self.conv2(y)))
         y = self.bn3(self.conv3(y)) + self.upsample(x)
@@ -122,19 +107,25 @@ class RTFNet(nn.Module):
         self.num_classes = num_classes
         self.record = self.record_from(thermal_stem=thermal_stem)
         self.thermal_stem = thermal_stem
-        for part, channels in (("rgb", 3), ("thermal", inputs.thermal_channels)):
-            stem = nn.Conv2d(channels, base_width, 7, stride=2, padding=3, bias=False)
+        for part, image_channels in (("rgb", 3), ("thermal", inputs.thermal_channels)):
+            stem = nn.Conv2d(image_channels, base_width, 7, stride=2, padding=3, bias=False)
             self.add_module(f"encoder_{part}_conv1", stem)
             self.add_module(f"encoder_{part}_bn1", nn.BatchNorm2d(base_width))
             self.add_module(f"encoder_{part}_maxpool", nn.MaxPool2d(3, stride=2, padding=1))
-            for number, stage in enumerate(_stages(depth, base_width), start=1):
-                self.add_module(f"encoder_{part}_layer{number}", stage)
-        channels = 8 * base_width * (1 if depth in BASIC else 4)
-        self.deconv1 = _upception(channels, channels // 2)
-        self.deconv2 = _upception(channels // 2, channels // 4)
-        self.deconv3 = _upception(channels // 4, channels // 8)
-        self.deconv4 = _upception(channels // 8, channels // 16)
-        self.deconv5 = _upception(channels // 16, num_classes, relu=final_relu)
+            stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
+            channels = base_width
+            for index, blocks in enumerate(BLOCKS[depth]):
+                width = base_width * 2**index
+                layer = stage(channels, width, blocks, stride=1 if index == 0 else 2)
+                self.add_module(f"encoder_{part}_layer{index + 1}", layer)
+                channels = expansion * width
+        for number in range(1, 6):
+            last = number == 5
+            after = num_classes if last else channels // 2
+            up = Upception(channels, after, up=True, relu=final_relu or not last)
+            block = nn.Sequential(Upception(channels, channels, up=False), up)
+            self.add_module(f"deconv{number}", block)
+            channels = after
         self.inputs = inputs
         self._start()
 
@@ -175,8 +166,8 @@ class RTFNet(nn.Module):
             y = unit(f"thermal_layer{number}", y)
             x = unit(f"rgb_layer{number}", x) + y
 
-        for block in (self.deconv1, self.deconv2, self.deconv3, self.deconv4, self.deconv5):
-            x = block(x)
+        for number in range(1, 6):
+            x = self.get_submodule(f"deconv{number}")(x)
         return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
 
     def _start(self) -> None:
@@ -195,18 +186,3 @@ class RTFNet(nn.Module):
         with torch.no_grad():
             rgb = self.get_parameter("encoder_rgb_conv1.weight")
             stem.copy_(rgb if rgb.shape == stem.shape else rgb.mean(1, keepdim=True))
-
-
-def _stages(depth: int, base_width: int) -> tuple[nn.Sequential, ...]:
-    """The four residual stages of one encoder."""
-    stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
-    stages, channels = [], base_width
-    for index, blocks in enumerate(BLOCKS[depth]):
-        width = base_width * 2**index
-        stages.append(stage(channels, width, blocks, stride=1 if index == 0 else 2))
-        channels = expansion * width
-    return tuple(stages)
-
-
-def _upception(in_channels: int, out_channels: int, *, relu: bool = True) -> nn.Sequential:
-    return nn.Sequential(UpceptionA(in_channels), UpceptionB(in_channels, out_channels, relu=relu))

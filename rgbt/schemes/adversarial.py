@@ -10,7 +10,7 @@ import torch
 from annotated_types import Interval
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError
 from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
 from rgbt.losses.adversarial import judged as judged_map
 from rgbt.ranges import NonNegative
@@ -84,9 +84,8 @@ class Adversarial:
     gradients: Gradients
 
     def __post_init__(self) -> None:
-        check_choice("scheme.verdict_loss", self.verdict_loss, VERDICT_LOSSES)
         source_value, target_value = self.source_value, self.target_value
-        outside = not 0 <= min(source_value, target_value) <= max(source_value, target_value) <= 1
+        outside = min(source_value, target_value) < 0 or max(source_value, target_value) > 1
         if self.verdict_loss == "cross_entropy" and outside:
             raise InputError(
                 "scheme.source_value and scheme.target_value must lie in [0, 1] with "
@@ -108,27 +107,21 @@ class Adversarial:
     @property
     def record(self) -> Record:
         """Labels of the target where they are read, confidence where it weighs."""
-        labels, weighed = self.supervise_target, self.weighed_by_confidence
-        confidence = Requirement(
-            "domains", "target_confidence", True, "scheme.weighed_by_confidence=true"
-        )
+        labels = self.supervise_target
+        setting = f"scheme.supervise_target={str(labels).lower()}"
+        required = [Requirement("domains", "target_labels", labels, setting)]
+        if self.weighed_by_confidence:
+            setting = "scheme.weighed_by_confidence=true"
+            required.append(Requirement("domains", "target_confidence", True, setting))
         return self.passes.record_with(
-            Requirement(
-                "domains", "target_labels", labels, f"scheme.supervise_target={str(labels).lower()}"
-            ),
-            *((confidence,) if weighed else ()),
+            *required,
             *record_of(self.others[CRITIC]).requires,
             networks=self.others,
             builders={CRITIC: self.critic_optimizer},
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """The segmentation's phases, then the discriminator's; or one of both kinds.
-
-        Args:
-            batch: of both domains, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """The segmentation's phases, then the discriminator's; or one of both kinds."""
         seen: dict[str, Tensor] = {}
         if self.alternates and batch.step % 2 == 0:
             with torch.no_grad():
@@ -139,42 +132,35 @@ class Adversarial:
             return
         self.others[CRITIC].requires_grad_(False)
         yield from self.passes.phases(
-            lambda: self._source(batch, generator_of, seen),
-            lambda: self._target(batch, generator_of, seen),
+            lambda: self._domain("source", batch, generator_of, seen),
+            lambda: self._domain("target", batch, generator_of, seen),
         )
         self.others[CRITIC].requires_grad_(True)
         if not self.alternates:
             yield self._discriminator_phase({name: each.detach() for name, each in seen.items()})
 
-    def _source(
-        self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
+    def _domain(
+        self, name: str, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        output, parts = self.passes.supervised("source", batch.source, generator_of)
-        seen["source"] = judged_map(scores(output), self.judged)
-        if self.both_ways:
-            parts["source/adversarial"] = self._adversarial("source", batch, seen)
-        return parts
-
-    def _target(
-        self, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
-    ) -> dict[str, Tensor]:
+        """What a domain costs the network; the map that the discriminator judges goes to `seen`."""
+        is_source = name == "source"
+        own = batch.source if is_source else batch.target
         parts: dict[str, Tensor] = {}
-        if self.supervise_target:
-            output, parts = self.passes.supervised("target", batch.target, generator_of)
+        if is_source or self.supervise_target:
+            output, parts = self.passes.supervised(name, own, generator_of)
         else:
-            output = self.passes.output("target", batch.target, generator_of)
-        seen["target"] = judged_map(scores(output), self.judged)
-        return parts | {"target/adversarial": self._adversarial("target", batch, seen)}
-
-    def _adversarial(self, name: str, batch: TwoDomains, seen: Mapping[str, Tensor]) -> Tensor:
-        """Weighted loss of a domain that the discriminator recognises."""
-        other = {"source": "target", "target": "source"}[name]
-        cost = self.cost_of(self.others[CRITIC](seen[name]), self.values[other])
-        if self.weighed_by_confidence:
-            confidence = batch.target.confidence
-            assert confidence is not None, "the record requires it"
-            cost = cost * (1.0 - confidence).mean()
-        return self.weight * cost
+            output = self.passes.output(name, own, generator_of)
+        seen[name] = judged_map(scores(output), self.judged)
+        if self.both_ways or not is_source:
+            cost = self.cost_of(
+                self.others[CRITIC](seen[name]), self.values["target" if is_source else "source"]
+            )
+            if self.weighed_by_confidence:
+                confidence = batch.target.confidence
+                assert confidence is not None, "the record requires it"
+                cost = cost * (1.0 - confidence).mean()
+            parts[f"{name}/adversarial"] = self.weight * cost
+        return parts
 
     def _discriminator_phase(self, seen: Mapping[str, Tensor]) -> Phase:
         share = 0.5 if self.halved else 1.0

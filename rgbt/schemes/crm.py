@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
@@ -70,53 +70,37 @@ class CRM:
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase: the criterion of the supervised passes and the distillation terms.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase: the criterion of the supervised passes and the distillation terms."""
         output, passes = self._forward(batch, generator_of)
-        weights = self._weights(passes).to(batch.rgb.device)
         # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
+        modality = [self.modality_weight] * (len(self.views) - 1)
+        weights = torch.tensor([1.0, *modality, *[1.0] * (passes - 1)]).to(batch.rgb.device)
         supervised = {name: tensor[:, : len(weights)] for name, tensor in output.aux.items()}
         parts = self.loss(Output(None, supervised), batch, generator_of("loss"))
         weighted = {name: (values * weights).sum() for name, values in parts.items()}
         if passes == 2:
-            weighted |= self._distil(output.aux["class_logits"][-1])
+            teacher, *others = output.aux["class_logits"][-1]
+            student, *singles = others[len(self.views) - 1 :]
+            if self.complementary_weight:
+                weighted["sdc"] = self.complementary_weight * sdc(teacher, student)
+            if self.nonlocal_weight:
+                weighted["sdn"] = self.nonlocal_weight * sdn(teacher, *singles)
         yield Phase(("main",), weighted)
 
     def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:
-        height, width = batch.rgb.shape[-2:]
+        """What the network returns, and the number of stacked passes."""
         generator = generator_of("stochastic depth")
         if not self.hides_cells:
             output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
             return output, 1
+        height, width = batch.rgb.shape[-2:]
         masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
-        clean_and_masked = MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks))
         output = self.model(
             batch.rgb.repeat(2, 1, 1, 1),
             batch.thermal.repeat(2, 1, 1, 1),
-            clean_and_masked,
+            MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks)),
             passes=2,
             views=self.views,
             generator=generator,
         )
         return output, 2
-
-    def _weights(self, passes: int) -> Tensor:
-        modality = [self.modality_weight] * (len(self.views) - 1)
-        masked = [1.0] * (passes - 1)
-        return torch.tensor([1.0, *modality, *masked])
-
-    def _distil(self, class_logits_PBQK: Tensor) -> dict[str, Tensor]:
-        views = len(self.views)
-        teacher = class_logits_PBQK[0]
-        terms = {}
-        if self.complementary_weight:
-            student = class_logits_PBQK[views]
-            terms["sdc"] = self.complementary_weight * sdc(teacher, student)
-        if self.nonlocal_weight:
-            rgb, thermal = class_logits_PBQK[views + 1 :]
-            terms["sdn"] = self.nonlocal_weight * sdn(teacher, rgb, thermal)
-        return terms

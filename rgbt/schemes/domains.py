@@ -38,6 +38,12 @@ class ViewAndHead(Protocol):
         ...
 
 
+def options_of(domain: ViewAndHead) -> dict[str, Any]:
+    """Keyword arguments of the network for a domain; what is None is left to the network."""
+    given = {"views": domain.view and (domain.view,), "head": domain.head}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 class SourceAndTarget(Protocol):
     """The domains of a run (see `rgbt.data.domains.Domains`)."""
 
@@ -106,10 +112,10 @@ class Passes:
         """What the network returns for a batch of the domain "source" or "target"."""
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
-        options: dict[str, Any] = {} if domain.view is None else {"views": (domain.view,)}
-        options |= {} if domain.head is None else {"head": domain.head}
         generator = generator_of(f"{name} network")
-        output: Output = self.model(batch.rgb, batch.thermal, generator=generator, **options)
+        output: Output = self.model(
+            batch.rgb, batch.thermal, generator=generator, **options_of(domain)
+        )
         return output
 
     def supervised(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 from torch import nn
 
 from rgbt.requirements import Record, record_of
-from rgbt.schemes.domains import SourceAndTarget
+from rgbt.schemes.domains import SourceAndTarget, options_of
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 
@@ -31,17 +30,10 @@ class Supervised:
         self.loss = loss
         self.masker = masker
         self.hides_cells = record_of(masker).hides_cells
-        source = domains.source
-        self.options: dict[str, Any] = {} if source.view is None else {"views": (source.view,)}
-        self.options |= {} if source.head is None else {"head": source.head}
+        self.options = options_of(domains.source)
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of the loss.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase with the parts of the loss."""
         height, width = batch.rgb.shape[-2:]
         masks = None
         if self.hides_cells:

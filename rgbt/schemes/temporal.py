@@ -87,41 +87,42 @@ class Temporal:
         )
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase with the parts of Eq. 4.
-
-        Args:
-            batch: see `rgbt.types.Batch`, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase with the parts of Eq. 4."""
         image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
         angles = self.view.draw(len(batch.name), generator_of("virtual view"))
         warp = self.view.warp(angles, image_hw)
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
-        warped = self._warped(first.logits, warp) if self.reads_warped else None
+        warped = None
+        if self.reads_warped:  # class probabilities of the first frame, as the second sees them
+            scores = first.logits.detach() if self.detach else first.logits
+            if self.warps == "probabilities":
+                warped = warp.bilinear(scores.float().softmax(1))
+            else:
+                warped = warp.bilinear(scores.float()).softmax(1)
         parts = self.loss(first, second, warped, self.view.valid(warp), generator_of("loss"))
         yield Phase(("main",), parts)
-
-    def _warped(self, logits: Tensor, warp: Warp) -> Tensor:
-        """(B, K, H, W) class probabilities of the first frame, as the second should see them."""
-        logits = logits.detach() if self.detach else logits
-        if self.warps == "probabilities":
-            return warp.bilinear(logits.float().softmax(1))
-        return warp.bilinear(logits.float()).softmax(1)
 
     def _frames(
         self, first: Batch, second: Batch, generator_of: GeneratorOf
     ) -> tuple[Frame, Frame]:
         generator = generator_of("stochastic depth")
-        batches = (first, second)
         if self.apart and not self.stacks:
-            outputs = [self.model(each.rgb, each.thermal, generator=generator) for each in batches]
-            return self._frame(outputs[0], first), self._frame(outputs[1], second)
-        rgb = torch.cat([each.rgb for each in batches])
-        thermal = torch.cat([each.thermal for each in batches])
+            one, two = (self.model(x.rgb, x.thermal, generator=generator) for x in (first, second))
+            return self._frame(one, first), self._frame(two, second)
+        rgb = torch.cat([first.rgb, second.rgb])
+        thermal = torch.cat([first.thermal, second.thermal])
         passes = {"passes": 2} if self.stacks else {}
         output = self.model(rgb, thermal, generator=generator, **passes)
-        halves = _passes(output) if self.stacks else _halves(output, len(first.name))
-        return self._frame(halves[0], first), self._frame(halves[1], second)
+        if self.stacks:  # (L, P = 2, B, ...)
+            aux = [{k: v[:, p : p + 1] for k, v in output.aux.items()} for p in range(2)]
+            one, two = (Output(None, each) for each in aux)
+        else:  # scores, and what networks return beside, have the batch first
+            halves = slice(len(first.name)), slice(len(first.name), None)
+            one, two = (
+                Output(output.logits[half], {k: v[half] for k, v in output.aux.items()})
+                for half in halves
+            )
+        return self._frame(one, first), self._frame(two, second)
 
     def _frame(self, output: Output, batch: Batch) -> Frame:
         logits = output.logits
@@ -129,22 +130,3 @@ class Temporal:
             image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
             logits = cast(DenseLogits, self.model.dense_logits)(output, image_hw)
         return Frame(output, batch, logits)
-
-
-def _passes(output: Output) -> tuple[Output, Output]:
-    """Two stacked passes (L, P = 2, B, ...) as two outputs."""
-    first, second = (
-        Output(None, {name: values[:, number : number + 1] for name, values in output.aux.items()})
-        for number in range(2)
-    )
-    return first, second
-
-
-def _halves(output: Output, count: int) -> tuple[Output, Output]:
-    """A batch of both frames as two outputs; what networks return beside has the batch first."""
-    assert output.logits is not None, "a network that does not stack passes returns scores"
-    first, second = (
-        Output(output.logits[part], {name: values[part] for name, values in output.aux.items()})
-        for part in (slice(count), slice(count, None))
-    )
-    return first, second

@@ -13,7 +13,7 @@ from rgbt.losses.unlabelled import guidance
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
-from rgbt.types import IGNORE, GeneratorOf, Loss, Output, Phase, TwoDomains
+from rgbt.types import IGNORE, GeneratorOf, Loss, Phase, TwoDomains
 
 UnlabelledLoss = Callable[[Tensor], dict[str, Tensor]]
 """(B, K, H, W) probabilities -> named, weighted scalars (see `rgbt.losses.unlabelled`)."""
@@ -42,12 +42,7 @@ class LabelledDomains:
         return self.passes.record_with(Requirement("domains", "target_labels", True))
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser.
-
-        Args:
-            batch: of both domains, images in [0, 1].
-            generator_of: purpose -> generator of this step.
-        """
+        """One phase, or one per optimiser, of images in [0, 1]."""
         yield from self.passes.phases(
             lambda: self.passes.supervised("source", batch.source, generator_of)[1],
             lambda: self.passes.supervised("target", batch.target, generator_of)[1],
@@ -99,15 +94,13 @@ class UnlabelledTarget:
 
     def _target(self, batch: TwoDomains, generator_of: GeneratorOf) -> dict[str, Tensor]:
         output = self.passes.output("target", batch.target, generator_of)
-        parts = self.unlabelled(scores(output).float().softmax(1))
-        if self.guidance_weight:
-            parts = parts | {"guidance": self.guidance_weight * self._guidance(output)}
-        return {f"target/{name}": value for name, value in parts.items()}
-
-    def _guidance(self, output: Output) -> Tensor:
-        auxiliary = output.aux["aux_logits"].float()
         probabilities = scores(output).float().softmax(1)
-        label = guidance(probabilities, auxiliary.softmax(1), self.guidance_threshold)
-        total = F.cross_entropy(auxiliary, label, ignore_index=IGNORE, reduction="sum")
-        # Where neither head is sure anywhere, the sum is 0 and so is the cost.
-        return total / torch.clamp((label != IGNORE).sum(), min=1)
+        parts = dict(self.unlabelled(probabilities))
+        if self.guidance_weight:
+            auxiliary = output.aux["aux_logits"].float()
+            label = guidance(probabilities, auxiliary.softmax(1), self.guidance_threshold)
+            total = F.cross_entropy(auxiliary, label, ignore_index=IGNORE, reduction="sum")
+            # Where neither head is sure anywhere, the sum is 0 and so is the cost.
+            cost = total / torch.clamp((label != IGNORE).sum(), min=1)
+            parts["guidance"] = self.guidance_weight * cost
+        return {f"target/{name}": value for name, value in parts.items()}

@@ -10,17 +10,14 @@ Run: python -m tests.benchmarks.bench_adaptation [cpu|cuda] [threads] [batch siz
 from __future__ import annotations
 
 import json
-import os
 import resource
-import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-# Threads that wait must not count as work.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+import numpy as np
+
+from tests.benchmarks.timing import in_process, seconds
 
 CASES = {
     "one head": ("sh_adversarial", ()),
@@ -71,13 +68,13 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
         per_round = 2 if getattr(made.scheme, "alternates", False) else 1
         rounds = ROUNDS[device]
         batches = made.batches(range(per_round * (rounds + 1)))
-        seconds, cpu = [], []
-        for number in range(rounds + 1):
-            started, began = time.perf_counter(), time.process_time()
-            for step in range(per_round):
-                trainer._step(number * per_round + step, batches, 0)
-            seconds.append(time.perf_counter() - started)
-            cpu.append(time.process_time() - began)
+        steps = iter(range(per_round * (rounds + 1)))
+
+        def one_round() -> None:
+            for _ in range(per_round):
+                trainer._step(next(steps), batches, 0)
+
+        cpu, wall = np.median([seconds(one_round) for _ in range(rounds + 1)][1:], axis=0)
     peak = (
         torch.cuda.max_memory_allocated() / 2**20
         if device == "cuda"
@@ -85,8 +82,8 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
     )
     parameters = sum(each.numel() for each in made.session.model.parameters()) / 1e6
     return {
-        "s": statistics.median(seconds[1:]),
-        "cpu": statistics.median(cpu[1:]),
+        "s": float(wall),
+        "cpu": float(cpu),
         "mib": peak,
         "parameters": parameters,
     }
@@ -94,34 +91,25 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
 
 def main(device: str = "cpu", threads: str = "2", batch_size: str = "1") -> None:
     """Measure every case and print a table."""
-    sys.stdout.write(
-        f"{device}, {threads} threads, {batch_size} image(s) of each domain, 320x640\n"
-    )
+    print(f"{device}, {threads} threads, {batch_size} image(s) of each domain, 320x640")
     first = None
     for case in CASES:
-        words = [sys.executable, "-m", "tests.benchmarks.bench_adaptation"]
-        done = subprocess.run(
-            [*words, "--case", case, device, threads, batch_size],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            sys.stdout.write(f"{case}: failed: {done.stderr.strip().splitlines()[-1]}\n")
+        words = ("--case", case, device, threads, batch_size)
+        found = in_process("tests.benchmarks.bench_adaptation", *words)
+        if "failed" in found:
+            print(f"{case}: failed: {found['failed']}")
             continue
-        found = json.loads(done.stdout.strip().splitlines()[-1])
         counted = found["cpu" if device == "cpu" else "s"]
         first = first or counted
-        sys.stdout.write(
+        print(
             f"{case:32} {found['parameters']:7.1f} M  {found['s']:7.2f} s  "
-            f"{found['cpu']:7.2f} s CPU  {counted / first:5.2f}x  {found['mib']:7.0f} MiB\n"
+            f"{found['cpu']:7.2f} s CPU  {counted / first:5.2f}x  {found['mib']:7.0f} MiB",
+            flush=True,
         )
-        sys.stdout.flush()
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--case"]:
-        result = measure(sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))
-        sys.stdout.write(json.dumps(result) + "\n")
+        print(json.dumps(measure(sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))))
     else:
         main(*sys.argv[1:])

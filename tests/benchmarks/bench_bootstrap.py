@@ -8,7 +8,6 @@ Run: python -m tests.benchmarks.bench_bootstrap
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from threadpoolctl import threadpool_limits  # of scikit-learn
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from tests.benchmarks.timing import medians
 
 IMAGES, REGIONS, CLASSES = 393, 5, 9
 RESAMPLES = 10_000
@@ -68,17 +68,6 @@ def loop(counts: Counts) -> np.ndarray:
     return np.array(resampled).T
 
 
-def seconds(work: Callable[[], object]) -> tuple[float, float]:
-    """Medians over rounds: CPU seconds, wall seconds."""
-    cpu, wall = [], []
-    for _ in range(ROUNDS):
-        start = time.process_time(), time.perf_counter()
-        work()
-        cpu.append(time.process_time() - start[0])
-        wall.append(time.perf_counter() - start[1])
-    return float(np.median(cpu)), float(np.median(wall))
-
-
 def check(counts: Counts, settings: Resampling) -> None:
     """Loop and matrix product see the same spread: quantiles of the one in the other."""
     looped = loop(counts)
@@ -96,7 +85,7 @@ def main() -> int:
     settings = Resampling(resamples=RESAMPLES, blocks="none")
     a, b = drawn(3, 0.70), drawn(3, 0.71)
     check(a[0], settings)
-    looped = seconds(lambda: loop(a[0]))[0] * RESAMPLES / LOOPED
+    looped = medians({"": lambda: loop(a[0])}, 1)[""][0] * RESAMPLES / LOOPED
     calls: dict[str, Callable[[], object]] = {
         "estimate, 1 training": lambda: estimate(a[:1], METRICS, settings),
         "estimate, 3 trainings": lambda: estimate(a, METRICS, settings),
@@ -110,7 +99,7 @@ def main() -> int:
     print(
         f"  {'loop over Counts.select':24s} {looped:8.1f} CPU s ({LOOPED} resamples extrapolated)"
     )
-    found = {name: seconds(call) for name, call in calls.items()}
+    found = medians(calls, ROUNDS)
     for name, (cpu, wall) in found.items():
         print(f"  {name:24s} {cpu:8.2f} CPU s {wall:8.2f} s")
     asked = found["estimate, 1 training"][0]

@@ -6,8 +6,6 @@ Run: python -m tests.benchmarks.bench_counts
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -18,6 +16,7 @@ from sklearn.metrics import confusion_matrix
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import ring_rectangle
+from tests.benchmarks.timing import medians
 
 HW = (480, 640)
 CLASSES = 9
@@ -65,17 +64,6 @@ def by_slices(label, prediction) -> np.ndarray[Any, Any]:
     return np.stack(matrices[::-1])
 
 
-def median_ms(calls: dict[str, Callable[[], Any]]) -> dict[str, float]:
-    """Medians of calls that take turns, so that other load on the machine meets all of them."""
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: float(np.median(values) * 1e3) for name, values in seconds.items()}
-
-
 def main() -> int:
     torch.set_num_threads(1)
     regions = Regions(partition="ring", regions=RINGS, aspect="image", absent="released")
@@ -96,7 +84,7 @@ def main() -> int:
     expected = counter(label, prediction)
     for name, call in {**ours, **theirs}.items():
         assert np.array_equal(call(), expected), f"{name}: counts differ"
-    ms = median_ms({**ours, **theirs})
+    ms = {name: 1e3 * wall for name, (_, wall) in medians({**ours, **theirs}, ROUNDS).items()}
     print(f"{HW[0]}x{HW[1]}, {CLASSES} classes, {RINGS} rings; equal counts; medians, one thread")
     for name, value in ms.items():
         print(f"  {name:21s} {value:8.3f} ms")

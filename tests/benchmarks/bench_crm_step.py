@@ -9,23 +9,18 @@ Run: python -m tests.benchmarks.bench_crm_step [tiny] [swin_s]
 
 from __future__ import annotations
 
-import os
-import statistics
 import sys
-import time
 
-# Threads that wait must not count as work: the figures are CPU seconds.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from tests.benchmarks.timing import in_turns  # isort: skip - before torch
 
 from collections.abc import Callable
-from pathlib import Path
 
-import hydra
+import numpy as np
 import torch
 from torch import Tensor
 
 from rgbt.config.component import build
-from rgbt.config.compose import conf_dir, register_resolvers
+from rgbt.config.compose import compose
 from rgbt.engine.allocator import keep_memory
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.losses.distillation import sdc, sdn
@@ -47,13 +42,8 @@ CASES = {
 def make(
     scale: str, model: str, batch_size: int
 ) -> tuple[Mask2Former, SetCriterion, Batch, MaskPair]:
-    register_resolvers()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose(
-            "config",
-            ["+experiment=crm", f"scale={scale}", f"model={model}", "dataset=mfnet"]
-            + ["dataset.root=unused", "model.drop_path_rate=0.0"],
-        )
+    words = (f"scale={scale}", f"model={model}", "dataset=mfnet", "dataset.root=unused")
+    config = compose(["+experiment=crm", *words, "model.drop_path_rate=0.0"])
     torch.manual_seed(0)
     network: Mask2Former = build(config.model)
     height, width = config.scale.crop_hw
@@ -118,33 +108,25 @@ def reference_loss(
     return total + sdc(final[0], final[3]) + sdn(final[0], final[4], final[5])
 
 
-def timed(step: Callable[[], Tensor], network: Mask2Former, rounds: int) -> tuple[float, float]:
-    """Median CPU seconds and the loss; CPU time, because these machines are shared."""
-    seconds, loss = [], 0.0
-    for _ in range(rounds + 1):
-        network.zero_grad()
-        start = time.process_time()
-        value = step()
-        value.backward()
-        seconds.append(time.process_time() - start)
-        loss = value.item()
-    return statistics.median(seconds[1:]), loss
-
-
 def measure(name: str, precision: str) -> str:
     scale, model, batch_size, rounds = CASES[name]
     network, criterion, batch, masks = make(scale, model, batch_size)
     layers = len(network.sem_seg_head.predictor.transformer_ffn_layers) + 1
-    found = []
-    for loss in (reference_loss, batched_loss):
+    last: dict[str, float] = {}
 
-        def step(loss: Callable[..., Tensor] = loss) -> Tensor:
-            draws = points(criterion, network, batch, layers)
-            with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-                return loss(network, criterion, batch, masks, draws)
+    def step(way: str, loss: Callable[..., Tensor]) -> None:
+        network.zero_grad()
+        draws = points(criterion, network, batch, layers)
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            value = loss(network, criterion, batch, masks, draws)
+        value.backward()
+        last[way] = value.item()
 
-        found.append(timed(step, network, rounds))
-    (slow, slow_loss), (fast, fast_loss) = found
+    ways = {"slow": reference_loss, "fast": batched_loss}
+    timed = in_turns({n: lambda n=n, w=w: step(n, w) for n, w in ways.items()}, rounds)
+    # CPU time, because these machines are shared.
+    slow, fast = (float(np.median(timed[way][:, 0])) for way in ways)
+    slow_loss, fast_loss = last["slow"], last["fast"]
     return (
         f"{name:<7} batch {batch_size} {precision}  "
         f"pass by pass {slow:7.2f} s  batched {fast:7.2f} s  "
@@ -160,5 +142,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     main()

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from rgbt.data.synth.dataset import synth
 from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.benchmarks.released_loading import ReleasedSamples
+from tests.benchmarks.timing import seconds
 
 WANTED = 10.0
 ROUNDS = 3
@@ -71,20 +71,16 @@ def released(dataset: MFNet) -> Way:
     return batches
 
 
-def seconds(batches: Iterator[Any], clock: Callable[[], float]) -> float:
-    """Of one sample, after a first batch."""
+def per_sample(batches: Iterator[Any]) -> tuple[float, float]:
+    """CPU and wall seconds of one sample, after a first batch."""
     next(batches)
-    start = clock()
-    for _ in range(STEPS):
-        next(batches)
-    return (clock() - start) / STEPS / BATCH
+    cpu, wall = seconds(lambda: [next(batches) for _ in range(STEPS)])
+    return cpu / STEPS / BATCH, wall / STEPS / BATCH
 
 
 def speeds(dataset: MFNet, cache: Path) -> None:
     mapped = CachedDataset(dataset, cache, num_threads=2)
-    start = time.perf_counter()
-    mapped.ensure(dataset.names("train"))
-    built = time.perf_counter() - start
+    _, built = seconds(lambda: mapped.ensure(dataset.names("train")))
     ways: dict[str, Way] = {
         "release": released(dataset),
         "files, loader": ours(dataset, "loader"),
@@ -95,8 +91,8 @@ def speeds(dataset: MFNet, cache: Path) -> None:
     found = np.full((2, len(ways), ROUNDS), math.nan)
     for turn in range(ROUNDS):
         for row, way in enumerate(ways.values()):
-            found[0, row, turn] = seconds(way(0), time.process_time)
-            found[1, row, turn] = seconds(way(2), time.perf_counter)
+            found[0, row, turn] = per_sample(way(0))[0]
+            found[1, row, turn] = per_sample(way(2))[1]
     best = found.min(-1) * 1e3
     print(f"cache of {len(dataset.names('train'))} images built in {built:.1f} s")
     print(f"{'':<16}{'one process, CPU':>24}{'two workers':>24}")

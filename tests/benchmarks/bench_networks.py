@@ -10,17 +10,13 @@ Run: python -m tests.benchmarks.bench_networks [name ...] (ratios: pip install t
 from __future__ import annotations
 
 import json
-import os
 import resource
 import statistics
-import subprocess
 import sys
-import time
-
-# Threads that wait must not count as work: the figures are CPU seconds.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 from collections.abc import Callable
+
+from tests.benchmarks.timing import in_process, seconds  # isort: skip - before torch
+
 from importlib.util import find_spec
 from typing import Any
 
@@ -30,6 +26,7 @@ from torch import Tensor, nn
 from rgbt.engine.allocator import keep_memory
 from tests.models.golden import network
 
+MODULE = "tests.benchmarks.bench_networks"
 SIZE = (256, 320)
 ROUNDS = 3
 NETWORKS = (
@@ -56,15 +53,12 @@ def total(output: Any) -> Tensor:
     return torch.stack([tensor.float().sum() for tensor in tensors]).sum()
 
 
-def seconds(step: Step, *, backward: bool) -> float:
+def cpu(step: Step, *, backward: bool) -> float:
     """CPU seconds of one step."""
-    start = time.process_time()
     if backward:
-        step().backward()
-    else:
-        with torch.no_grad():
-            step()
-    return time.process_time() - start
+        return seconds(lambda: step().backward())[0]
+    with torch.no_grad():
+        return seconds(step)[0]
 
 
 def one(name: str) -> dict[str, float]:
@@ -72,10 +66,10 @@ def one(name: str) -> dict[str, float]:
     net = network(name)
     pair, generator = images(), torch.Generator().manual_seed(1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    forward = [seconds(lambda: total(net.eval()(*pair)), backward=False) for _ in range(ROUNDS + 1)]
+    forward = [cpu(lambda: total(net.eval()(*pair)), backward=False) for _ in range(ROUNDS + 1)]
     eval_peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     both = [
-        seconds(lambda: total(net.train()(*pair, generator=generator)), backward=True)
+        cpu(lambda: total(net.train()(*pair, generator=generator)), backward=True)
         for _ in range(ROUNDS)
     ]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -162,17 +156,10 @@ def compare(name: str) -> dict[str, float]:
     for _ in range(ROUNDS + 1):
         for label, module, call in (("", ours, step), ("_hf", theirs, their_step)):
             module.eval()
-            found[f"forward{label}"].append(seconds(call, backward=False))
+            found[f"forward{label}"].append(cpu(call, backward=False))
             module.train()
-            found[f"step{label}"].append(seconds(call, backward=True))
+            found[f"step{label}"].append(cpu(call, backward=True))
     return {key: statistics.median(values[1:]) for key, values in found.items()}
-
-
-def in_process(kind: str, name: str) -> dict[str, float]:
-    call = [sys.executable, "-m", "tests.benchmarks.bench_networks", f"--{kind}", name]
-    done = subprocess.run(call, capture_output=True, text=True, check=True)
-    measured: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    return measured
 
 
 def main() -> None:
@@ -183,7 +170,7 @@ def main() -> None:
         return
     print("network, 1 x 256 x 320, CPU s      params M   forward  fwd+bwd   MiB forward  MiB peak")
     for name in words or NETWORKS:
-        row = in_process("one", name)
+        row = in_process(MODULE, "--one", name)
         print(
             f"{name:<32} {row['millions']:10.2f} {row['forward']:9.2f} {row['step']:8.2f} "
             f"{row['forward_mib']:13.0f} {row['mib']:9.0f}",
@@ -193,7 +180,7 @@ def main() -> None:
         print("transformers is not installed: no ratios")
         return
     for name in [name for name in COMPARED if name in (words or COMPARED)]:
-        row = in_process("compare", name)
+        row = in_process(MODULE, "--compare", name)
         print(
             f"{name:<20} against transformers: forward {row['forward']:.2f} / "
             f"{row['forward_hf']:.2f} s = {row['forward_hf'] / row['forward']:.2f}x, "

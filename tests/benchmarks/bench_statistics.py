@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Regions
 from rgbt.types import Sample
 from tests.analysis.statistics.scenes import InMemory
+from tests.benchmarks.timing import seconds
 
 HW = (480, 640)
 CLASSES = 9
@@ -114,13 +114,6 @@ def same(stats: SpatialStatistics, expected: Arrays) -> None:
         np.testing.assert_allclose(stats.noise[name], expected[name], rtol=1e-9)
 
 
-def timed(call: Callable[[], Any], clock: Callable[[], float]) -> tuple[float, Any]:
-    """Milliseconds per image by `clock`, and what came back."""
-    start = clock()
-    result = call()
-    return 1e3 * (clock() - start) / IMAGES, result
-
-
 def written(samples: list[Sample], folder: Path) -> MFNet:
     """The samples as files, in the packed layout."""
     for name in ("images", "labels"):
@@ -138,6 +131,11 @@ def main() -> int:
     samples = scenes(np.random.default_rng(0))
     memory = InMemory(samples)
     region_map = RINGS.map(HW)
+    results: dict[str, Any] = {}
+
+    def timed(call: Callable[[], Any], clock: int) -> float:
+        """CPU (0) or wall (1) milliseconds per image; what came back is in `results`."""
+        return 1e3 * seconds(lambda: results.update(last=call()))[clock] / IMAGES
 
     def ours(dataset: Any, workers: int) -> Callable[[], SpatialStatistics]:
         return lambda: collect(
@@ -146,21 +144,21 @@ def main() -> int:
 
     ours(InMemory(samples[:10]), 1)()
     print(f"{IMAGES} images of {HW[0]}x{HW[1]}, both modalities, 9 rings, all estimators")
-    cpu, wall = time.process_time, time.perf_counter
-    masks_ms, expected = timed(lambda: by_masks(samples, region_map), cpu)
-    one_ms, stats = timed(ours(memory, 1), cpu)
-    same(stats, expected)
+    masks_ms = timed(lambda: by_masks(samples, region_map), 0)
+    expected = results["last"]
+    one_ms = timed(ours(memory, 1), 0)
+    same(results["last"], expected)
     print("equal results; CPU ms per image, images in memory, one thread")
     print(f"  mask per ring  {masks_ms:7.2f}")
     print(f"  ours           {one_ms:7.2f}   ratio {masks_ms / one_ms:.1f}")
     with tempfile.TemporaryDirectory() as folder:
         files = written(samples, Path(folder))
-        read_ms, _ = timed(lambda: [files.read(name) for name in files.names("train")], wall)
+        read_ms = timed(lambda: [files.read(name) for name in files.names("train")], 1)
         print(f"wall ms per image, {os.cpu_count()} cores (reading PNG files alone {read_ms:.2f})")
         for where, dataset in (("memory", memory), ("files", files)):
             for workers in (1, 2):
-                found, stats = timed(ours(dataset, workers), wall)
-                same(stats, expected)
+                found = timed(ours(dataset, workers), 1)
+                same(results["last"], expected)
                 print(f"  from {where:6s} {workers} worker(s) {found:7.2f}")
     return 0
 

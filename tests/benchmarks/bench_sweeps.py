@@ -19,11 +19,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
 from sweeps import attributes as names
 from sweeps.worker.storage import load_study, open_storage, study_names
+from tests.benchmarks.timing import seconds
 
 POINTS = 6
 TRIALS = 16
@@ -35,14 +36,9 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 def call(*words: str) -> float:
     """Wall seconds of a command."""
-    began = time.perf_counter()
-    subprocess.run(
-        [sys.executable, "-m", "rgbt.run", *words],
-        env=ENVIRONMENT,
-        check=True,
-        capture_output=True,
-    )
-    return time.perf_counter() - began
+    command = [sys.executable, "-m", "rgbt.run", *words]
+    run = partial(subprocess.run, command, env=ENVIRONMENT, check=True, capture_output=True)
+    return seconds(run)[1]
 
 
 def inside(run: Path) -> float:

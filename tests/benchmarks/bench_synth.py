@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,6 +17,7 @@ import numpy as np
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import render_scene
 from rgbt.data.synth.writer import SynthPlan, write_index
+from tests.benchmarks.timing import in_turns
 
 WANTED = 100.0
 """Scenes per second and core at 120 x 160, rendered only (issue: dataset synth)."""
@@ -26,13 +27,9 @@ ROUNDS = 5
 
 def rate(work: Callable[[int], object], num_scenes: int) -> tuple[float, float]:
     """Scenes per CPU second: median round, and each scene at the best of all rounds."""
-    seconds = np.empty((ROUNDS, num_scenes))
-    for turn in range(ROUNDS):
-        for index in range(num_scenes):
-            start = time.process_time()
-            work(index)
-            seconds[turn, index] = time.process_time() - start
-    return num_scenes / float(np.median(seconds.sum(1))), num_scenes / float(seconds.min(0).sum())
+    each = {str(index): partial(work, index) for index in range(num_scenes)}
+    cpu = np.stack([timed[:, 0] for timed in in_turns(each, ROUNDS, warm=False).values()], 1)
+    return num_scenes / float(np.median(cpu.sum(1))), num_scenes / float(cpu.min(0).sum())
 
 
 def main(num_scenes: int) -> None:

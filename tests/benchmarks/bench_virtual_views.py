@@ -14,15 +14,12 @@ Run: python -m tests.benchmarks.bench_virtual_views [default]
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-
-# Threads that wait must not count as work: CPU time is given beside the wall clock.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 from collections.abc import Callable
 from typing import Any
+
+from tests.benchmarks.timing import in_turns, seconds  # isort: skip - before torch
 
 import cv2
 import numpy as np
@@ -111,16 +108,8 @@ class Work:
         return logits
 
 
-Times = list[tuple[float, float]]
-"""Milliseconds of wall clock and of all threads together, one pair per round."""
-
-
-def milliseconds(call: Callable[[], Any], device: str) -> tuple[float, float]:
-    """Wall clock and CPU; on a GPU the time between two events in place of the wall clock."""
-    if device == "cpu":
-        start, work = time.perf_counter(), time.process_time()
-        call()
-        return (time.perf_counter() - start) * 1e3, (time.process_time() - work) * 1e3
+def on_gpu(call: Callable[[], object]) -> tuple[float, float]:
+    """CPU seconds, and those between two events in place of the wall clock."""
     torch.cuda.synchronize()
     work = time.process_time()
     begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -128,18 +117,7 @@ def milliseconds(call: Callable[[], Any], device: str) -> tuple[float, float]:
     call()
     end.record()
     end.synchronize()
-    return float(begin.elapsed_time(end)), (time.process_time() - work) * 1e3
-
-
-def measured(calls: dict[str, Callable[[], Any]], device: str) -> dict[str, Times]:
-    """Times of calls that take turns, so that other load on the machine meets all of them."""
-    for call in calls.values():
-        call()
-    times: dict[str, Times] = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            times[name].append(milliseconds(call, device))
-    return times
+    return time.process_time() - work, float(begin.elapsed_time(end)) / 1e3
 
 
 def check(work: Work) -> None:
@@ -161,7 +139,8 @@ def compare(device: str) -> bool:
         "ours as released, with gradient": lambda: work.ours("corners", "twice"),
         "logits by grid_sample alone": work.plain,
     }
-    times = {name: np.array(values) for name, values in measured(calls, device).items()}
+    timed = in_turns(calls, ROUNDS, timer=on_gpu if device == "cuda" else seconds)
+    times = {name: 1e3 * pairs[:, ::-1] for name, pairs in timed.items()}  # wall, CPU
     where = torch.cuda.get_device_name() if device == "cuda" else f"{THREADS} threads"
     print(f"{BATCH} x {HW[0]}x{HW[1]}, {CLASSES} classes, {where}, OpenCV {cv2.__version__}")
     print("ms a sample (medians): wall, CPU; times faster than the loop: by wall (range), by CPU")

@@ -38,10 +38,10 @@ class Replayed:
     def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
         return self._take("loss", self._loss, (num_sets, num_masks, num_points, 2))
 
-    def matcher_of(self, layer: int, one_pass: int, *_: int) -> Tensor:
+    def matcher_of(self, layer: int, one_pass: int) -> Tensor:
         return self._matcher[layer * self._passes + one_pass]
 
-    def loss_of(self, layer: int, one_pass: int, *_: int) -> Tensor:
+    def loss_of(self, layer: int, one_pass: int) -> Tensor:
         return self._loss[layer * self._passes + one_pass]
 
     def one_pass(self, index: int) -> Replayed:
@@ -57,19 +57,6 @@ class Replayed:
         return taken
 
 
-class Fresh:
-    """New uniform draws for every (layer, pass), as the releases make them."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self._generator = generator
-
-    def matcher_of(self, layer: int, one_pass: int, *shape: int) -> Tensor:
-        del layer, one_pass
-        return 2 * torch.rand(*shape, 2, generator=self._generator) - 1
-
-    loss_of = matcher_of
-
-
 @dataclass(frozen=True)
 class _Image:
     """One image's targets and, for the weighted loss, the weights of its pixels."""
@@ -80,7 +67,7 @@ class _Image:
 
 
 def reference_criterion(
-    criterion: SetCriterion, output: Output, batch: Batch, draws: Replayed | Fresh
+    criterion: SetCriterion, output: Output, batch: Batch, draws: Replayed
 ) -> dict[str, Tensor]:
     """The weighted parts "class", "mask", "dice", each (P,), as `criterion` returns them."""
     class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
@@ -93,7 +80,7 @@ def reference_criterion(
         parts = torch.zeros(3)
         for layer in range(0 if criterion.deep_supervision else layers - 1, layers):
             prediction = (class_logits[layer, one_pass], mask_logits[layer, one_pass])
-            points = _points(criterion, images, draws, (layer, one_pass))
+            points = draws.matcher_of(layer, one_pass), draws.loss_of(layer, one_pass)
             parts = parts + _layer(criterion, prediction, images, points, spatial)
         totals.append(parts)
     total = torch.stack(totals)
@@ -122,15 +109,6 @@ def _spatial_of_pass(spatial: SpatialWeight, one_pass: int, passes: int) -> Spat
     if spatial.passes == "fused" and one_pass not in fused[passes]:
         return PLAIN
     return spatial
-
-
-def _points(
-    criterion: SetCriterion, images: list[_Image], draws: Replayed | Fresh, where: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    sampling = criterion.sampling
-    count = sum(len(image.labels) for image in images)
-    matcher = draws.matcher_of(*where, len(images), criterion.matcher.num_points)
-    return matcher, draws.loss_of(*where, count, sampling.candidates + sampling.fresh)
 
 
 def _layer(

@@ -9,7 +9,8 @@ from torch import Tensor
 from rgbt.geometry.homography import homography
 from rgbt.geometry.rectangle import inner_rectangle
 from rgbt.geometry.warp import Warp
-from tests.geometry.views import FOLDER, HW, RELEASED, Recorded
+from tests.geometry.views import HW, RELEASED, Recorded
+from tests.models.golden import FOLDER
 
 VIEWS = 6
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,9 +11,7 @@ from torch import Tensor
 
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.homography import Order, homography
-
-SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
-FOLDER = SHARED / "golden"
+from tests.models.golden import FOLDER, fill_rule
 
 HW = (480, 640)
 RELEASED = Camera(fx=702.6030497884977, fy=703.4541726858521, cx=320, cy=240, height=480, width=640)
@@ -47,7 +41,7 @@ class Recorded:
         self.angles = torch.tensor(recipe["triples_yaw_pitch_roll_degrees"], dtype=torch.float32)
         fx, fy, cx, cy = (value * width / 640 for value in recipe["fx_fy_cx_cy_480x640"])
         self.camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, height=height, width=width)
-        self.fill = _fill()
+        self.fill = fill_rule()
 
     def image(self) -> Tensor:
         """(1, 4, H, W) float32, whole grey levels 0..255."""
@@ -75,12 +69,3 @@ class Recorded:
         recorded = torch.from_numpy(self[key]).double().flatten()
         positions = self.fill.sample_positions(f"{self.name}.{key}", values.numel())
         return values.double().flatten()[torch.from_numpy(positions)], recorded
-
-
-def _fill() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fill", FOLDER / "fill.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

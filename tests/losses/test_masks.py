@@ -5,10 +5,11 @@ from typing import Any
 
 import torch
 
-from rgbt.losses import masks as module
+from rgbt.losses import masks, matcher
 from rgbt.losses.masks import mask_and_dice
-from rgbt.losses.points import PointSource
+from rgbt.losses.points import Points
 from rgbt.losses.spatial import PointWeights
+from tests.losses.problems import criterion_of, problem_of, seeded
 
 
 def test_plain_losses_by_hand() -> None:
@@ -30,14 +31,6 @@ def test_weighted_losses_by_hand() -> None:
     assert torch.allclose(dice, torch.tensor([11 / 15]))
 
 
-def test_weights_of_one_are_the_plain_losses() -> None:
-    generator = torch.Generator().manual_seed(0)
-    x, t = torch.randn(4, 30, generator=generator), torch.rand(4, 30, generator=generator)
-    ones = PointWeights(torch.ones(4, 30), torch.full((4,), 30.0), torch.ones(4))
-    for plain, weighted in zip(mask_and_dice(x, t, None), mask_and_dice(x, t, ones), strict=True):
-        assert torch.allclose(plain, weighted)
-
-
 def test_large_logits_stay_finite() -> None:
     x = torch.tensor([[200.0, -200.0]], requires_grad=True)
     bce, dice = mask_and_dice(x, torch.tensor([[0.0, 1.0]]), None)
@@ -48,7 +41,7 @@ def test_large_logits_stay_finite() -> None:
 
 
 def test_gradients() -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     x = torch.randn(3, 6, dtype=torch.float64, generator=generator, requires_grad=True)
     t = torch.rand(3, 6, dtype=torch.float64, generator=generator)
     w = PointWeights(1 + t, (1 + t).sum(-1), torch.zeros(3, dtype=torch.float64))
@@ -56,16 +49,15 @@ def test_gradients() -> None:
     assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, w), x)
 
 
-def test_losses_do_not_depend_on_the_chunks(
-    make_problem: Any, make_criterion: Any, monkeypatch: Any
-) -> None:
-    output, batch = make_problem(3, 4, 2)
-    criterion = make_criterion()
+def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
+    output, batch = problem_of(3, 4, 2)
+    criterion = criterion_of()
 
     def losses() -> torch.Tensor:
-        points = PointSource(torch.Generator().manual_seed(0), device=torch.device("cpu"))
+        points = Points(seeded(0), device=torch.device("cpu"))
         return torch.stack(list(criterion.compare(output, batch, points).values()))
 
     whole = losses()
-    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
+    for module in (masks, matcher):
+        monkeypatch.setattr(module, "CHUNK_BYTES", 1)
     assert torch.allclose(whole, losses(), rtol=1e-6)

@@ -1,18 +1,15 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.losses import matcher as module
-from rgbt.losses.matcher import Matcher, assign, pairwise_costs, targets_of
-from rgbt.losses.points import PointSource
+from rgbt.losses.matcher import assign, pairwise_costs, targets_of
 from rgbt.losses.spatial import PointWeights
+from tests.losses.problems import seeded
 
 
 def test_targets_are_padded_and_counted() -> None:
@@ -30,21 +27,8 @@ def test_unknown_labels_are_refused(value: int) -> None:
         assign(torch.zeros(1, 1, 4, 3), targets)
 
 
-def test_pairwise_costs_by_hand() -> None:
-    # One query with logits 0 everywhere, two points, target 1 on one of them: s = 1/2, BCE is
-    # log 2, the dice cost 1 - (2 * 1/2 + 1) / (1 + 1 + 1) = 1/3.
-    x, t = torch.zeros(1, 1, 2), torch.tensor([[[1.0, 0.0]]])
-    cost = pairwise_costs(x.clone(), t, None, 5.0, 7.0)
-    assert torch.allclose(cost, 5 * torch.tensor(2.0).log() + 7 / 3)
-    # Weights 1 and 3, divided by their sum, no smoothing: BCE is log 2 again, the dice cost
-    # 1 - 2 * 1/2 / (2 + 1) = 2/3.
-    w = PointWeights(torch.tensor([[1.0, 3.0]]), torch.tensor([4.0]), torch.tensor([0.0]))
-    cost = pairwise_costs(x, t * w.values[:, None], w, 5.0, 7.0)
-    assert torch.allclose(cost, 5 * torch.tensor(2.0).log() + 7 * 2 / 3)
-
-
 def test_pairwise_costs_against_the_printed_formula() -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     x = 4 * torch.randn(2, 3, 50, generator=generator)
     t = torch.rand(2, 4, 50, generator=generator)
     w = PointWeights(
@@ -63,7 +47,7 @@ def test_pairwise_costs_against_the_printed_formula() -> None:
 
 
 def test_assignment_is_the_cheapest_of_all() -> None:
-    cost = torch.randn(6, 2, 4, 3, generator=torch.Generator().manual_seed(3))
+    cost = torch.randn(6, 2, 4, 3, generator=seeded(3))
     targets = targets_of(torch.tensor([[[0, 2]], [[1, 255]]]), (1, 2), 3, None)
     matches = assign(cost, targets)
     assert matches.image.tolist() == [0, 0, 1]
@@ -84,29 +68,8 @@ def test_more_targets_than_queries() -> None:
     assert assign(cost, targets).query.tolist() == [[-1, 0, 1]]
 
 
-def test_no_targets_at_all() -> None:
-    targets = targets_of(torch.full((2, 1, 3), 255), (1, 3), 3, None)
-    assert assign(torch.zeros(5, 2, 4, 3), targets).query.shape == (5, 0)
-
-
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_costs_that_are_not_finite(bad: float) -> None:
     targets = targets_of(torch.tensor([[[0, 1]]]), (1, 2), 2, None)
     with pytest.raises(RunError, match="matching cost"):
         assign(torch.full((1, 1, 3, 2), bad), targets)
-
-
-def test_matches_do_not_depend_on_the_chunks(make_problem: Any, monkeypatch: Any) -> None:
-    output, batch = make_problem(3, 4, 2)
-    matcher = Matcher(num_points=32, class_weight=2.0, mask_weight=5.0, dice_weight=5.0)
-    targets = targets_of(batch.label, (24, 32), 5, None)
-
-    def match() -> Any:
-        generator = torch.Generator().manual_seed(0)
-        points = PointSource(generator, device=torch.device("cpu"))
-        aux = output.aux
-        return matcher(aux["class_logits"], aux["mask_logits"], targets, points).query
-
-    whole = match()
-    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
-    assert np.array_equal(whole, match())

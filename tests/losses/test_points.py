@@ -3,13 +3,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rgbt.losses.points import PointSource, class_shares, most_uncertain, sample
+from rgbt.losses.points import Points, class_shares, most_uncertain, sample
+from tests.losses.problems import seeded
 
 CPU = torch.device("cpu")
 
 
-def source(seed: int = 0) -> PointSource:
-    return PointSource(torch.Generator().manual_seed(seed), device=CPU)
+def source(seed: int = 0) -> Points:
+    return Points(seeded(seed), device=CPU)
 
 
 @pytest.mark.parametrize("count", [1, 3, 64])
@@ -19,10 +20,6 @@ def test_draws_do_not_depend_on_how_many_sets_are_asked_for(count: int) -> None:
     pieces = [one_by_one.loss(n, 3, count) for n in (1, 3, 1)]
     assert together.shape == (5, 3, count, 2)
     assert torch.equal(together, torch.cat(pieces))
-
-
-def test_no_points_for_no_masks() -> None:
-    assert source().loss(4, 0, 10).shape == (4, 0, 10, 2)
 
 
 def test_points_are_uniform_and_independent() -> None:
@@ -37,10 +34,6 @@ def test_points_are_uniform_and_independent() -> None:
     assert torch.allclose(share / len(points), torch.full((16,), 1 / 16), atol=3e-3)
 
 
-def test_different_seeds_differ() -> None:
-    assert not torch.equal(source(0).matcher(1, 1, 9), source(1).matcher(1, 1, 9))
-
-
 def test_sample_by_hand() -> None:
     # 1 x 2 pixels [4, 8]: their centres lie at x = -1/2 and 1/2.
     maps = torch.tensor([[[[4.0, 8.0]]]])
@@ -50,7 +43,7 @@ def test_sample_by_hand() -> None:
 
 
 def test_class_shares_equal_the_sampled_one_hot_label() -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     label = torch.randint(0, 5, (3, 10, 14), generator=generator)
     label[label == 4] = 255
     points = 2 * torch.rand(2, 3, 500, 2, generator=generator) - 1
@@ -61,12 +54,6 @@ def test_class_shares_equal_the_sampled_one_hot_label() -> None:
     assert torch.allclose(class_shares(label, points, 4), expected, atol=1e-5)
 
 
-def test_class_shares_by_hand() -> None:
-    label = torch.tensor([[[2, 0]]])
-    points = torch.tensor([[[[0.25, 0.0], [-0.5, 0.0]]]])
-    assert class_shares(label, points, 3)[0, 0].T.tolist() == [[0.75, 0.0, 0.25], [0.0, 0.0, 1.0]]
-
-
 def test_most_uncertain_keeps_the_smallest_magnitudes() -> None:
     logits = torch.tensor([[3.0, -1.0, 0.5, -0.0], [-9.0, 8.0, -7.0, 6.0]])
     points = torch.arange(16.0).reshape(2, 4, 2)
@@ -74,10 +61,3 @@ def test_most_uncertain_keeps_the_smallest_magnitudes() -> None:
     assert sorted(kept[0, :, 0].tolist()) == [4.0, 6.0]
     assert sorted(kept[1, :, 0].tolist()) == [12.0, 14.0]
     assert most_uncertain(logits.clone(), points, 0).shape == (2, 0, 2)
-
-
-def test_gradient_of_sample() -> None:
-    double = {"dtype": torch.float64, "generator": torch.Generator().manual_seed(0)}
-    maps = torch.randn(2, 2, 3, 4, **double).requires_grad_()
-    points = 2 * torch.rand(2, 1, 5, 2, **double) - 1
-    assert torch.autograd.gradcheck(lambda m: sample(m, points), maps)

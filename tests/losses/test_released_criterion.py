@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import os
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,24 +11,11 @@ from torch import Tensor
 
 from rgbt.losses.matcher import targets_of
 from rgbt.types import Output
+from tests.benchmarks.reference_criterion import Replayed
+from tests.losses.problems import batch_of, criterion_of, recorded_losses
+from tests.models.golden import requires_golden
 
-ROOT = Path(__file__).resolve().parents[2]
-SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
-GOLDEN = SHARED / "golden"
-
-
-@pytest.fixture(scope="module")
-def golden() -> Any:
-    """Reference material: recipes and outputs of the released criterion, and its number rules."""
-    if not GOLDEN.exists():
-        pytest.skip("reference material is not here")
-    spec = importlib.util.spec_from_file_location("fill", GOLDEN / "fill.py")
-    assert spec is not None
-    assert spec.loader is not None
-    fill = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(fill)
-    recipes = json.loads((GOLDEN / "losses.json").read_text())["recipes"]["criterion"]
-    return fill, recipes, np.load(GOLDEN / "losses.npz")
+pytestmark = requires_golden
 
 
 class Golden:
@@ -43,8 +25,8 @@ class Golden:
     it numbers a mask's draws by image and query, we by image and class.
     """
 
-    def __init__(self, golden: Any, name: str) -> None:
-        self.fill, recipes, self.stored = golden
+    def __init__(self, name: str) -> None:
+        self.fill, recipes, _, self.stored = recorded_losses("criterion")
         self.name, self.recipe = name, recipes[name]
         self.order = [1, 2, 0]  # auxiliary 0, auxiliary 1, last
 
@@ -80,7 +62,9 @@ class Golden:
             columns.append(query[np.argsort(target)])
         return np.concatenate(columns)
 
-    def draws(self, reference: ModuleType) -> Any:
+    def draws(
+        self,
+    ) -> Any:
         matcher, loss = [], []
         for layer in self.order:
             drawn = self.recipe["draws"][4 * layer : 4 * layer + 4]
@@ -94,26 +78,24 @@ class Golden:
             ranks = [part.argsort().argsort() for part in parts]
             rows = np.concatenate([ranks[0], ranks[1] + counts[0]])
             loss.append(torch.cat([candidates, fresh], 1)[rows])
-        return reference.Replayed(2 * torch.stack(matcher) - 1, 2 * torch.stack(loss) - 1, 1)
+        return Replayed(2 * torch.stack(matcher) - 1, 2 * torch.stack(loss) - 1, 1)
 
 
 @pytest.fixture(params=["two_images", "one_empty_image"])
-def case(request: pytest.FixtureRequest, golden: Any) -> Golden:
-    return Golden(golden, request.param)
+def case(request: pytest.FixtureRequest) -> Golden:
+    return Golden(request.param)
 
 
-def test_released_values(
-    case: Golden, reference: ModuleType, make_criterion: Any, make_batch: Any
-) -> None:
-    output, batch = case.output(), make_batch(case.label())
-    criterion = make_criterion(num_classes=9, num_points=256)
-    parts = criterion.layers(output, batch, case.draws(reference))
+def test_released_values(case: Golden) -> None:
+    output, batch = case.output(), batch_of(case.label())
+    criterion = criterion_of(num_classes=9, num_points=256)
+    parts = criterion.layers(output, batch, case.draws())
     for row, suffix in enumerate(["_0", "_1", ""]):
         for part, released in [("class", "ce"), ("mask", "mask"), ("dice", "dice")]:
             stored = case.stored[f"criterion.{case.name}.loss_{released}{suffix}"]
             assert parts[part][row, 0].item() == pytest.approx(float(stored), abs=1e-4)
 
-    weighted = criterion.compare(output, batch, case.draws(reference))
+    weighted = criterion.compare(output, batch, case.draws())
     total = torch.stack(list(weighted.values())).sum()
     stored = case.stored[f"criterion.{case.name}.weighted_total"]
     assert total.item() == pytest.approx(float(stored), abs=1e-4)
@@ -132,16 +114,12 @@ def test_released_values(
         assert torch.allclose(ours, released, rtol=0, atol=5e-7), key
 
 
-def test_released_matches(
-    case: Golden, reference: ModuleType, make_criterion: Any, make_batch: Any
-) -> None:
+def test_released_matches(case: Golden) -> None:
     output, label = case.output(), case.label()
     hw = case.recipe["image_size"]
-    targets = targets_of(make_batch(label).label, tuple(hw), 9, None)
-    matcher = make_criterion(num_classes=9, num_points=256).matcher
-    matches = matcher(
-        output.aux["class_logits"], output.aux["mask_logits"], targets, case.draws(reference)
-    )
+    targets = targets_of(batch_of(label).label, tuple(hw), 9, None)
+    matcher = criterion_of(num_classes=9, num_points=256).matcher
+    matches = matcher(output.aux["class_logits"], output.aux["mask_logits"], targets, case.draws())
     assert matches.label.tolist() == sum(case.recipe["target_classes"], [])
     for row, layer in enumerate(case.order):
         assert np.array_equal(matches.query[row], case.matches(layer))

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.checks import InputError
 from rgbt.losses.spatial import PLAIN, SpatialMap, weight_map
+from tests.losses.problems import batch_of, whole_image
 
 EDGE = replace(PLAIN, alpha=2.0, focus="edge")
 
 
-def test_edge_weights_of_a_3x3_image(make_batch: Any, make_positions: Any) -> None:
-    batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long), make_positions(1, 3, 3))
+def test_edge_weights_of_a_3x3_image() -> None:
+    batch = batch_of(torch.zeros(1, 3, 3, dtype=torch.long), whole_image(1, 3, 3))
     # Centre (1, 1), d_max = sqrt 2: corners 1 + 2, sides 1 + 2 / sqrt 2.
     side = 1 + 2 / sqrt(2)
     expected = torch.tensor([[3, side, 3], [side, 1, side], [3, side, 3]])
@@ -23,21 +23,12 @@ def test_edge_weights_of_a_3x3_image(make_batch: Any, make_positions: Any) -> No
     assert torch.allclose(weights[0, 0], expected)
 
 
-def test_centre_weights_are_reversed(make_batch: Any, make_positions: Any) -> None:
-    batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long), make_positions(1, 3, 3))
+def test_centre_weights_are_reversed() -> None:
+    batch = batch_of(torch.zeros(1, 3, 3, dtype=torch.long), whole_image(1, 3, 3))
     side = 3 - 2 / sqrt(2)
     expected = torch.tensor([[1, side, 1], [side, 3, side], [1, side, 1]])
     weights = weight_map(batch, (3, 3), replace(EDGE, focus="center"))
     assert torch.allclose(weights[0, 0], expected)
-
-
-def test_original_d_max_of_mfnet_is_400(make_batch: Any, make_positions: Any) -> None:
-    batch = make_batch(torch.zeros(1, 480, 640, dtype=torch.long), make_positions(1, 480, 640))
-    weights = weight_map(batch, (480, 640), EDGE)[0, 0]
-    # Centre (240, 320); the farthest pixel is (0, 0) at sqrt(240^2 + 320^2) = 400.
-    assert weights[240, 320] == 1.0
-    assert weights[0, 0] == 3.0
-    assert weights[240, 0] == pytest.approx(1 + 2 * 320 / 400)
 
 
 @pytest.mark.parametrize(
@@ -51,11 +42,9 @@ def test_original_d_max_of_mfnet_is_400(make_batch: Any, make_positions: Any) ->
         ({"centre": "crop", "d_max": "crop"}, [[1.0, sqrt(0.5)], [sqrt(0.5), 0.0]]),
     ],
 )
-def test_centre_and_largest_distance(
-    make_batch: Any, make_positions: Any, changes: dict[str, str], expected: list[list[float]]
-) -> None:
-    position = make_positions(1, 5, 5)[:, :, :2, 3:]
-    batch = make_batch(torch.zeros(1, 2, 2, dtype=torch.long), position, (5, 5))
+def test_centre_and_largest_distance(changes: dict[str, str], expected: list[list[float]]) -> None:
+    position = whole_image(1, 5, 5)[:, :, :2, 3:]
+    batch = batch_of(torch.zeros(1, 2, 2, dtype=torch.long), position, (5, 5))
     weights = weight_map(batch, (2, 2), replace(EDGE, alpha=1.0, **changes))
     assert torch.allclose(weights[0, 0], 1 + torch.tensor(expected))
 
@@ -64,10 +53,8 @@ def test_centre_and_largest_distance(
     ("focus", "padding", "expected"),
     [("edge", "map", 3.0), ("center", "map", 1.0), ("edge", "one", 1.0), ("edge", "zero", 0.0)],
 )
-def test_padding(
-    make_batch: Any, make_positions: Any, focus: Any, padding: Any, expected: float
-) -> None:
-    batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long), make_positions(1, 3, 3))
+def test_padding(focus: Any, padding: Any, expected: float) -> None:
+    batch = batch_of(torch.zeros(1, 3, 3, dtype=torch.long), whole_image(1, 3, 3))
     weights = weight_map(batch, (4, 5), replace(EDGE, focus=focus, padding=padding))[0, 0]
     assert (weights[3] == expected).all()
     assert (weights[:, 3:] == expected).all()
@@ -77,10 +64,8 @@ def test_padding(
     ("passes", "weighted"),
     [(1, [0]), (2, [0, 1]), (3, [0]), (4, [0, 3])],  # F | F F' | F R T | F R T F'
 )
-def test_fused_passes(
-    make_batch: Any, make_positions: Any, passes: int, weighted: list[int]
-) -> None:
-    batch = make_batch(torch.zeros(2, 3, 3, dtype=torch.long), make_positions(2, 3, 3))
+def test_fused_passes(passes: int, weighted: list[int]) -> None:
+    batch = batch_of(torch.zeros(2, 3, 3, dtype=torch.long), whole_image(2, 3, 3))
     settings = replace(EDGE, passes="fused", dice_smoothing="none", normaliser="weights")
     spatial = SpatialMap(batch, (3, 3), settings=settings, num_passes=passes)
     corner = torch.tensor([-2 / 3, -2 / 3]).expand(2 * passes, 2, 1, 2)
@@ -91,8 +76,8 @@ def test_fused_passes(
     assert weights.smoothing[:, 0].tolist() == [0.0 if e == 3 else 1.0 for e in expected]
 
 
-def test_weights_at_points(make_batch: Any, make_positions: Any) -> None:
-    batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long), make_positions(1, 3, 3))
+def test_weights_at_points() -> None:
+    batch = batch_of(torch.zeros(1, 3, 3, dtype=torch.long), whole_image(1, 3, 3))
     spatial = SpatialMap(batch, (3, 3), settings=EDGE, num_passes=1)
     # The middle, half way from it to the right, and the outer corner, where the border continues.
     points = torch.tensor([[[[0.0, 0.0], [1 / 3, 0.0], [1.0, 1.0]]]])
@@ -101,12 +86,6 @@ def test_weights_at_points(make_batch: Any, make_positions: Any) -> None:
     assert torch.allclose(weights.values[0, 0], expected)
     assert weights.total.tolist() == [[3.0]]
     assert weights.smoothing.tolist() == [[1.0]]
-
-
-def test_raises(make_batch: Any) -> None:
-    batch = make_batch(torch.zeros(1, 3, 3, dtype=torch.long))
-    with pytest.raises(InputError, match="track_position"):
-        weight_map(batch, (3, 3), EDGE)
 
 
 def test_what_counts_as_active() -> None:

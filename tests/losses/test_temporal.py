@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,16 +12,20 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
-from rgbt.losses import temporal as module
-from rgbt.losses.consistency import con, con_acc
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.dice import dice
+from rgbt.losses.overlap import con, con_acc, dice
 from rgbt.losses.temporal import TemporalLoss
 from rgbt.requirements import Record, Requirement
 from rgbt.types import Frame, Output
-from tests.models.golden import FOLDER, compose, requires_golden
-
-NOTHING = torch.Generator()
+from tests.losses.problems import (
+    NOTHING,
+    batch_of,
+    criterion_of,
+    problem_of,
+    recorded_losses,
+    seeded,
+)
+from tests.models.golden import compose, requires_golden
 
 
 def loss_of(**changes: Any) -> TemporalLoss:
@@ -39,16 +40,16 @@ def loss_of(**changes: Any) -> TemporalLoss:
 
 
 @pytest.fixture
-def frames(make_batch: Any) -> tuple[Frame, Frame, Tensor, Tensor]:
+def frames() -> tuple[Frame, Frame, Tensor, Tensor]:
     """Two frames of two images and four classes, the first as the second sees it, what it sees."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     logits = torch.randn(3, 2, 4, 6, 7, generator=generator)
     labels = torch.randint(0, 4, (2, 2, 6, 7), generator=generator)
     labels[:, 0, 0] = 255
 
     def frame(i: int) -> Frame:
         scores = logits[i].clone().requires_grad_()
-        return Frame(Output(scores, {}), make_batch(labels[i]), scores)
+        return Frame(Output(scores, {}), batch_of(labels[i]), scores)
 
     valid = torch.rand(2, 6, 7, generator=generator) < 0.8
     return frame(0), frame(1), logits[2].softmax(1), valid
@@ -103,50 +104,22 @@ def test_values(form: Any, frames: Any) -> None:
             assert torch.allclose(parts[f"cross_entropy_{number}"], seg)
 
 
-def test_without_alpha_no_dice_is_computed(frames: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "dice", None)
-    first, second, warped, valid = frames
-    assert "con" in loss_of(alpha=0.0)(first, second, warped, valid, NOTHING)
-
-
-def test_a_gradient_reaches_the_first_frame_through_the_warp(frames: Any) -> None:
-    first, second, _, valid = frames
-    warped = first.logits.softmax(1).flip(3)
-    parts = loss_of()(first, second, warped, valid, NOTHING)
-    (gradient,) = torch.autograd.grad(parts["con"], first.logits)
-    assert gradient.any()
-
-
-def test_half_precision_logits(frames: Any) -> None:
-    first, second, warped, valid = frames
-    half = [frame._replace(logits=frame.logits.detach().bfloat16()) for frame in (first, second)]
-    single = [frame._replace(logits=frame.logits.float()) for frame in half]
-    for name in ("dice", "con", "con_acc"):
-        loss = loss_of(second=name)
-        with torch.autocast("cpu", torch.bfloat16):
-            found = loss(*half, warped.bfloat16(), valid, NOTHING)
-        expected = loss(*single, warped.bfloat16().float(), valid, NOTHING)
-        for key, part in found.items():
-            assert part.dtype == torch.float32
-            assert torch.equal(part, expected[key]), key
-
-
-def test_masks_of_queries(make_problem: Any, make_criterion: Any) -> None:
-    criterion, generator = make_criterion(), torch.Generator().manual_seed(3)
+def test_masks_of_queries() -> None:
+    criterion, generator = criterion_of(), seeded(3)
     frames = []
     for seed in (0, 1):
-        output, batch = make_problem(3, 1, 2, seed=seed)
+        output, batch = problem_of(3, 1, 2, seed=seed)
         logits = torch.randn(2, 5, *batch.label.shape[1:], generator=generator)
         frames.append(Frame(output, batch, logits))
     valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
     loss = loss_of(segmentation=criterion)
     assert Requirement("model", "outputs", "masks") in loss.record.requires
     warped = frames[0].logits.softmax(1)
-    parts = loss(*frames, warped, valid, torch.Generator().manual_seed(5))
+    parts = loss(*frames, warped, valid, seeded(5))
     # The set criterion has a dice of its own.
     segmentation = ["class_1", "mask_1", "seg_dice_1", "class_2", "mask_2", "seg_dice_2"]
     assert list(parts) == [*segmentation, "dice_1", "con"]
-    generator = torch.Generator().manual_seed(5)
+    generator = seeded(5)
     alone = [criterion(frame.output, frame.batch, generator) for frame in frames]
     expected = [values.sum() for each in alone for values in each.values()]
     assert torch.equal(torch.stack([parts[name] for name in segmentation]), torch.stack(expected))
@@ -191,20 +164,9 @@ def built(*overrides: str) -> TemporalLoss:
     return loss
 
 
-@pytest.mark.parametrize("form", ["paper", "released"])
-def test_the_files_build(form: str) -> None:
-    loss = built(f"loss=temporal_{form}")
-    assert (loss.alpha, loss.beta, loss.second, loss.form) == (1.0, 1.0, "con", form)
-    assert loss.record.reads_warped
-    assert Requirement("model", "outputs", "scores") in loss.record.requires
-    assert Requirement("scheme", "frames", 2) in loss.record.requires
-    loss = built(f"loss=temporal_{form}", "loss.alpha=0.5", "loss.beta=0", "loss.second=none")
-    assert (loss.alpha, loss.beta, loss.second) == (0.5, 0, "none")
-    assert not loss.record.reads_warped
-
-
-@pytest.mark.parametrize("criterion", ["set_criterion", "set_criterion_spatial"])
-@pytest.mark.parametrize("form", ["paper", "released"])
+@pytest.mark.parametrize(
+    ("form", "criterion"), [("paper", "set_criterion"), ("released", "set_criterion_spatial")]
+)
 def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> None:
     config = compose(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
     loss = built(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
@@ -214,48 +176,25 @@ def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> N
     assert config.loss.segmentation == compose(f"loss={criterion}").loss
 
 
-@pytest.mark.parametrize(
-    "wrong", ["loss.second=concc", "loss.form=printed", "loss.alpha=much", "loss.gamma=1"]
-)
-def test_unknown_words_name_their_key(wrong: str) -> None:
-    key, _ = wrong.split("=")
-    with pytest.raises(InputError, match=f"^'{key}'"):
-        Component.from_node(compose("loss=temporal_paper", f"++{wrong}").loss, "loss")
-
-
 class Recorded:
     """One case of the release: inputs by recipe, stored results."""
 
-    def __init__(self, name: str, make_batch: Callable[..., Any]) -> None:
-        spec = importlib.util.spec_from_file_location("fill", FOLDER / "fill.py")
-        assert spec is not None
-        assert spec.loader is not None
-        self.fill = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(self.fill)
-        facts = json.loads((FOLDER / "losses.json").read_text())
-        recipe = facts["recipes"]["temporal_loss"][name]
-        self.name, self.arrays = name, np.load(FOLDER / "losses.npz")
-        self.about = facts["outputs"]
+    def __init__(self, name: str) -> None:
+        self.fill, recipes, self.about, self.arrays = recorded_losses("temporal_loss")
+        recipe, self.name = recipes[name], name
         logits = [
             torch.from_numpy(recipe["logit_scale"] * self.fill.normal(seed, recipe["shape"]))
             for seed in recipe["logit_seeds"]
         ]
-        height, width = recipe["shape"][2:]
-        labels = [
-            np.stack(
-                [
-                    self.fill.labels(seed, height, width, classes, recipe["cell"])
-                    for seed, classes in zip(seeds, recipe["classes"], strict=True)
-                ]
-            )
-            for seeds in recipe["label_seeds"]
-        ]
-        for number, label in enumerate(labels, 1):
-            assert self.deviation(f"labels{number}", label) == 0
-        self.frames = [
-            Frame(Output(scores, {}), make_batch(torch.from_numpy(label)), scores)
-            for scores, label in zip((x.requires_grad_() for x in logits), labels, strict=False)
-        ]
+        hw = recipe["shape"][2:]
+        self.frames = []
+        for number, seeds in enumerate(recipe["label_seeds"]):
+            both = zip(seeds, recipe["classes"], strict=True)
+            label = np.stack([self.fill.labels(s, *hw, k, recipe["cell"]) for s, k in both])
+            assert self.deviation(f"labels{number + 1}", label) == 0
+            scores = logits[number].requires_grad_()
+            frame = Frame(Output(scores, {}), batch_of(torch.from_numpy(label)), scores)
+            self.frames.append(frame)
         self.warped = logits[2].softmax(1)
 
     def deviation(self, key: str, found: Any) -> float:
@@ -270,8 +209,8 @@ class Recorded:
 
 @requires_golden
 @pytest.mark.parametrize("name", ["soft", "peaked", "background_only"])
-def test_released_values_and_gradients(name: str, make_batch: Any) -> None:
-    case = Recorded(name, make_batch)
+def test_released_values_and_gradients(name: str) -> None:
+    case = Recorded(name)
     first, second = case.frames
     valid = torch.ones_like(second.batch.label, dtype=torch.bool)
     for which in ("dice", "con", "con_acc"):
@@ -289,7 +228,7 @@ def test_released_values_and_gradients(name: str, make_batch: Any) -> None:
         assert case.deviation(f"grad.{part.replace('_1', '1')}", gradient) <= 5e-10
 
 
-def test_printed_numbers_of_a_small_case(make_batch: Any) -> None:
+def test_printed_numbers_of_a_small_case() -> None:
     """Nine classes, 2x3 pixels; numbers computed with the released modules (paper: by formula)."""
     c, y, x = torch.meshgrid(
         *(torch.arange(n, dtype=torch.float64) for n in (9, 2, 3)), indexing="ij"
@@ -298,7 +237,7 @@ def test_printed_numbers_of_a_small_case(make_batch: Any) -> None:
         torch.sin(c + 0.7 * y + 0.3 * x)[None],
         torch.cos(0.5 * c - 0.4 * y + 0.9 * x)[None],
     ]
-    batch = make_batch(torch.tensor([[[0, 1, 2], [2, 0, 4]]]))
+    batch = batch_of(torch.tensor([[[0, 1, 2], [2, 0, 4]]]))
     first, second = (Frame(Output(scores, {}), batch, scores) for scores in logits)
     valid = torch.ones(1, 2, 3, dtype=torch.bool)
 

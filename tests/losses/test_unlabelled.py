@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.losses.unlabelled import Entropy, MaxSquares, guidance
+from tests.losses.problems import seeded
 
 
 def squares(
@@ -67,34 +67,17 @@ def by_loops(p: Tensor, ratio: float) -> float:
 
 @pytest.mark.parametrize("ratio", [0.0, 0.2, 0.7, 1.0])
 def test_image_wise_weights_against_loops(ratio: float) -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     p = (2 * torch.randn(3, 4, 5, 6, generator=generator, dtype=torch.float64)).softmax(1)
     total = by_loops(p, ratio)
     assert squares(p, "pixels", ratio).item() == pytest.approx(total / (2 * 3), rel=1e-9)
     assert squares(p, "entries", ratio).item() == pytest.approx(total / (3 * 4), rel=1e-9)
 
 
-def test_image_wise_weights_by_hand() -> None:
-    """Four pixels, three of class 0: with r = 1/2 they weigh 1 / sqrt(12), the other 1 / 2."""
-    p = torch.tensor([[1.0, 0.0]] * 3 + [[0.0, 1.0]]).T.reshape(1, 2, 2, 2)
-    expected = 3 / math.sqrt(12) + 1 / 2
-    assert squares(p, "entries", 0.5).item() == pytest.approx(-expected / 2)
-    # Without any class: every pixel 1 / H, as without the ratio.
-    assert squares(p, "pixels", 0.0).item() == pytest.approx(squares(p).item()) == -0.5
-
-
-def test_what_is_sure_costs_less() -> None:
-    sharper = [torch.softmax(scale * torch.tensor(SURE).log(), 0) for scale in (0.5, 1, 2, 8)]
-    ps = [each.view(1, 3, 1, 1) for each in sharper]
-    for loss in (squares, entropy):
-        values = [loss(p).item() for p in ps]
-        assert values == sorted(values, reverse=True)
-
-
 @pytest.mark.parametrize("ratio", [None, 0.2])
 @pytest.mark.parametrize("normalisation", ["pixels", "entries"])
 def test_gradient_of_max_squares(normalisation: str, ratio: float | None) -> None:
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     scores = torch.randn(2, 3, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
         lambda s: squares(s.softmax(1), normalisation, ratio, 0.1), (scores,)
@@ -102,7 +85,7 @@ def test_gradient_of_max_squares(normalisation: str, ratio: float | None) -> Non
 
 
 def test_gradient_of_entropy() -> None:
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     scores = torch.randn(2, 3, 2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda s: entropy(s.softmax(1)), (scores,))
 
@@ -127,13 +110,6 @@ def test_large_scores_give_finite_values_and_gradients(dtype: torch.dtype) -> No
         assert leaf.grad.isfinite().all()
 
 
-def test_a_probability_of_zero_has_a_finite_gradient() -> None:
-    p = constant(ONE_HOT).clone().requires_grad_()
-    entropy(p).backward()
-    assert p.grad is not None
-    assert p.grad.isfinite().all()
-
-
 def test_of_one_class_there_is_nothing_to_be_unsure_of() -> None:
     p = torch.ones(2, 1, 3, 5, requires_grad=True)
     assert entropy(p).item() == 0
@@ -141,3 +117,34 @@ def test_of_one_class_there_is_nothing_to_be_unsure_of() -> None:
     entropy(p).backward()
     assert p.grad is not None
     assert p.grad.isfinite().all()
+
+
+def maps(*pixels: tuple[float, ...]) -> Tensor:
+    """(1, K, 1, pixels)."""
+    return torch.tensor(pixels).T[None, :, None]
+
+
+def test_guidance_by_hand() -> None:
+    p = maps((0.96, 0.04), (0.5, 0.5), (0.6, 0.4), (0.95, 0.05), (0.03, 0.97))
+    q = maps((0.60, 0.40), (0.01, 0.99), (0.7, 0.3), (0.95, 0.05), (0.98, 0.02))
+    found = guidance(p, q, 0.95)
+    # Sure p; sure q; nobody; not above the threshold; both, and the mean is (0.505, 0.495).
+    assert found.tolist() == [[[0, 1, 255, 255, 0]]]
+    assert found.dtype == torch.int64
+
+
+def test_guidance_at_the_ends_of_the_threshold() -> None:
+    p, q = maps((1.0, 0.0), (0.4, 0.6)), maps((0.2, 0.8), (0.5, 0.5))
+    assert guidance(p, q, 0.0).tolist() == [[[0, 1]]]
+    assert guidance(p, q, 1.0).tolist() == [[[255, 255]]]
+
+
+def test_guidance_has_no_gradient() -> None:
+    p = maps((0.96, 0.04)).requires_grad_()
+    assert not guidance(p, p, 0.5).requires_grad
+
+
+def test_guidance_refuses_what_does_not_fit() -> None:
+    p = torch.full((1, 2, 3, 4), 0.5)
+    with pytest.raises(ValueError, match="aux_probabilities: expected shape"):
+        guidance(p, p[..., 1:], 0.95)

@@ -28,12 +28,6 @@ def test_gaussian_by_hand() -> None:
     assert weight[0, 1, 2].item() == pytest.approx(-0.25 / 8)
 
 
-def test_gaussian_at_cell_middles_is_symmetric() -> None:
-    weight = pattern.gaussian_log_weight((4, 5), torch.tensor([[2.0, 2.5]]), 1.0, 0.5)
-    assert torch.equal(weight, weight.flip(1))
-    assert torch.equal(weight, weight.flip(2))
-
-
 def test_fixed_count_is_exact_and_differs_between_samples() -> None:
     log_weight = pattern.gaussian_log_weight(
         (8, 10), torch.tensor([[4.0, 5.0]]).expand(64, 2), 1, 0

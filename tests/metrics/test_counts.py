@@ -35,12 +35,6 @@ def test_what_is_saved_is_loaded(tmp_path, night) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["test.npz"]
 
 
-def test_saving_again_replaces_the_file(tmp_path) -> None:
-    example().save(tmp_path / "test.npz")
-    example().select(["00002N"]).save(tmp_path / "test.npz")
-    assert Counts.load(tmp_path / "test.npz").names == ("00002N",)
-
-
 def test_sums_over_images_and_regions() -> None:
     counts = example()
     assert counts.by_region().shape == (5, 2, 2)

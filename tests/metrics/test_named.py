@@ -7,7 +7,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import images_of, parse, value, values
+from rgbt.metrics.named import OF_PAIRS, images_of, parse, value, values
 from tests.sweeps.tabled import DAY, counts_of
 
 
@@ -33,54 +33,6 @@ from tests.sweeps.tabled import DAY, counts_of
 )
 def test_values_by_hand(metric: str, expected: float) -> None:
     assert value(metric, counts_of(), "released") == pytest.approx(expected)
-
-
-def test_absent_class_counts_as_asked() -> None:
-    counts = counts_of([[[4, 0], [0, 0]]], night=None)
-    assert value("mIoU", counts, "released") == 50.0
-    assert value("mIoU", counts, "exclude") == 100.0
-
-
-@pytest.mark.parametrize(
-    "metric",
-    ["mIou", "region/0", "region/x", "class/", "class/car/prec", "region/1/TC", "class//CA", ""],
-)
-def test_unknown_metric(metric: str) -> None:
-    with pytest.raises(InputError, match=f"'{metric}' is not a metric"):
-        parse(metric)
-
-
-def test_nearest_metric_is_named() -> None:
-    with pytest.raises(InputError, match="did you mean 'mIoU'"):
-        parse("day/mIou")
-
-
-def test_unknown_class_and_region() -> None:
-    with pytest.raises(InputError, match="no class 'carr'; did you mean 'car'"):
-        value("class/carr", counts_of(), "released")
-    with pytest.raises(InputError, match="the counts have the regions 1 to 2"):
-        value("region/3", counts_of(), "released")
-
-
-def test_images_that_are_not_told_apart() -> None:
-    with pytest.raises(InputError, match="told apart"):
-        value("night/mIoU", counts_of(DAY, night=None), "released")
-
-
-@pytest.mark.parametrize(
-    "metric",
-    ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"],
-)
-def test_many_sums_at_once_are_each_alone(metric: str) -> None:
-    asked, counts = parse(metric), counts_of()
-    by_region = images_of(asked, counts).by_region()
-    many = np.stack([by_region, 3 * by_region, by_region[::-1]])[:, None]
-    given = (counts, "released")
-    found = values(asked, many, *given)
-    alone = [values(asked, each[0], *given) for each in many]
-    assert found.shape == (3, 1)
-    np.testing.assert_allclose(found[:, 0], alone)
-    np.testing.assert_allclose(found[0], value(metric, counts, "released"))
 
 
 # Pairs of frames.
@@ -124,49 +76,52 @@ def test_values_of_pairs_by_hand(metric: str, absent, expected: float) -> None:
     assert value(metric, pairs_of(), absent) == pytest.approx(100 * expected)
 
 
-@pytest.mark.parametrize("metric", ["TC", "CA", "CA_released", "class/car/CA", "night/TC"])
-def test_many_sums_of_pairs_at_once_are_each_alone(metric: str) -> None:
-    asked, counts = parse(metric), pairs_of()
+@pytest.mark.parametrize(
+    ("metric", "of_pairs", "night", "word"),
+    [
+        ("class/carr", False, True, "no class 'carr'; did you mean 'car'"),
+        ("region/3", False, True, "the counts have the regions 1 to 2"),
+        ("night/mIoU", False, False, "told apart"),
+        ("class/carr/TC", True, True, "no class 'carr'; did you mean 'car'"),
+        ("night/TC", True, False, "told apart"),
+        *((each, True, True, "score of single frames.*aligned2, of rgbt consistency")
+          for each in ("mIoU", "Var", "class/car/acc", "class/car/region/2", "night/mIoU")),
+        *((each, False, True, "score of pairs.*ring2.*rgbt consistency run=")
+          for each in ("TC", "CA", "night/CA_released", "class/car/TC")),
+    ],
+)  # fmt: skip
+def test_scores_that_counts_do_not_have_are_refused(
+    metric: str, of_pairs: bool, night: bool, word: str
+) -> None:
+    given = {} if night else {"night": None}
+    counts = pairs_of(**given) if of_pairs else counts_of(DAY, **given) if given else counts_of()
+    with pytest.raises(InputError, match=word):
+        value(metric, counts, "released")
+
+
+@pytest.mark.parametrize(
+    "metric",
+    ["mIou", "region/0", "region/x", "class/", "class/car/prec", "region/1/TC", "class//CA", ""],
+)
+def test_unknown_metrics_are_refused(metric: str) -> None:
+    with pytest.raises(InputError, match=f"'{metric}' is not a metric"):
+        parse(metric)
+    with pytest.raises(InputError, match="did you mean 'mIoU'"):
+        parse("day/mIou")
+
+
+@pytest.mark.parametrize(
+    "metric",
+    ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"]
+    + ["TC", "CA", "CA_released", "class/car/CA", "night/TC"],
+)
+def test_many_sums_at_once_are_each_alone(metric: str) -> None:
+    asked = parse(metric)
+    counts = pairs_of() if asked.score in OF_PAIRS else counts_of()
     by_region = images_of(asked, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
-    given = (counts, "released")
-    found = values(asked, many, *given)
+    found = values(asked, many, counts, "released")
     assert found.shape == (3, 1)
-    np.testing.assert_allclose(found[:, 0], [values(asked, each[0], *given) for each in many])
+    alone = [values(asked, each[0], counts, "released") for each in many]
+    np.testing.assert_allclose(found[:, 0], alone)
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))
-
-
-OF_SINGLE = ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/1", "class/car", "class/car/acc"]
-
-
-@pytest.mark.parametrize("metric", [*OF_SINGLE, "class/car/region/2", "night/mIoU"])
-def test_pairs_have_no_scores_of_single_frames(metric: str) -> None:
-    asked, counts = parse(metric), pairs_of()
-    sentence = f"'{metric}' is a score of single frames.*aligned2, of rgbt consistency"
-    with pytest.raises(InputError, match=sentence):
-        value(metric, counts, "released")
-    with pytest.raises(InputError, match=sentence):
-        images_of(asked, counts)
-    with pytest.raises(InputError, match=sentence):
-        values(asked, counts.by_region(), counts, "released")
-
-
-@pytest.mark.parametrize("metric", ["TC", "CA", "night/CA_released", "class/car/TC"])
-def test_single_frames_have_no_scores_of_pairs(metric: str) -> None:
-    asked, counts = parse(metric), counts_of()
-    sentence = f"'{metric}' is a score of pairs.*ring2.*rgbt consistency run="
-    with pytest.raises(InputError, match=sentence):
-        value(metric, counts, "released")
-    with pytest.raises(InputError, match=sentence):
-        images_of(asked, counts)
-    with pytest.raises(InputError, match=sentence):
-        values(asked, counts.by_region(), counts, "released")
-
-
-def test_classes_and_parts_of_pairs_are_checked_too() -> None:
-    with pytest.raises(InputError, match="no class 'carr'; did you mean 'car'"):
-        value("class/carr/TC", pairs_of(), "released")
-    with pytest.raises(InputError, match="told apart"):
-        value("night/TC", pairs_of(night=None), "released")
-    with pytest.raises(InputError, match="did you mean 'CA_released'"):
-        parse("day/CA_release")

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import os
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from sklearn.metrics import f1_score, jaccard_score, precision_score, recall_score
 
-from rgbt.metrics import names, scores
-from rgbt.metrics.counts import Counts
+from rgbt.checks import InputError
+from rgbt.metrics import scores
+from rgbt.metrics.absent import absent_notes
+from rgbt.metrics.counts import ARCHIVE, Counts, check_same_means, convention
+from rgbt.metrics.named import value
+from tests.models.golden import FOLDER
 
-SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
-GOLDEN = SHARED / "golden" / "losses.npz"
+GOLDEN = FOLDER / "losses.npz"
 BOTH = ["released", "exclude"]
 
 
@@ -86,13 +90,6 @@ def test_equal_to_the_released_metric_code() -> None:
     assert np.isnan(ours[~there]).all()
 
 
-def test_leading_dimensions_are_kept() -> None:
-    counts = np.random.default_rng(0).integers(0, 50, (3, 5, 4, 4))
-    every = scores.iou(counts, "released")
-    assert every.shape == (3, 5, 4)
-    np.testing.assert_array_equal(every[1, 2], scores.iou(counts[1, 2], "released"))
-
-
 @pytest.mark.parametrize(
     ("ious", "printed"),
     [
@@ -112,53 +109,173 @@ def test_variances_of_the_paper_recompute(ious, printed) -> None:
     assert scores.variance(np.array(ious) / 100) == pytest.approx(printed, abs=rounding)
 
 
-def test_variance_leaves_out_regions_without_a_score() -> None:
-    # 40 and 60 percent: mean 50, variance 100.
-    assert scores.variance([0.4, np.nan, 0.6]) == pytest.approx(100)
-
-
-def example(night: tuple[bool, ...] | None) -> Counts:
-    rng = np.random.default_rng(0)
-    return Counts(
-        counts=rng.integers(0, 100, (2, 3, 2, 2)),
-        names=("00001D", "00002N"),
-        night=night,
-        classes=("unlabeled", "car"),
-        partition="ring3",
-        dataset="abc",
-        split="test",
-    )
-
-
-@pytest.mark.parametrize("absent", BOTH)
-def test_summary_is_derived_from_the_counts(absent) -> None:
-    counts = example((False, True))
-    result = scores.summary(counts, absent)
-    pooled = counts.counts.sum((0, 1))
-    assert result[names.MIOU] == pytest.approx(float(scores.miou(pooled, absent, None)))
-    regions = [
-        float(scores.miou(counts.counts[:, region].sum(0), absent, None)) for region in range(3)
-    ]
-    assert [result[names.region(number)] for number in (1, 2, 3)] == pytest.approx(regions)
-    assert result[names.VAR] == pytest.approx(np.var(np.array(regions) * 100))
-    assert result[names.class_iou("car")] == pytest.approx(scores.iou(pooled, absent)[1])
-    night = scores.summary(counts.select(["00002N"]), absent)
-    assert result[names.subset(names.NIGHT, names.MIOU)] == night[names.MIOU]
-    assert result["night/Var"] == night[names.VAR]
-    assert all(isinstance(value, float) for value in result.values())
-
-
-def test_summary_without_day_and_night_has_no_parts() -> None:
-    result = scores.summary(example(None), "released")
-    assert set(result) == {
-        *("mIoU", "Var", "mAcc", "mPrecision", "mF1", "pixel_accuracy"),
-        *("region/1", "region/2", "region/3", "class/unlabeled", "class/car"),
-    }
-
-
 def test_the_pooled_mean_is_not_the_mean_of_the_regions() -> None:
     # Region 1: 90 of 100 pixels right; region 2: 1 of 4.
     counts = np.array([[[90, 10], [0, 0]], [[0, 0], [3, 1]]])
     pooled = float(scores.miou(counts.sum(0), "released", None))
     assert pooled == pytest.approx((90 / 103 + 1 / 14) / 2)
     assert pooled != pytest.approx(scores.miou(counts, "released", None).mean())
+
+
+CLASSES = ("road", "car", "person", "void")
+LEFT = [[6, 1, 0, 1], [1, 3, 0, 0], [0, 0, 0, 0], [2, 0, 0, 5]]
+"""By label and prediction. Road 6 of 11, car 3 of 5, nobody; void 5 of 8."""
+
+RIGHT = [[4, 0, 0, 0], [0, 0, 0, 2], [0, 0, 2, 0], [0, 0, 2, 1]]
+"""Road 4 of 4, car 0 of 2, person 2 of 4; void 1 of 5."""
+
+IN_LEFT = {"released": (6 / 11 + 3 / 5 + 0) / 3, "exclude": (6 / 11 + 3 / 5) / 2}
+IN_RIGHT = (1 + 0 + 1 / 2) / 3
+
+# Both: road 10 of 15, car 3 of 7, person 2 of 4; void 6 of 13.
+BY_HAND = {
+    "mIoU": (10 / 15 + 3 / 7 + 2 / 4) / 3,
+    "mAcc": (10 / 12 + 3 / 6 + 2 / 2) / 3,
+    "mPrecision": (10 / 13 + 3 / 4 + 2 / 4) / 3,
+    "mF1": (20 / 25 + 6 / 10 + 4 / 6) / 3,
+    "pixel_accuracy": (10 + 3 + 2 + 6) / 30,
+    "region/2": IN_RIGHT,
+    "class/void": 6 / 13,
+    "class/void/acc": 6 / 10,
+    "class/void/region/1": 5 / 8,
+    "class/car": 3 / 7,
+}
+
+
+def counts_of(
+    *images: object,
+    unscored: tuple[str, ...] = ("void",),
+    night: tuple[bool, ...] | None = None,
+    partition: str = "ring2",
+    absent: Any = "released",
+) -> Counts:
+    return Counts(
+        counts=np.array(images or [[LEFT, RIGHT]], np.int32),
+        names=tuple(f"{index:05d}" for index in range(max(1, len(images)))),
+        night=night,
+        classes=CLASSES,
+        partition=partition,
+        dataset="f",
+        split="test",
+        unscored=unscored,
+        absent=absent,
+    )
+
+
+@pytest.mark.parametrize("absent", ["released", "exclude"])
+def test_means_by_hand(absent) -> None:
+    counts = counts_of()
+    expected = BY_HAND | {"region/1": IN_LEFT[absent]}
+    # Two regions: half their difference is the deviation of both.
+    spread = (100 * (IN_LEFT[absent] - IN_RIGHT) / 2) ** 2
+    summary = scores.summary(counts, absent)
+    for metric, fraction in expected.items():
+        assert value(metric, counts, absent) == pytest.approx(100 * fraction), metric
+        if metric in summary:
+            assert summary[metric] == pytest.approx(fraction), metric
+    assert value("Var", counts, absent) == summary["Var"] == pytest.approx(spread)
+    assert {f"class/{name}" for name in CLASSES} < set(summary)  # all, the unscored one too
+
+
+def test_a_region_of_unscored_pixels_alone() -> None:
+    nothing = np.zeros((4, 4), int)
+    nothing[3, 3] = 9
+    counts = counts_of([LEFT, nothing, RIGHT], partition="ring3")
+    released = [IN_LEFT["released"], 0, IN_RIGHT]
+    assert value("region/2", counts, "released") == 0
+    assert value("Var", counts, "released") == pytest.approx(np.var(np.array(released) * 100))
+    assert np.isnan(value("region/2", counts, "exclude"))
+    expected = (100 * (IN_LEFT["exclude"] - IN_RIGHT) / 2) ** 2
+    assert value("Var", counts, "exclude") == pytest.approx(expected)
+
+
+def test_day_and_night_and_chosen_images_leave_it_out_too() -> None:
+    counts = counts_of([LEFT, LEFT], [RIGHT, RIGHT], night=(False, True))
+    day, night = 100 * IN_LEFT["released"], 100 * IN_RIGHT
+    assert value("day/mIoU", counts, "released") == pytest.approx(day)
+    assert value("night/mIoU", counts, "released") == pytest.approx(night)
+    summary = scores.summary(counts, "released")
+    assert 100 * summary["day/mIoU"] == pytest.approx(day)
+    assert summary["night/Var"] == pytest.approx(0)
+    chosen = [counts.select(["00001"]), counts.parts()["day"], replace(counts, split="val")]
+    assert [each.unscored for each in chosen] == [("void",)] * 3
+    assert value("mIoU", chosen[0], "released") == pytest.approx(night)
+
+
+def test_pairs_of_frames_by_hand() -> None:
+    """By label (the last: no class), first, second."""
+    pairs = np.zeros((5, 4, 4), int)
+    pairs[0, 0, 0] = 3  # road, twice seen as such
+    pairs[0, 0, 1] = 1
+    pairs[1, 1, 1] = 2
+    pairs[2, 3, 3] = 4  # a person, twice void
+    pairs[3, 3, 0] = 2  # void, then road
+    counts = counts_of(pairs, partition="aligned1")
+    # TC: road 3 of 6, car 2 of 3, person in no frame; void 4 of 6.
+    # CA: road 3 of 6, car 2 of 3, person 0 of 4 (label alone); void 0 of 6.
+    assert value("class/void/TC", counts, "released") == pytest.approx(100 * 4 / 6)
+    assert value("TC", counts, "released") == pytest.approx(100 * (3 / 6 + 2 / 3 + 0) / 3)
+    assert value("TC", counts, "exclude") == pytest.approx(100 * (3 / 6 + 2 / 3) / 2)
+    for absent in ("released", "exclude"):
+        assert value("CA", counts, absent) == pytest.approx(100 * (3 / 6 + 2 / 3 + 0) / 3)
+    # As released: the three sizes less twice what all three share.
+    road, car = 3 / (4 + 5 + 4 - 2 * 3), 2 / (2 + 3 + 2 - 2 * 2)
+    assert value("CA_released", counts, "released") == pytest.approx(100 * (road + car + 0) / 3)
+
+
+def test_files_from_before_score_every_class(tmp_path: Path) -> None:
+    counts = counts_of()
+    stored = {each.name: getattr(counts, each.name) for each in fields(counts)}
+    del stored["unscored"]
+    ARCHIVE.save(tmp_path / "old.npz", {**stored, "night": np.array((), bool)})
+    loaded = Counts.load(tmp_path / "old.npz")
+    assert loaded.unscored == ()
+    assert loaded.scored.tolist() == [True] * 4
+    assert counts.scored.tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("unscored", [("sky",), ("void", "Void"), CLASSES])
+def test_unscored_are_some_of_the_classes(unscored) -> None:
+    with pytest.raises(ValueError, match="some of the classes road, car, person, void, but not"):
+        counts_of(unscored=unscored)
+
+
+def test_means_over_different_classes_are_not_compared() -> None:
+    check_same_means(counts_of(unscored=("void", "car")), counts_of(unscored=("car", "void")))
+    with pytest.raises(
+        InputError, match=r"leave void out.*leave out no class; .*dataset\.unscored"
+    ):
+        check_same_means(counts_of(), counts_of(unscored=()))
+
+
+def test_absent_notes_by_hand() -> None:
+    """Two regions: person nowhere, void predicted on 5 road pixels of region 2 only."""
+    regions = np.zeros((2, 4, 4), int)
+    regions[:, 0, 0], regions[0, 1, 1], regions[1, 0, 3] = (90, 95), 10, 5
+    every = np.ones(4, bool)
+    for absent, counted in (("released", "counted as 0"), ("exclude", "left out of the mean")):
+        assert absent_notes(regions, CLASSES, every, "test", absent) == (
+            f"absent from the test split: person ({counted})",
+            "predicted, but not labelled in the test split: void (IoU 0)",
+            f"absent from some regions: car (region 2), void (region 1); {counted} there",
+        )
+    scored = np.array([True, False, False, False])
+    assert absent_notes(regions, CLASSES, scored, "test", "released") == ()
+    assert absent_notes(np.ones_like(regions), CLASSES, every, "test", "exclude") == ()
+
+
+def test_counts_keep_their_convention_and_are_not_mixed(tmp_path: Path) -> None:
+    path = tmp_path / "counts.npz"
+    both = [counts_of(absent=absent) for absent in ("released", "exclude")]
+    for counts in both:
+        counts.save(path)
+        assert Counts.load(path).absent == Counts.load(path).parts().get("day", counts).absent
+        assert Counts.load(path).absent == counts.absent
+    values = ARCHIVE.load(path)
+    ARCHIVE.save(path, {key: value for key, value in values.items() if key != "absent"})
+    assert Counts.load(path).absent == "released"
+    assert convention(both[1:]) == "exclude"
+    with pytest.raises(InputError, match="choose absent=released or absent=exclude"):
+        convention(both)
+    with pytest.raises(ValueError, match="expected released or exclude, got 'zero'"):
+        counts_of(absent="zero")

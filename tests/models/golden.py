@@ -66,16 +66,21 @@ def recorded(pattern: str, *, fast: Collection[str]) -> list[Any]:
     ]
 
 
-def load(name: str) -> Golden:
-    """The golden file `name`, such as "rtfnet_50"."""
+def fill_rule() -> ModuleType:
+    """The module that states how weights, images and labels are filled."""
     spec = importlib.util.spec_from_file_location("golden_fill", FOLDER / "fill.py")
     assert spec is not None
     assert spec.loader is not None
     fill = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(fill)
+    return fill
+
+
+def load(name: str) -> Golden:
+    """The golden file `name`, such as "rtfnet_50"."""
     with np.load(FOLDER / f"{name}.npz") as archive:
         arrays = dict(archive)
-    return Golden(json.loads((FOLDER / f"{name}.json").read_text()), arrays, fill)
+    return Golden(json.loads((FOLDER / f"{name}.json").read_text()), arrays, fill_rule())
 
 
 def compose(*overrides: str) -> DictConfig:
@@ -118,14 +123,6 @@ def fill_network(
     net.load_state_dict(state, strict=False)
 
 
-def deviations(golden: Golden, found: dict[str, Tensor]) -> dict[str, float]:
-    """Largest difference of every recorded tensor, in units of its tolerance; all must be found."""
-    skipped = {"argmax", "network_input", "mask_pair"}
-    wanted = {key for key in golden.facts["outputs"] if key not in skipped}
-    assert wanted <= found.keys(), f"not computed: {sorted(wanted - found.keys())}"
-    return {key: deviation(golden, key, found[key]) for key in sorted(wanted)}
-
-
 def deviation(golden: Golden, key: str, found: Tensor) -> float:
     """Largest difference of one recorded tensor, in units of its tolerance."""
     about, value = golden.facts["outputs"][key], found.detach().contiguous().numpy()
@@ -138,19 +135,21 @@ def deviation(golden: Golden, key: str, found: Tensor) -> float:
 
 def check_all(golden: Golden, found: dict[str, Tensor]) -> None:
     """Fail with the tensors that differ by more than their tolerance; print the worst."""
-    found_deviations = deviations(golden, found)
+    wanted = set(golden.facts["outputs"]) - {"argmax", "network_input", "mask_pair"}
+    assert wanted <= found.keys(), f"not computed: {sorted(wanted - found.keys())}"
+    found_deviations = {key: deviation(golden, key, found[key]) for key in sorted(wanted)}
     worst = max(found_deviations, key=lambda key: found_deviations[key])
     print(f"{golden.facts['network']}: worst {worst} at {found_deviations[worst]:.2g} of tolerance")
     assert {key: value for key, value in found_deviations.items() if not value <= 1} == {}
 
 
-def hook(net: nn.Module, named: dict[str, str]) -> dict[str, Tensor]:
-    """Outputs of submodules, filled by the next forward: name in the record -> module path."""
+def hook(net: nn.Module, named: dict[str, str], *, inputs: bool = False) -> dict[str, Tensor]:
+    """Outputs (or inputs) of submodules, filled by the next forward: name -> module path."""
     seen: dict[str, Tensor] = {}
 
     def note(name: str) -> Callable[..., None]:
-        def called(_module: nn.Module, _inputs: Any, output: Tensor) -> None:
-            seen[name] = output
+        def called(_module: nn.Module, given: tuple[Tensor, ...], output: Any) -> None:
+            seen[name] = given[0] if inputs else output
 
         return called
 

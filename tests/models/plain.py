@@ -1,40 +1,88 @@
-"""A second, plain computation of residual networks from their weights, to compare with."""
+"""Networks of few channels, and a second, plain computation from their weights to compare with."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rgbt.models.cmx.model import CMX
+from rgbt.models.critic import Critic
+from rgbt.models.deeplabv2.model import DeepLabV2
 from rgbt.models.inputs import Inputs
+from rgbt.models.mask2former.model import Mask2Former
+from rgbt.models.mfnet import MFNet
+from rgbt.models.pspnet import PSPNet
+from rgbt.models.rtfnet import RTFNet
 
-HALF = (127.5, 127.5, 127.5)
+NANO: dict[str, tuple[Any, dict[str, Any]]] = {
+    "mfnet": (MFNet, {"num_classes": 3, "rgb_widths": (2, 3, 4, 6), "thermal_widths": (3, 2, 3, 4),
+                      "decoder_width": 5, "final_activation": True}),
+    "rtfnet": (RTFNet, {"num_classes": 4, "depth": 18, "base_width": 4, "final_relu": False,
+                        "thermal_stem": "rgb_mean"}),
+    "pspnet": (PSPNet, {"num_classes": 4, "depths": (1, 2, 3, 2), "base_width": 4,
+                        "decoder_width": 5, "modalities": "late_fusion", "dropout": (0.3, 0.15),
+                        "align_corners": False}),
+    "deeplabv2": (DeepLabV2, {"num_classes": 3, "depths": (1, 2, 2, 2), "base_width": 2,
+                              "ceil_mode": True, "train_norm": "all", "heads": ("source", "target"),
+                              "auxiliary": True, "decoder": "basic", "rates": (2, 4, 6, 8),
+                              "summed_rates": (2, 4, 6, 8), "dropout": (0.0, 0.0),
+                              "align_corners": True}),
+    "cmx": (CMX, {"num_classes": 4, "embed_dims": (8, 8, 12, 16), "depths": (1, 2, 1, 1),
+                  "num_heads": (1, 2, 3, 4), "sr_ratios": (8, 4, 2, 1), "mlp_ratio": 2.0,
+                  "decoder_dim": 16, "drop_path_rate": 0.0, "drop_path_stage2": "ramp",
+                  "decoder_dropout": 0.0, "decoder_norm_eps": 1e-3,
+                  "decoder_norm_eps_eval": None}),
+    "mask2former": (Mask2Former, {"num_classes": 4, "embed_dim": 8, "depths": (1, 1, 2, 1),
+                                  "num_heads": (1, 1, 2, 2), "window_size": 3, "mlp_ratio": 2.0,
+                                  "drop_path_rate": 0.0, "share_start": 4, "fusion": "max",
+                                  "hidden_dim": 32, "num_queries": 5, "encoder_layers": 1,
+                                  "encoder_ffn_dim": 16, "decoder_layers": 3,
+                                  "decoder_ffn_dim": 16, "attention_heads": 2,
+                                  "pixel_decoder_fp32": True}),
+    "critic": (Critic, {"in_channels": 2, "base_width": 2, "upsample": False,
+                        "align_corners": False}),
+}  # fmt: skip
+
+
+def nano(name: str, seed: int = 0, **changes: Any) -> Any:
+    """A small network whose first weights depend on the seed alone."""
+    kind, settings = NANO[name]
+    given = {} if name == "critic" else {"inputs": half(3 if name in ("deeplabv2", "cmx") else 1)}
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return kind(**{**settings, **given, **changes})
 
 
 def half(thermal_channels: int) -> Inputs:
     """0..1 to -1..1."""
-    values = HALF[:thermal_channels]
+    values = (127.5, 127.5, 127.5)
     return Inputs(
-        rgb_order="rgb",
-        rgb_mean=HALF,
-        rgb_std=HALF,
-        thermal_mean=values,
-        thermal_std=values,
-        thermal_scale="fixed",
+        **{"rgb_order": "rgb", "rgb_mean": values, "rgb_std": values, "thermal_scale": "fixed"},
+        thermal_mean=values[:thermal_channels],
+        thermal_std=values[:thermal_channels],
     )
 
 
-def images(count: int, height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return torch.rand(count, 3, height, width, generator=g), torch.rand(
-        count, 1, height, width, generator=g
-    )
+def images(count: int, height: int = 64, width: int = 96, seed: int = 0) -> tuple[Tensor, Tensor]:
+    g = generator(seed)
+    rgb = torch.rand(count, 3, height, width, generator=g)
+    return rgb, torch.rand(count, 1, height, width, generator=g)
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=generator(seed))
+
+
+def count(net: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in net.parameters())
 
 
 def randomise(net: nn.Module) -> dict[str, Tensor]:
@@ -74,6 +122,9 @@ class Plain:
         )
         return (x - mean) / torch.sqrt(var + 1e-5) * weight + bias
 
+    def normed(self, conv: str, norm: str, x: Tensor, **options: int) -> Tensor:
+        return self.norm(norm, self.conv(conv, x, **options))
+
     def stage(
         self,
         name: str,
@@ -82,29 +133,35 @@ class Plain:
         strides: tuple[int, int] = (1, 1),
         dilations: tuple[int, int] = (1, 1),
     ) -> Tensor:
-        """Bottlenecks `name`.0, .1, ...
+        """Residual blocks `name`.0, .1, ...
 
-        strides: of the first block's 1x1 and 3x3 convolution; its shortcut takes both.
-        dilations: of the first block and of the others.
+        strides: of the first block's first two convolutions; its shortcut takes both.
+        dilations: of the first block's second convolution and of the others'.
         """
         block = 0
         while f"{name}.{block}.conv1.weight" in self.state:
             at = f"{name}.{block}"
             first, second = strides if block == 0 else (1, 1)
-            y = self.norm(f"{at}.bn1", self.conv(f"{at}.conv1", x, stride=first)).clamp(min=0)
-            y = self.conv(f"{at}.conv2", y, stride=second, dilation=dilations[min(block, 1)])
-            y = self.norm(f"{at}.bn2", y).clamp(min=0)
-            y = self.norm(f"{at}.bn3", self.conv(f"{at}.conv3", y))
+            y = self.normed(f"{at}.conv1", f"{at}.bn1", x, stride=first).clamp(min=0)
+            given = {"stride": second, "dilation": dilations[min(block, 1)]}
+            y = self.normed(f"{at}.conv2", f"{at}.bn2", y, **given)
+            if f"{at}.conv3.weight" in self.state:
+                y = self.normed(f"{at}.conv3", f"{at}.bn3", y.clamp(min=0))
             if f"{at}.downsample.0.weight" in self.state:
-                x = self.conv(f"{at}.downsample.0", x, stride=first * second)
-                x = self.norm(f"{at}.downsample.1", x)
+                down = (f"{at}.downsample.0", f"{at}.downsample.1")
+                x = self.normed(*down, x, stride=first * second)
             x = (x + y).clamp(min=0)
             block += 1
         return x
+
+    def doubled(self, conv: str, norm: str, x: Tensor) -> Tensor:
+        """Transposed 2x2 convolution with stride 2: every pixel becomes its own 2x2 square."""
+        squares = torch.einsum("nihw,iokl->nohkwl", x, self.state[f"{conv}.weight"])
+        return self.norm(norm, squares.flatten(4, 5).flatten(2, 3))
 
     def up(self, name: str, x: Tensor, *, align_corners: bool) -> Tensor:
         """Twice the size, convolution, normalisation, one slope for what is negative."""
         size = (2 * x.shape[2], 2 * x.shape[3])
         x = F.interpolate(x, size=size, mode="bilinear", align_corners=align_corners)
-        x = self.norm(f"{name}.conv.1", self.conv(f"{name}.conv.0", x))
+        x = self.normed(f"{name}.conv.0", f"{name}.conv.1", x)
         return torch.where(x > 0, x, self.state[f"{name}.conv.2.weight"] * x)

@@ -9,7 +9,7 @@ import torch
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.models.inputs import Inputs, expand_cells, only_view
+from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.types import MaskPair
 from tests.models.golden import compose
 
@@ -83,13 +83,6 @@ def test_padding_and_hidden_pixels_are_the_mean() -> None:
     assert (images.thermal[0, 0, :40, :60] != 0).sum() == 8 * 28
 
 
-def test_any_size_without_a_multiple() -> None:
-    hidden = torch.ones(1, 2, 2, dtype=torch.bool)
-    images = inputs()(*ones(37, 41), MaskPair(hidden, ~hidden))
-    assert images.rgb.shape[-2:] == (37, 41)
-    assert images.rgb.abs().sum() == 0
-
-
 def test_cells_become_squares_of_units() -> None:
     hidden = torch.tensor([[[True, False]]])
     pixels = expand_cells(MaskPair(hidden, hidden), 1, (32, 64))
@@ -116,20 +109,6 @@ def test_cells_that_do_not_fit_are_refused(grid: tuple[int, int], unit: int) -> 
 def test_settings_that_do_not_fit_are_refused(change: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         inputs(**change)
-
-
-def test_shapes_that_do_not_fit_raise() -> None:
-    rgb, thermal = ones()
-    with pytest.raises(ValueError, match="thermal"):
-        inputs()(rgb, thermal[..., 1:])
-
-
-def test_one_view_at_a_time() -> None:
-    assert only_view((), ("rgb", "thermal"), "X") == "rgb"
-    assert only_view(("thermal",), ("rgb", "thermal"), "X") == "thermal"
-    for asked in (("rgbt",), ("rgb", "thermal")):
-        with pytest.raises(InputError, match="X predicts from rgb or thermal"):
-            only_view(asked, ("rgb", "thermal"), "X")
 
 
 @pytest.mark.parametrize(

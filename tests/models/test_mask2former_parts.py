@@ -10,10 +10,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.decoder import QueryAttention, shrink
-from rgbt.models.mask2former.deformable import DeformableAttention
-from rgbt.models.mask2former.position import centre_grid, sine_code
-from rgbt.models.mask2former.swin import PatchMerging, SwinBlock, SwinShape
-from rgbt.models.mask2former.windows import relative_index, shift_mask
+from rgbt.models.mask2former.deformable import DeformableAttention, centre_grid
+from rgbt.models.mask2former.pixel_decoder import sine_code
+from rgbt.models.mask2former.swin import (
+    PatchMerging,
+    SwinBlock,
+    SwinShape,
+    relative_index,
+    shift_mask,
+)
 
 CPU = torch.device("cpu")
 

@@ -1,112 +1,40 @@
-"""HeatNet's PSPNet: sizes, what is seen, a second computation, weights as drawn, dropout."""
+"""HeatNet's PSPNet: what is seen, a second computation, weights as drawn."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
 from rgbt.models.pspnet import PSPNet
-from rgbt.types import MaskPair
-from tests.models.golden import network
-from tests.models.plain import Plain, generator, half, images, randomise
+from tests.models.plain import Plain, images, nano, randomise
 
-NANO = {
-    "num_classes": 4,
-    "depths": (1, 2, 3, 2),
-    "base_width": 4,
-    "decoder_width": 5,
-    "modalities": "late_fusion",
-    "dropout": (0.3, 0.15),
-    "align_corners": False,
-}
-ALL = ("late_fusion", "early_fusion", "rgb", "thermal")
+VIEW_OF = {"late_fusion": "rgbt", "early_fusion": "rgbt", "rgb": "rgb", "thermal": "thermal"}
 
 
-def nano(**changes: Any) -> PSPNet:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return PSPNet(**{**NANO, "inputs": half(1), **changes})
-
-
-@pytest.mark.parametrize(
-    ("yaml", "num_classes", "count"),
-    [
-        ("heatnet", 14, 54_361_105),
-        ("heatnet", 13, 54_361_040),
-        ("heatnet_rgb", 14, 53_317_713),
-        ("heatnet_rgb", 13, 53_317_648),
-        ("heatnet_thermal", 14, 53_311_441),
-        ("heatnet_thermal", 13, 53_311_376),
-        ("heatnet_early", 14, 53_320_849),
-    ],
-)
-def test_parameter_count(yaml: str, num_classes: int, count: int) -> None:
-    with torch.device("meta"):
-        net = network(yaml, num_classes)
-    assert sum(parameter.numel() for parameter in net.parameters()) == count
-
-
-@pytest.mark.parametrize("modalities", ALL)
-@pytest.mark.parametrize("size", [(64, 96), (61, 83)])
-def test_shapes(modalities: str, size: tuple[int, int]) -> None:
-    net = nano(modalities=modalities).eval()
-    with torch.no_grad():
-        found = net(*images(2, *size))
-    assert found.logits.shape == (2, 4, *size)
-    branches = 2 if modalities == "late_fusion" else 1
-    h, w = (-(-side // 8) for side in size)
-    assert {name: tuple(x.shape[1:]) for name, x in found.aux.items()} == {
-        "layer4": (128, h, w),
-        "layer3": (64, h, w),
-        "layer2": (32 * branches, h, w),
-        "layer1": (16 * branches, 2 * h, 2 * w),
-        "stem": (4 * branches, 2 * h, 2 * w),
-    }
-
-
-def test_sizes_of_the_release() -> None:
-    with torch.device("meta"):
-        net = network("heatnet", 14).eval()
-        found = net(torch.empty(1, 3, 320, 640), torch.empty(1, 1, 320, 640))
-    assert found.logits.shape == (1, 14, 320, 640)
-    assert {name: tuple(x.shape[1:]) for name, x in found.aux.items()} == {
-        "layer4": (2048, 40, 80),
-        "layer3": (1024, 40, 80),
-        "layer2": (1024, 40, 80),
-        "layer1": (512, 80, 160),
-        "stem": (128, 80, 160),
-    }
-
-
-def test_one_view() -> None:
-    assert [nano(modalities=name).record.views for name in ALL] == [
-        ("rgbt",),
-        ("rgbt",),
-        ("rgb",),
-        ("thermal",),
-    ]
-    net, pair = nano(modalities="rgb").eval(), images(1, 32, 32)
-    assert torch.equal(net(*pair).logits, net(*pair, views=("rgb",)).logits)
-    with pytest.raises(InputError, match="PSPNet predicts from rgb"):
-        net(*pair, views=("rgbt",))
-
-
-@pytest.mark.parametrize("modalities", ALL)
-def test_what_is_seen(modalities: str) -> None:
-    net = nano(modalities=modalities).eval()
+@pytest.mark.parametrize("modalities", VIEW_OF)
+def test_modalities_decide_what_is_seen_and_returned(modalities: str) -> None:
+    net = nano("pspnet", modalities=modalities).eval()
     randomise(net)
-    rgb, thermal = images(1, 32, 32)
+    assert net.record.views == (VIEW_OF[modalities],)
+    assert net.record.pretrained_parts == ("feats.",)
+    branches = 2 if modalities == "late_fusion" else 1
+    # After two branches the third stage keeps its width and has no projection.
+    assert isinstance(net.feats.layer3[0].downsample, nn.Identity) == (branches == 2)
+    rgb, thermal = images(1, 61, 83)
     with torch.no_grad():
-        before = net(rgb, thermal).logits
-        sees_rgb = not torch.equal(before, net(1 - rgb, thermal).logits)
-        sees_thermal = not torch.equal(before, net(rgb, 1 - thermal).logits)
-    assert sees_rgb == (modalities != "thermal")
-    assert sees_thermal == (modalities != "rgb")
+        before = net(rgb, thermal)
+        sees_rgb = not torch.equal(before.logits, net(1 - rgb, thermal).logits)
+        sees_thermal = not torch.equal(before.logits, net(rgb, 1 - thermal).logits)
+    assert (sees_rgb, sees_thermal) == (modalities != "thermal", modalities != "rgb")
+    assert {name: tuple(x.shape[1:]) for name, x in before.aux.items()} == {
+        "layer4": (128, 8, 11),
+        "layer3": (64, 8, 11),
+        "layer2": (32 * branches, 8, 11),
+        "layer1": (16 * branches, 16, 22),
+        "stem": (4 * branches, 16, 22),
+    }
 
 
 def reference(net: PSPNet, rgb: Tensor, thermal: Tensor) -> dict[str, Tensor]:
@@ -118,7 +46,7 @@ def reference(net: PSPNet, rgb: Tensor, thermal: Tensor) -> dict[str, Tensor]:
 
     found: dict[str, list[Tensor]] = {"stem": [], "layer1": [], "layer2": []}
     for end, image in (("", 2 * rgb - 1), ("_2", 2 * thermal - 1)):
-        x = plain.norm(f"feats.bn1{end}", plain.conv(f"feats.conv1{end}", image, stride=2))
+        x = plain.normed(f"feats.conv1{end}", f"feats.bn1{end}", image, stride=2)
         x = F.max_pool2d(x.clamp(min=0), 3, 2, 1)
         found["stem"].append(x)
         x = plain.stage(f"feats.layer1{end}", x)
@@ -138,8 +66,8 @@ def reference(net: PSPNet, rgb: Tensor, thermal: Tensor) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("align_corners", [False, True])
-def test_against_a_second_computation(align_corners: bool) -> None:
-    net = nano(align_corners=align_corners).eval()
+def test_values_equal_a_second_computation(align_corners: bool) -> None:
+    net = nano("pspnet", align_corners=align_corners).eval()
     randomise(net)
     rgb, thermal = images(2, 64, 88)
     with torch.no_grad():
@@ -150,19 +78,10 @@ def test_against_a_second_computation(align_corners: bool) -> None:
         torch.testing.assert_close(found[name], value, rtol=1e-4, atol=1e-5, msg=name)
 
 
-def test_third_stage_keeps_its_input_after_two_branches() -> None:
-    projected = {
-        modalities: isinstance(nano(modalities=modalities).feats.layer3[0].downsample, nn.Identity)
-        for modalities in ALL
-    }
-    assert projected == {name: name == "late_fusion" for name in ALL}
-
-
 def test_weights_are_drawn_as_released() -> None:
-    net = nano(base_width=16)
-    convolutions = [m for m in net.modules() if isinstance(m, nn.Conv2d)]
+    net = nano("pspnet", base_width=16)
+    drawn = torch.cat([m.weight.flatten() for m in net.modules() if isinstance(m, nn.Conv2d)])
     norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
-    drawn = torch.cat([m.weight.flatten() for m in convolutions])
     scales = torch.cat([m.weight for m in norms])
     assert drawn.mean().item() == pytest.approx(0, abs=1e-4)
     assert drawn.std().item() == pytest.approx(0.02, rel=0.01)
@@ -172,50 +91,3 @@ def test_weights_are_drawn_as_released() -> None:
     # torch's own: uniform within one over the root of the fan-in
     assert net.psp.bottleneck.bias.abs().max().item() == pytest.approx(2560**-0.5, rel=0.02)
     assert [net.get_parameter(f"up_{i}.conv.2.weight").item() for i in (1, 2, 3)] == [0.25] * 3
-
-
-def test_hidden_pixels_do_not_count() -> None:
-    net = nano().eval()
-    rgb, thermal = images(1, 64, 64)
-    cells = torch.tensor([[[True, False], [False, False]]])
-    masks = MaskPair(cells, torch.zeros_like(cells))
-    other = rgb.clone()
-    other[..., :32, :32] = 0.9
-    seen = rgb.clone()
-    seen[..., 32:, 32:] = 0.9
-    with torch.no_grad():
-        first = net(rgb, thermal, masks).logits
-        assert torch.equal(first, net(other, thermal, masks).logits)
-        assert not torch.equal(first, net(seen, thermal, masks).logits)
-        assert not torch.equal(first, net(rgb, thermal).logits)
-
-
-def test_dropped_channels_depend_on_the_generator_alone() -> None:
-    net, pair = nano(), images(2, 32, 32)
-
-    def logits(seed: int, global_seed: int) -> Tensor:
-        torch.manual_seed(global_seed)
-        return net(*pair, generator=generator(seed)).logits
-
-    with torch.random.fork_rng():
-        assert torch.equal(logits(0, 1), logits(0, 2))
-        assert not torch.equal(logits(0, 1), logits(1, 1))
-    with pytest.raises(ValueError, match="generator"):
-        net(*pair)
-    assert nano(dropout=(0.0, 0.0))(*pair).logits.shape == (2, 4, 32, 32)
-
-
-def test_gradient_reaches_every_weight() -> None:
-    net = nano()
-    output = net(*images(2, 64, 64), generator=generator())
-    F.cross_entropy(output.logits, torch.zeros(2, 64, 64, dtype=torch.int64)).backward()
-    unmoved = {name for name, p in net.named_parameters() if not p.grad.abs().sum() > 0}
-    # A bias before a normalisation cancels, up to rounding.
-    assert unmoved <= {f"up_{index}.conv.0.bias" for index in (1, 2, 3)}
-
-
-def test_pretrained_part_is_the_encoder() -> None:
-    net = nano()
-    names = {name.split(".")[0] for name, _ in net.named_parameters()}
-    assert names == {"feats", "psp", "up_1", "up_2", "up_3", "final"}
-    assert net.record.pretrained_parts == ("feats.",)

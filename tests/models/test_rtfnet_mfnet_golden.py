@@ -5,9 +5,6 @@ Confusion counts on real pairs are compared in tests/test_weights_run.py, by the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -23,27 +20,12 @@ requires_weights = pytest.mark.skipif(
 )
 
 
-def hook_inputs(net: nn.Module, named: dict[str, str]) -> dict[str, Tensor]:
-    """Inputs of submodules, filled by the next forward: name in the record -> module path."""
-    seen: dict[str, Tensor] = {}
-
-    def note(name: str) -> Callable[..., None]:
-        def called(_module: nn.Module, inputs: tuple[Tensor]) -> None:
-            seen[name] = inputs[0]
-
-        return called
-
-    for name, path in named.items():
-        net.get_submodule(path).register_forward_pre_hook(note(name))
-    return seen
-
-
 def check_record(
     recorded: golden.Golden, net: nn.Module, outputs: dict[str, str], inputs: dict[str, str]
 ) -> None:
     golden.fill_network(net, recorded)
     assert set(net.state_dict()) == set(recorded.facts["keys"])
-    after, before = golden.hook(net, outputs), hook_inputs(net, inputs)
+    after, before = golden.hook(net, outputs), golden.hook(net, inputs, inputs=True)
     with torch.inference_mode():
         logits = net(*recorded.image).logits
         images = net.inputs(*recorded.image)
@@ -82,16 +64,6 @@ def test_mfnet_every_recorded_tensor(name: str, _: str) -> None:
     check_record(recorded, net, outputs, inputs)
 
 
-def released_network() -> Any:
-    """MFNet with the weights that its authors' PyTorch release holds."""
-    state = torch.load(REAL / "mfnet_weights" / "final.pth", "cpu", weights_only=True)
-    net = golden.network("mfnet").eval()
-    # Saved before batch normalisations counted: torch itself adds the 38 counters that are missing.
-    assert len(state) == 228
-    net.load_state_dict(state)
-    return net
-
-
 def images(rgb: np.ndarray, thermal: np.ndarray) -> tuple[Tensor, Tensor]:
     return (
         torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255,
@@ -102,7 +74,11 @@ def images(rgb: np.ndarray, thermal: np.ndarray) -> tuple[Tensor, Tensor]:
 @requires_weights
 def test_trained_mfnet_on_two_frames() -> None:
     """Pixels per class and one pixel's logits, as the release gives them."""
-    net = released_network()
+    state = torch.load(REAL / "mfnet_weights" / "final.pth", "cpu", weights_only=True)
+    net = golden.network("mfnet").eval()
+    # Saved before batch normalisations counted: torch itself adds the 38 counters that are missing.
+    assert len(state) == 228
+    net.load_state_dict(state)
     folder = REAL / "mfnet_author_samples" / "images"
     counts = {
         "01234N": [300176, 521, 4026, 3, 2474, 0, 0, 0, 0],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
 from rgbt.requirements import Record, record_of
 from rgbt.types import Batch, Output, View
+from tests.losses.problems import batch_of
 
 K = 3
 LR, MOMENTUM = 0.5, 0.9
@@ -86,14 +87,13 @@ def network(heads: bool, **others: Any) -> Linear:
 
 def images(purpose: str, number: int, confidence: bool = False) -> Batch:
     draw = torch_generator(0, purpose, number)
-    return Batch(
-        rgb=torch.randint(0, 256, (2, 3, 4, 4), generator=draw, dtype=torch.uint8),
-        thermal=torch.randint(0, 256, (2, 1, 4, 4), generator=draw, dtype=torch.uint8),
-        label=torch.randint(0, K, (2, 4, 4), generator=draw),
-        name=("a", "b"),
-        centre_yx=torch.zeros(2, 2, dtype=torch.int64),
-        position=None,
-        original_hw=torch.full((2, 2), 4),
+    rgb, thermal = (
+        torch.randint(0, 256, (2, c, 4, 4), generator=draw, dtype=torch.uint8) for c in (3, 1)
+    )
+    return replace(
+        batch_of(torch.randint(0, K, (2, 4, 4), generator=draw)),
+        rgb=rgb,
+        thermal=thermal,
         confidence=torch.rand(2, 4, 4, generator=draw) if confidence else None,
     )
 
@@ -150,9 +150,8 @@ def trained(
 
 def values_of(module: nn.Module) -> Values:
     """Parameters as matrices, float64."""
-    return {name: each.detach().double().flatten(1).clone() if each.dim() > 1
-            else each.detach().double().clone()
-            for name, each in module.named_parameters()}  # fmt: skip
+    each = ((name, p.detach().double().clone()) for name, p in module.named_parameters())
+    return {name: p.flatten(1) if p.dim() > 1 else p for name, p in each}
 
 
 def pixels(batch: Batch, view: str) -> tuple[Tensor, Tensor]:

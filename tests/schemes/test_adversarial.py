@@ -13,11 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.data.pairs import LoadedPair
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
-from rgbt.models.critic import Critic
-from rgbt.requirements import record_of
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.types import TwoDomains
 from tests.schemes.linear import (
@@ -33,7 +30,6 @@ from tests.schemes.linear import (
     domains,
     generator_of,
     gradient,
-    images,
     nats,
     network,
     pairs,
@@ -208,30 +204,11 @@ def test_three_steps_of_network_and_critic(
     scheme = scheme_of(model, heads, **changes)
     confidence = scheme.weighed_by_confidence
     by_hand = ByHand({**PAPERS, **changes}, heads, values_of(model), values_of(critic()))
-    for number, pair in enumerate(islice(pairs(confidence=confidence), 3)):
+    for pair in islice(pairs(confidence=confidence), 3):
         by_hand.step(pair)
-        steps = number + 1
-        model = network(heads)
-        scheme = scheme_of(model, heads, **changes)
-        trained(scheme, model, tmp_path / str(steps), steps, confidence)
-        assert_same(model, by_hand.values)
-        assert_same(scheme.others["critic"], by_hand.judge)
-
-
-def test_the_cases_differ_by_more_than_the_tolerance() -> None:
-    found = []
-    for heads, changes in CASES.values():
-        if heads:
-            continue
-        by_hand = ByHand(
-            {**PAPERS, **changes}, heads, values_of(network(heads)), values_of(critic())
-        )
-        for pair in islice(pairs(confidence=True), 2):
-            by_hand.step(pair)
-        found.append(torch.cat([by_hand.values[SHARED].ravel(), by_hand.judge["weight"].ravel()]))
-    for index, one in enumerate(found):
-        for other in found[:index]:
-            assert (one - other).abs().max() > 1e-4
+    trained(scheme, model, tmp_path, 3, confidence)
+    assert_same(model, by_hand.values)
+    assert_same(scheme.others["critic"], by_hand.judge)
 
 
 # ---- numbers --------------------------------------------------------------------------------
@@ -279,35 +256,6 @@ def test_confidence_weighs_the_adversarial_cost_of_both_domains() -> None:
 
 
 # ---- who steps what -------------------------------------------------------------------------
-
-
-def test_which_optimiser_holds_which_parameters(tmp_path: Path) -> None:
-    model = network(True)
-    scheme = scheme_of(model, True)
-    made = trainer(scheme, model, tmp_path, 1)
-    judge = scheme.others["critic"]
-    names = {id(p): name for name, p in [*model.named_parameters(), *judge.named_parameters()]}
-    held = {
-        name: sorted(names[id(p)] for group in each.param_groups for p in group["params"])
-        for name, each in made.optimizers.items()
-    }
-    assert held == {
-        "source": [SHARED, DAY],
-        "target": [SHARED, DARK],
-        "critic": ["bias", "weight"],
-    }
-
-
-def test_without_its_labels_the_targets_head_gets_the_critics_gradient_alone(
-    tmp_path: Path,
-) -> None:
-    model = network(True)
-    before = values_of(model)
-    trained(scheme_of(model, True, weight=0.0), model, tmp_path, 1)
-    after = values_of(model)
-    assert torch.equal(before[DARK], after[DARK])
-    assert not torch.equal(before[DAY], after[DAY])
-    assert not torch.equal(before[SHARED], after[SHARED])
 
 
 class Normalised(Linear):
@@ -390,24 +338,10 @@ def test_accumulated_steps_are_the_mean_of_their_batches(tmp_path: Path, case: s
         torch.testing.assert_close(value, found[1][0][name], atol=1e-6, rtol=1e-5)
 
 
-def test_the_step_after_a_critics_step_that_broke_off_is_whole() -> None:
-    """A step that ends between its phases leaves nothing that the next one would miss."""
-    model = network(False)
-    scheme = scheme_of(model)
-    judge = scheme.others["critic"]
-    broken = scheme.phases(next(pairs()).to("cpu"), generator_of)
-    next(broken)
-    broken.close()
-    phases = list(scheme.phases(next(pairs()).to("cpu"), generator_of))
-    sum(phases[-1].parts.values()).backward()
-    assert all(parameter.grad is not None for parameter in judge.parameters())
-
-
 # ---- what does not fit ----------------------------------------------------------------------
 
 NETWORK = network(False)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "verdict loss": ({"verdict_loss": "least_square"}, "did you mean 'least_squares'"),
     "no probability": (
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
         r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
@@ -420,28 +354,6 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         scheme_of(NETWORK, **changes)
-
-
-def required(**changes: Any) -> dict[tuple[str, str], Any]:
-    record = record_of(scheme_of(NETWORK, **changes))
-    return {(each.node, each.key): each.value for each in record.requires}
-
-
-def test_a_critic_requires_the_classes_that_it_was_built_for() -> None:
-    judge = Critic(in_channels=K, base_width=4, upsample=False, align_corners=False)
-    record = record_of(scheme_of(NETWORK, critic=judge))
-    assert record.networks["critic"] is judge
-    assert required(critic=judge)[("dataset", "num_classes")] == K
-
-
-def test_labels_and_confidence_are_required_where_they_are_read() -> None:
-    found = required()
-    assert found[("domains", "target_labels")] is False
-    assert ("domains", "target_confidence") not in found
-    found = required(**HEATNET)
-    assert found[("domains", "target_labels")] is True
-    assert found[("domains", "target_confidence")] is True
-    assert found[("model", "outputs")] == "scores"
 
 
 def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
@@ -462,9 +374,3 @@ def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
     judging = scheme_of(network(True), True, **HEATNET)  # the discriminator's step
     list(judging.phases(next(pairs(confidence=True)).to("cpu"), noting))
     assert asked == ["source network", "target network"]
-
-
-def test_another_map_is_refused_when_it_is_judged() -> None:
-    scheme = scheme_of(NETWORK, judged="logit")
-    with pytest.raises(InputError, match="judged"):
-        list(scheme.phases(LoadedPair(images("s", 0), images("t", 0), 0).to("cpu"), generator_of))

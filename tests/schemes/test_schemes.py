@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from rgbt.data.domains import Domain, Domains
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import Record
 from rgbt.schemes.crm import CRM
 from rgbt.schemes.supervised import Supervised
 from rgbt.types import Batch, MaskPair, Output
+from tests.losses.problems import batch_of
 
 ONE = Domains(
     source=Domain(split="train", view=None, head=None, labels="given"),
@@ -21,15 +22,7 @@ B, Q, K = 2, 3, 4
 
 
 def batch() -> Batch:
-    return Batch(
-        rgb=torch.zeros(B, 3, 32, 32),
-        thermal=torch.zeros(B, 1, 32, 32),
-        label=torch.zeros(B, 32, 32, dtype=torch.int64),
-        name=("a", "b"),
-        centre_yx=torch.zeros(B, 2, dtype=torch.int64),
-        position=None,
-        original_hw=torch.full((B, 2), 32),
-    )
+    return batch_of(torch.zeros(B, 32, 32, dtype=torch.int64))
 
 
 def generator_of(purpose: str) -> torch.Generator:
@@ -108,30 +101,6 @@ def test_single_modalities_are_not_decoded_where_nothing_reads_them() -> None:
     assert crm.model.call["views"] == ("rgbt",)
     assert phase.parts["class"] == 1 + 2
     assert phase.parts["sdc"] == 1.0
-
-
-def test_distillation_requires_a_masker_that_hides_cells() -> None:
-    required = [each for each in record_of(scheme(Halves())).requires if each.node == "masker"]
-    assert [(each.key, each.value, each.setting) for each in required] == [
-        ("hides_cells", True, "scheme.complementary_weight=1"),
-        ("hides_cells", True, "scheme.nonlocal_weight=1"),
-    ]
-    plain = record_of(scheme(Nothing(), complementary_weight=0.0, nonlocal_weight=0.0))
-    assert [each.node for each in plain.requires] == ["model", "model"]
-
-
-def test_crm_requires_all_views_in_one_pass() -> None:
-    single, stacked = Record(views=("rgbt",)), Record(stacks_passes=True)
-    required = [each for each in record_of(scheme(Halves())).requires if each.node == "model"]
-    assert [each.is_met_by(single) for each in required] == [False, False]
-    assert [each.is_met_by(stacked) for each in required] == [True, True]
-
-
-def test_supervised_sums_the_parts_of_one_pass() -> None:
-    supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Nothing(), domains=ONE)
-    (phase,) = supervised.phases(batch(), generator_of)
-    assert phase.parts["class"] == 1.0
-    assert supervised.model.call["masks"] is None
 
 
 def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,14 +13,14 @@ from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss
 from rgbt.models.mask2former.model import Mask2Former, semantic_logits
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import Batch, Frame, Output
-from tests.models.test_mask2former import images, nano
+from tests.losses.problems import batch_of
+from tests.models.plain import images
+from tests.models.test_mask2former import nano
 
 B, K, HW = 3, 4, (48, 64)
 
@@ -31,19 +32,11 @@ def generator_of(purpose: str) -> torch.Generator:
 def batch(count: int = B, hw: tuple[int, int] = HW) -> Batch:
     rgb, thermal = images(count, *hw)
     label = torch.randint(K, (count, *hw), generator=torch.Generator().manual_seed(5))
-    return Batch(
-        rgb=rgb,
-        thermal=thermal,
-        label=label,
-        name=tuple("abcdefgh"[:count]),
-        centre_yx=torch.zeros(count, 2, dtype=torch.int64),
-        position=None,
-        original_hw=torch.tensor([hw]).expand(count, 2),
-    )
+    return replace(batch_of(label), rgb=rgb, thermal=thermal)
 
 
 class Net(nn.Module):
-    """Two convolutions; counts its calls and keeps the images."""
+    """Two convolutions; counts its calls."""
 
     def __init__(self, norm: nn.Module) -> None:
         super().__init__()
@@ -51,38 +44,28 @@ class Net(nn.Module):
             torch.manual_seed(0)
             self.first, self.last = nn.Conv2d(4, 6, 3, padding=1), nn.Conv2d(6, K, 1)
         self.norm = norm
-        self.calls: list[tuple[Tensor, Tensor]] = []
+        self.calls: list[int] = []
 
-    def forward(
-        self, rgb: Tensor, thermal: Tensor, *, generator: torch.Generator | None = None
-    ) -> Output:
-        self.calls.append((rgb, thermal))
+    def forward(self, rgb: Tensor, thermal: Tensor, *, generator: Any = None) -> Output:
+        self.calls.append(len(rgb))
         inner = self.norm(self.first(torch.cat([rgb, thermal], 1))).relu()
         return Output(self.last(inner), {"inner": inner})
 
 
 class Recorded:
-    """A loss of two frames that keeps what it is given."""
+    """A loss of two frames, and of their queries, that keeps what it is given."""
 
     record = Record(frames=2, reads_warped=True)
 
     def __call__(
-        self,
-        first: Frame,
-        second: Frame,
-        warped: Tensor | None,
-        valid: Tensor,
-        generator: torch.Generator,
+        self, first: Frame, second: Frame, warped: Tensor, valid: Tensor, generator: Any
     ) -> dict[str, Tensor]:
         self.first, self.second, self.warped, self.valid = first, second, warped, valid
         parts = [(f.logits * f.batch.label[:, None]).square().mean() for f in (first, second)]
-        if warped is not None:
-            parts.append((warped - second.logits.softmax(1)).square().mean())
+        parts.append((warped - second.logits.softmax(1)).square().mean())
+        queries = [frame.output.aux.get("class_logits") for frame in (first, second)]
+        parts += [each.square().mean() for each in queries if each is not None]
         return {str(number): part for number, part in enumerate(parts)}
-
-
-class Segmentation(Recorded):
-    record = Record(frames=2)
 
 
 def view(**changes: Any) -> VirtualView:
@@ -96,35 +79,24 @@ def view(**changes: Any) -> VirtualView:
 
 
 def scheme(model: Any, **changes: Any) -> Temporal:
-    settings: dict[str, Any] = {
-        **{"loss": Recorded(), "view": view()},
-        **{"warps": "probabilities", "detach": False},
-    }
-    return Temporal(model=model, **{**settings, **changes})
+    settings: dict[str, Any] = {"loss": Recorded(), "view": view()}
+    return Temporal(
+        model=model, **{**settings, "warps": "probabilities", "detach": False} | changes
+    )
 
 
-def step(temporal: Temporal, given: Batch | None = None) -> dict[str, Tensor]:
+def step(temporal: Temporal, given: Batch | None = None) -> Any:
+    """The loss that has seen a step, after its backward pass."""
     (phase,) = temporal.phases(given or batch(), generator_of)
     assert phase.optimizers == ("main",)
-    return dict(phase.parts)
+    torch.stack(list(phase.parts.values())).sum().backward()
+    return temporal.loss
 
 
 def gradients(module: nn.Module) -> list[Tensor]:
     found = [parameter.grad for parameter in module.parameters()]
     assert all(each is not None and each.isfinite().all() for each in found)
     return [each for each in found if each is not None]
-
-
-def by_two_calls(net: Net, loss: Recorded) -> tuple[list[Output], list[Tensor]]:
-    """The outputs and gradients of the frames that `loss` saw, one call after the other."""
-    frames = loss.first.batch, loss.second.batch
-    outputs = [net(each.rgb, each.thermal) for each in frames]
-    first, second = (Frame(o, f, o.logits) for o, f in zip(outputs, frames, strict=True))
-    warp = view().warp(view().draw(B, generator_of("virtual view")), HW)
-    warped = warp.bilinear(outputs[0].logits.softmax(1))
-    parts = Recorded()(first, second, warped, loss.valid, generator_of("loss"))
-    torch.stack(list(parts.values())).sum().backward()
-    return outputs, gradients(net)
 
 
 @pytest.mark.parametrize(
@@ -143,41 +115,29 @@ def test_outputs_gradients_and_statistics_are_those_of_two_calls(
 ) -> None:
     net = Net(norm)
     apart = deepcopy(net)
-    temporal = scheme(net)
-    torch.stack(list(step(temporal).values())).sum().backward()
-    loss: Any = temporal.loss
-    assert [len(rgb) for rgb, _ in net.calls] == [2 * B // calls] * calls
+    loss = step(scheme(net))
+    assert net.calls == [2 * B // calls] * calls
 
-    outputs, expected = by_two_calls(apart, loss)
+    frames = loss.first.batch, loss.second.batch
+    outputs = [apart(each.rgb, each.thermal) for each in frames]
+    first, second = (Frame(o, f, o.logits) for o, f in zip(outputs, frames, strict=True))
+    warp = view().warp(view().draw(B, generator_of("virtual view")), HW)
+    warped = warp.bilinear(outputs[0].logits.softmax(1))
+    parts = Recorded()(first, second, warped, loss.valid, None)
+    torch.stack(list(parts.values())).sum().backward()
     for frame, output in zip((loss.first, loss.second), outputs, strict=True):
         torch.testing.assert_close(frame.logits, output.logits)
         torch.testing.assert_close(frame.output.aux["inner"], output.aux["inner"])
         assert frame.logits is frame.output.logits
-    for mine, theirs in zip(gradients(net), expected, strict=True):
+    for mine, theirs in zip(gradients(net), gradients(apart), strict=True):
         torch.testing.assert_close(mine, theirs)
     for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
         torch.testing.assert_close(mine, theirs)
 
 
-def test_one_call_would_change_what_is_normalised() -> None:
-    """What the test above would not see if statistics of frames were near enough to be equal."""
-    net = Net(nn.BatchNorm2d(6))
-    temporal = scheme(net)
-    step(temporal)
-    loss: Any = temporal.loss
-    frames = loss.first.batch, loss.second.batch
-    joint = Net(nn.BatchNorm2d(6))(*(torch.cat([getattr(f, n) for f in frames]) for n in NAMES))
-    assert (joint.logits[:B] - loss.first.logits).abs().max() > 1e-3
-    assert int(net.norm.num_batches_tracked) == 2
-
-
-NAMES = ("rgb", "thermal")
-
-
-def test_the_second_frame_is_the_view_of_the_first() -> None:
-    temporal, given = scheme(Net(nn.Identity())), batch()
-    step(temporal, given)
-    loss: Any = temporal.loss
+def test_second_frame_is_the_view_of_the_first() -> None:
+    given = batch()
+    loss = step(scheme(Net(nn.Identity())), given)
     assert loss.first.batch is given
     drawn = view().draw(B, generator_of("virtual view"))
     warp = view().warp(drawn, HW)
@@ -248,8 +208,7 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
 ) -> None:
     net = Fixed()
     temporal = scheme(net, view=Half(), warps=warps, detach=detach)
-    given = batch(1, (1, 4))
-    step(temporal, given)
+    (_,) = temporal.phases(batch(1, (1, 4)), generator_of)
     warped: Tensor = temporal.loss.warped
     assert warped[0, 1, 0].tolist() == pytest.approx(expected)
     assert warped.sum(1)[0, 0].tolist() == pytest.approx([1] * 4)
@@ -261,53 +220,24 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
         assert touched.tolist() == [False, False, True, True]
 
 
-def test_a_loss_that_reads_no_warped_prediction_is_given_none() -> None:
-    temporal = scheme(Net(nn.Identity()), loss=Segmentation())
-    step(temporal)
-    assert temporal.loss.warped is None
-
-
 def test_background_views_count_every_pixel() -> None:
-    temporal = scheme(Net(nn.Identity()), view=view(mode="rotation", outside="background"))
-    step(temporal)
-    loss: Any = temporal.loss
+    loss = step(scheme(Net(nn.Identity()), view=view(mode="rotation", outside="background")))
     assert loss.valid.all()
     assert (loss.second.batch.label < K).all()
 
 
-# ---- networks that predict masks ------------------------------------------------------------
-
-
-class MaskLoss(Recorded):
-    """As `Recorded`, and a part that reads the queries."""
-
-    def __call__(self, first: Frame, second: Frame, *rest: Any) -> dict[str, Tensor]:
-        parts = super().__call__(first, second, *rest)
-        for number, frame in enumerate((first, second)):
-            queries = frame.output.aux["class_logits"], frame.output.aux["mask_logits"]
-            parts[f"masks{number}"] = sum((each.square().mean() for each in queries), Tensor([0]))[
-                0
-            ]
-        return parts
-
-
 def test_mask2former_passes_equal_two_calls() -> None:
     net, apart = nano().train(), nano().train()
-    temporal = scheme(net, loss=MaskLoss(), view=view())
-    given = batch(2, (96, 128))
-    parts = step(temporal, given)
-    torch.stack(list(parts.values())).sum().backward()
-    loss: Any = temporal.loss
-    frames = loss.first.batch, loss.second.batch
-    for frame, source in zip((loss.first, loss.second), frames, strict=True):
-        single = apart(source.rgb, source.thermal, generator=generator_of("stochastic depth"))
+    loss = step(scheme(net), batch(2, (96, 128)))
+    frames = loss.first, loss.second
+    for frame in frames:
+        given = frame.batch
+        single = apart(given.rgb, given.thermal, generator=generator_of("stochastic depth"))
         assert frame.output.logits is None
         for name, values in single.aux.items():
-            assert frame.output.aux[name].shape == values.shape
             torch.testing.assert_close(frame.output.aux[name], values, rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(
-            frame.logits, apart.dense_logits(single, (96, 128)), rtol=1e-4, atol=1e-4
-        )
+        dense = apart.dense_logits(single, (96, 128))
+        torch.testing.assert_close(frame.logits, dense, rtol=1e-4, atol=1e-4)
     for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
         torch.testing.assert_close(mine, theirs)
     idle = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
@@ -332,13 +262,6 @@ def test_dense_logits_are_the_logarithm_of_semantic_scores(hw: tuple[int, int]) 
     assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)
 
 
-def test_dense_logits_are_those_of_evaluation() -> None:
-    net, (rgb, thermal) = nano().eval(), images(2, 60, 84)
-    output = net(rgb, thermal)
-    assert output.logits is not None
-    torch.testing.assert_close(net.dense_logits(output, (60, 84)).exp(), output.logits)
-
-
 def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
     classes = torch.tensor([[[200.0, -200.0, 0.0]]], requires_grad=True)
     masks = torch.full((1, 1, 8, 8), 3.0, requires_grad=True)
@@ -352,37 +275,3 @@ def test_a_class_that_no_query_names_has_finite_logits_and_gradients() -> None:
 
 
 # ---- what is required -----------------------------------------------------------------------
-
-
-def test_temporal_requires_two_frames_and_whole_images() -> None:
-    record = record_of(scheme(Net(nn.Identity())))
-    assert [(each.node, each.key, each.value) for each in record.requires] == [
-        ("loss", "frames", 2),
-        ("masker", "hides_cells", False),
-    ]
-    assert record.frames == 2
-    assert record.camera == view().camera
-
-
-def test_temporal_with_masks_requires_dense_logits() -> None:
-    net = Net(nn.Identity())
-    net.record = Record(outputs="masks")
-    required = record_of(scheme(net)).requires[-1]
-    assert (required.node, required.key) == ("model", "dense_logits")
-    assert not required.is_met_by(net.record)
-    assert required.is_met_by(nano().record)
-
-
-def test_the_loss_of_the_papers_goes_through_the_scheme() -> None:
-    loss = TemporalLoss(
-        segmentation=CrossEntropy(class_weights=None),
-        alpha=1.0,
-        beta=2.0,
-        second="con",
-        form="paper",
-    )
-    net = Net(nn.BatchNorm2d(6))
-    parts = step(scheme(net, loss=loss))
-    assert set(parts) == {"cross_entropy_1", "cross_entropy_2", "dice_1", "con"}
-    torch.stack(list(parts.values())).sum().backward()
-    assert all(each.any() for each in gradients(net)[:1])

@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.stochastic import drop_channels
-
-
-class Projection(nn.Module):
-    """A linear map and the one after it, as the single map that they are together.
-
-        following (proj x + b) + bias
-
-    The linear map has the released name `proj`.
-    """
-
-    def __init__(self, in_dim: int, out_dim: int) -> None:
-        super().__init__()
-        self.proj = nn.Linear(in_dim, out_dim)
-
-    def forward(self, x: Tensor, following: Tensor, bias: Tensor | None = None) -> Tensor:
-        """(N, H, W, in), (E, out) and (E,) -> (N, E, H, W)."""
-        offset = following @ self.proj.bias
-        if bias is not None:
-            offset = offset + bias
-        return F.linear(x, following @ self.proj.weight, offset).permute(0, 3, 1, 2)
+from rgbt.models.parts import drop_channels
 
 
 class TwoEpsNorm(nn.BatchNorm2d):
@@ -72,7 +53,7 @@ class MlpDecoder(nn.Module):
         super().__init__()
         self.dropout = dropout
         self.linear_c1, self.linear_c2, self.linear_c3, self.linear_c4 = (
-            Projection(width, dim) for width in dims
+            nn.Sequential(OrderedDict(proj=nn.Linear(width, dim))) for width in dims
         )
         fuse = nn.Conv2d(4 * dim, dim, 1)
         norm = TwoEpsNorm(dim, eps=norm_eps, eps_eval=norm_eps_eval)
@@ -82,34 +63,37 @@ class MlpDecoder(nn.Module):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
 
     def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
-        """Class scores.
+        """Class scores (N, K, H_1, W_1) of four (N, H_i, W_i, C_i), the largest first.
 
-        Args:
-            maps: four (N, H_i, W_i, C_i), the largest first.
-            generator: draws the dropped channels; only read in training mode with a rate above 0.
-
-        Returns:
-            (N, K, H_1, W_1).
+        `generator` draws the dropped channels, in training mode with a rate above 0 alone.
         """
-        mixed = self.linear_fuse[1:](self._mix(maps))
-        if self.training and self.dropout > 0:
-            mixed = drop_channels(mixed, self.dropout, generator)
-        logits: Tensor = self.linear_pred(mixed)
-        return logits
-
-    def _mix(self, maps: list[Tensor]) -> Tensor:
-        """The convolution over the four projected and enlarged maps, (N, E, H_1, W_1)."""
+        # The convolution over the four projected and enlarged maps, (N, E, H_1, W_1). The release
+        # joins the maps in the order c4, c3, c2, c1.
         weight, bias = (self.linear_fuse.get_parameter(f"0.{name}") for name in ("weight", "bias"))
-        # The release joins the maps in the order c4, c3, c2, c1.
         part4, part3, part2, part1 = weight.flatten(1).chunk(4, 1)
-        mixed: Tensor = self.linear_c1(maps[0], part1, bias)
+        mixed = _projected(self.linear_c1, maps[0], part1, bias)
         smaller = (
-            self.linear_c2(maps[1], part2),
-            self.linear_c3(maps[2], part3),
-            self.linear_c4(maps[3], part4),
+            _projected(self.linear_c2, maps[1], part2),
+            _projected(self.linear_c3, maps[2], part3),
+            _projected(self.linear_c4, maps[3], part4),
         )
         for small in smaller:
             mixed = mixed + F.interpolate(
                 small, size=mixed.shape[2:], mode="bilinear", align_corners=False
             )
-        return mixed
+        mixed = self.linear_fuse[1:](mixed)
+        if self.training and self.dropout > 0:
+            mixed = drop_channels(mixed, self.dropout, generator)
+        logits: Tensor = self.linear_pred(mixed)
+        return logits
+
+
+def _projected(
+    linear: nn.Module, x: Tensor, following: Tensor, bias: Tensor | None = None
+) -> Tensor:
+    """``following (proj x + b) + bias``: (N, H, W, in), (E, out) and (E,) -> (N, E, H, W)."""
+    offset = following @ linear.get_parameter("proj.bias")
+    if bias is not None:
+        offset = offset + bias
+    weight = following @ linear.get_parameter("proj.weight")
+    return F.linear(x, weight, offset).permute(0, 3, 1, 2)

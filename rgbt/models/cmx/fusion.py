@@ -10,9 +10,6 @@ from torch import Tensor, nn
 
 from rgbt.models.cmx.mit import convolve
 
-SHARE = 0.5
-"""Weight of the rectification by channel and of that by position, lambda_C and lambda_S of CMX."""
-
 
 class ChannelWeights(nn.Module):
     """How much of each channel of a map the other stream takes up, from the whole image.
@@ -58,9 +55,9 @@ class SpatialWeights(nn.Module):
 class Rectification(nn.Module):
     """FRM: each stream takes up what the other one is sure of.
 
-        x1 + SHARE (Wc2 + Ws2) x2   and   x2 + SHARE (Wc1 + Ws1) x1
+        x1 + 1/2 (Wc2 + Ws2) x2   and   x2 + 1/2 (Wc1 + Ws1) x1
 
-    Source: CMX, Sec. III-B.
+    Source: CMX, Sec. III-B, with lambda_C = lambda_S = 1/2.
     """
 
     def __init__(self, dim: int) -> None:
@@ -71,7 +68,7 @@ class Rectification(nn.Module):
     def forward(self, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
         """Two (N, H, W, C) -> the two rectified ones."""
         weights = self.channel_weights(x1, x2) + self.spatial_weights(x1, x2)
-        first, second = (SHARE * weights).unbind()
+        first, second = (0.5 * weights).unbind()
         return torch.addcmul(x1, x2, second), torch.addcmul(x2, x1, first)
 
 

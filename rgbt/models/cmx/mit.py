@@ -6,6 +6,7 @@ take as it is (channels last), so that nothing is copied between the two.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.stochastic import add_residual
+from rgbt.models.parts import add_residual
 
 BLOCK_NORM_EPS = 1e-6
 """Of the normalisations in front of attention and feed-forward and after a stage; those of patch
@@ -83,18 +84,6 @@ class MitAttention(nn.Module):
         return mixed
 
 
-class Depthwise(nn.Module):
-    """A 3x3 convolution of every channel alone, under the released name `dwconv.dwconv`."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.dwconv = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, H, W, C) -> (N, H, W, C)."""
-        return convolve(self.dwconv, x)
-
-
 class MixFfn(nn.Module):
     """Linear, depthwise 3x3 convolution, exact GELU, linear.
 
@@ -104,12 +93,13 @@ class MixFfn(nn.Module):
     def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
         self.fc1 = nn.Linear(dim, hidden)
-        self.dwconv = Depthwise(hidden)
+        depthwise = nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)
+        self.dwconv = nn.Sequential(OrderedDict(dwconv=depthwise))  # the released name
         self.fc2 = nn.Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, H, W, C) -> (N, H, W, C)."""
-        out: Tensor = self.fc2(F.gelu(self.dwconv(self.fc1(x))))
+        out: Tensor = self.fc2(F.gelu(convolve(self.dwconv, self.fc1(x))))
         return out
 
 
@@ -131,14 +121,10 @@ class MitBlock(nn.Module):
 
 
 def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn.Module]:
-    """Patch embedding, blocks and normalisation of a stage, by their released names.
+    """Patch embedding, blocks and normalisation of stage 0..3, by their released names.
 
     The release keeps them side by side (`block1`, `extra_block1`), not in one module per stage.
-
-    Args:
-        shape: sizes.
-        stage: 0..3.
-        in_channels: of the image, for stage 0.
+    `in_channels` are those of the image, for stage 0.
     """
     dim = shape.embed_dims[stage]
     before = shape.embed_dims[stage - 1] if stage else in_channels
@@ -157,11 +143,8 @@ def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn
 def drop_rates(depths: tuple[int, int, int, int], last: float, stage2: Stage2) -> Tensor:
     """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
 
-    Args:
-        depths: blocks per stage.
-        last: rate of the last block; rates rise evenly from 0.
-        stage2: "released": stage 2 has one rate per stream, that of its first block for RGB and
-            the next one on the ramp for thermal; "ramp": no exception.
+    Rates rise evenly from 0 to `last`. `stage2` "released": stage 2 has one rate per stream, that
+    of its first block for RGB and the next one on the ramp for thermal; "ramp": no exception.
     """
     rates = torch.linspace(0, last, sum(depths)).repeat(2, 1)
     if stage2 == "released":

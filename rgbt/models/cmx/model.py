@@ -15,7 +15,7 @@ from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.fusion import Fusion, Rectification
 from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
 from rgbt.models.inputs import Images, Inputs, only_view
-from rgbt.models.stochastic import keep_factors
+from rgbt.models.parts import check_heads, keep_factors
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
 from rgbt.requirements import Record
 from rgbt.types import MaskPair, Output, View
@@ -30,10 +30,7 @@ class CmxEncoder(nn.Module):
     The next stage continues with what the rectification returns; the decoder reads what the fusion
     returns.   Source: CMX, Sec. III-A.
 
-    Args:
-        shape: sizes of a stream.
-        thermal_channels: of the thermal image.
-        drop_rates: (2, blocks) probabilities of stochastic depth, RGB's and thermal's; None: none.
+    `drop_rates` (2, blocks): probabilities of stochastic depth, RGB's and thermal's; None: none.
     """
 
     def __init__(
@@ -53,17 +50,19 @@ class CmxEncoder(nn.Module):
         self.apply(initialise)
 
     def forward(self, images: Images, generator: torch.Generator | None) -> list[Tensor]:
-        """Fused maps of the four stages.
+        """Fused maps of the four stages, (N, h, w, C_s): H and W over 4, 8, 16, 32, rounded up.
 
-        Args:
-            images: (N, 3, H, W) and (N, c, H, W) normalised.
-            generator: draws stochastic depth; only read in training mode with rates.
-
-        Returns:
-            four (N, h, w, C_s), h and w being H and W over 4, 8, 16, 32, rounded up.
+        `images` are (N, 3, H, W) and (N, c, H, W), normalised; `generator` draws stochastic depth,
+        in training mode with rates alone.
         """
         rgb, thermal = (image.permute(0, 2, 3, 1).contiguous() for image in images)
-        keep_rgb, keep_thermal = self._draw_keep(rgb, generator)
+        # Factors of every residual by stream and stage, (blocks, 2, N, 1, 1, 1) each.
+        keep_rgb: Sequence[Tensor | None] = [None] * 4
+        keep_thermal = keep_rgb
+        if self.training and self.drop_rates is not None:
+            shape = (2, len(rgb), 1, 1, 1)
+            drawn = keep_factors(self.drop_rates.flatten(), shape, generator, rgb.device)
+            keep_rgb, keep_thermal = (torch.split(x, list(self.depths)) for x in drawn.chunk(2))
         fused = []
         for stage, (rectify, fuse) in enumerate(zip(self.FRMs, self.FFMs, strict=True)):
             rgb = self._stage(STREAMS[0], stage, rgb, keep_rgb[stage])
@@ -83,15 +82,6 @@ class CmxEncoder(nn.Module):
             x = block(x, None if keep is None else keep[number])
         normed: Tensor = norm(x)
         return normed
-
-    def _draw_keep(
-        self, x: Tensor, generator: torch.Generator | None
-    ) -> Sequence[Sequence[Tensor | None]]:
-        """Factors of every residual by stream and stage, (blocks, 2, N, 1, 1, 1) each."""
-        if not self.training or self.drop_rates is None:
-            return [[None] * 4] * 2
-        drawn = keep_factors(self.drop_rates.flatten(), (2, len(x), 1, 1, 1), generator, x.device)
-        return [torch.split(half, list(self.depths)) for half in drawn.chunk(2)]
 
 
 Reduction = Annotated[int, Interval(ge=1, le=64)]
@@ -145,7 +135,12 @@ class CMX(nn.Module):
     ) -> None:
         super().__init__()
         shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
-        _check(shape)
+        if min(int(dim * mlp_ratio) for dim in embed_dims) < 1:
+            raise InputError(
+                f"model.mlp_ratio={mlp_ratio:g} leaves no channel of model.embed_dims="
+                f"{list(embed_dims)}; choose a larger ratio, such as 4."
+            )
+        check_heads(embed_dims, num_heads)
         self.num_classes = num_classes
         # The smallest image whose every map is at least as large as the kernel that shrinks it.
         self.shortest_side = max(
@@ -158,15 +153,13 @@ class CMX(nn.Module):
             thermal_channels=inputs.thermal_channels,
             drop_rates=rates if drop_path_rate > 0 else None,
         )
-        if decoder_norm_eps_eval is None:
-            decoder_norm_eps_eval = decoder_norm_eps
         self.decode_head = MlpDecoder(
             embed_dims,
             num_classes,
             dim=decoder_dim,
             dropout=decoder_dropout,
             norm_eps=decoder_norm_eps,
-            norm_eps_eval=decoder_norm_eps_eval,
+            norm_eps_eval=decoder_norm_eps_eval or decoder_norm_eps,
         )
         self.inputs = inputs
 
@@ -200,18 +193,3 @@ class CMX(nn.Module):
         quarter = self.decode_head(fused, generator)
         logits = F.interpolate(quarter.float(), size=image_hw, mode="bilinear", align_corners=False)
         return Output(logits, {})
-
-
-def _check(shape: MitShape) -> None:
-    """Refuse sizes that do not fit each other, naming the key."""
-    if min(int(dim * shape.mlp_ratio) for dim in shape.embed_dims) < 1:
-        raise InputError(
-            f"model.mlp_ratio={shape.mlp_ratio:g} leaves no channel of model.embed_dims="
-            f"{list(shape.embed_dims)}; choose a larger ratio, such as 4."
-        )
-    for stage, (dim, heads) in enumerate(zip(shape.embed_dims, shape.num_heads, strict=True)):
-        if dim % heads:
-            raise InputError(
-                f"model.num_heads[{stage}] = {heads} must divide the {dim} channels of "
-                f"model.embed_dims[{stage}]."
-            )

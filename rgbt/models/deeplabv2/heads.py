@@ -10,7 +10,7 @@ from annotated_types import Interval, Len
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.models.upsampling import DropRates, UpBlock, enlarge
+from rgbt.models.parts import DropRates, UpBlock, enlarge
 
 Decoder = Literal["basic", "modified_released", "modified_thesis"]
 
@@ -72,12 +72,8 @@ class AtrousPyramid(nn.Module):
     """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
 
     Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
-    MaxSquareLoss and the thesis leave their loop early, so that only the first two count, while
-    the others still belong to the parameters; ADVENT sums all.
-
-    Args:
-        rates: dilations, one convolution each.
-        summed_rates: those that count.
+    MaxSquareLoss and the thesis leave their loop early, so that only the first two (`summed_rates`)
+    count, while the others still belong to the parameters; ADVENT sums all.
     """
 
     def __init__(

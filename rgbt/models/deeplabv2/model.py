@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Len
@@ -11,16 +11,63 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import padded_hw
-from rgbt.models.deeplabv2.backbone import Backbone, TrainNorm
 from rgbt.models.deeplabv2.heads import AtrousPyramid, Decoder, DeepLabHead, HeadShape, Rates
 from rgbt.models.inputs import Inputs, only_view
-from rgbt.models.upsampling import DropRates
+from rgbt.models.parts import DropRates
+from rgbt.models.resnet import bottleneck_stage
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
 from rgbt.requirements import Record, Requirement
 from rgbt.types import MaskPair, Output, View
 
 STRIDE = 8
 """Of the backbone; the modified decoders double the size three times."""
+
+TrainNorm = Literal["all", "statistics"]
+
+
+class Backbone(nn.Module):
+    """ResNet with the stride on the first 1x1 convolution and both last stages dilated throughout.
+
+    Parameters have torchvision's names, so that its ImageNet files fit, although there the stride
+    sits on the 3x3 convolution.
+
+    Source: DeepLab v2, Sec. 3.1.   Released: AdaptSegNet, ADVENT, MaxSquareLoss, thesis.
+
+    Arguments: see `DeepLabV2`; `width` is its base_width.
+    """
+
+    def __init__(
+        self,
+        depths: tuple[int, int, int, int],
+        width: int,
+        *,
+        ceil_mode: bool,
+        train_norm: TrainNorm,
+    ) -> None:
+        super().__init__()
+        self.pool = nn.MaxPool2d(3, stride=2, padding=1, ceil_mode=ceil_mode)
+        self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.layer1 = bottleneck_stage(width, width, depths[0], stride_at="1x1")
+        self.layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2, stride_at="1x1")
+        self.layer3 = bottleneck_stage(
+            8 * width, 4 * width, depths[2], dilations=(2, 2), stride_at="1x1"
+        )
+        self.layer4 = bottleneck_stage(
+            16 * width, 8 * width, depths[3], dilations=(4, 4), stride_at="1x1"
+        )
+        for module in self.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.requires_grad_(train_norm == "all")
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, H, W) -> layer3 (N, 16 w, h, w) and layer4 (N, 32 w, h, w).
+
+        h = H / 8, one more where the pooling rounded up.
+        """
+        x = self.pool(F.relu(self.bn1(self.conv1(image))))
+        layer3 = self.layer3(self.layer2(self.layer1(x)))
+        return layer3, self.layer4(layer3)
 
 
 class DeepLabV2(nn.Module):
@@ -77,7 +124,17 @@ class DeepLabV2(nn.Module):
         shape = HeadShape(
             32 * base_width, num_classes, decoder, rates, summed_rates, dropout, align_corners
         )
-        _check(heads, inputs)
+        usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
+        if len(set(heads)) < len(heads) or not usable:
+            raise InputError(
+                "model.heads needs different names made of letters, such as [main] or "
+                f"[source, target], got {list(heads)}."
+            )
+        if inputs.thermal_channels != 3:
+            raise InputError(
+                "model.inputs must repeat thermal for three channels, because RGB and thermal "
+                "images pass the same backbone; choose model/inputs=half_three."
+            )
         if ceil_mode and decoder != "basic":
             raise InputError(
                 f"model.decoder={decoder} enlarges 8 times, which comes back to the size of the "
@@ -131,13 +188,13 @@ class DeepLabV2(nn.Module):
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
         images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
-        features = self.backbone(images.rgb if view == "rgb" else images.thermal)
+        layer3, layer4 = self.backbone(images.rgb if view == "rgb" else images.thermal)
 
         image_hw = rgb.shape[2], rgb.shape[3]
         aux = {}
         if self.auxiliary is not None:
-            aux["aux_logits"] = self._at_image(self.auxiliary(features.layer3), image_hw)
-        scores = self.heads[name](features.layer4, generator)
+            aux["aux_logits"] = self._at_image(self.auxiliary(layer3), image_hw)
+        scores = self.heads[name](layer4, generator)
         return Output(self._at_image(scores, image_hw), aux)
 
     def _at_image(self, scores: Tensor, image_hw: tuple[int, int]) -> Tensor:
@@ -148,18 +205,3 @@ class DeepLabV2(nn.Module):
                 scores, size=full, mode="bilinear", align_corners=self.align_corners
             )
         return scores[..., : image_hw[0], : image_hw[1]]
-
-
-def _check(heads: tuple[str, ...], inputs: Inputs) -> None:
-    """Refuse what the parts cannot be built from, naming the key."""
-    usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
-    if len(set(heads)) < len(heads) or not usable:
-        raise InputError(
-            "model.heads needs different names made of letters, such as [main] or "
-            f"[source, target], got {list(heads)}."
-        )
-    if inputs.thermal_channels != 3:
-        raise InputError(
-            "model.inputs must repeat thermal for three channels, because RGB and thermal images "
-            "pass the same backbone; choose model/inputs=half_three."
-        )

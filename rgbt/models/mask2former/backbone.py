@@ -19,12 +19,8 @@ class RgbtBackbone(nn.Module):
     Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
     a single modality leave as the branch normalised them.
 
-    Args:
-        shape: sizes of a branch.
-        share_start: stages from this index on (0..4) are the RGB branch's own in both branches;
-            embedding, output normalisations and mask token never are. 4 shares nothing.
-        fusion: "max" or "add".
-        thermal_channels: of the thermal image.
+    Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding, output
+    normalisations and mask token never are. 4 shares nothing.
     """
 
     def __init__(
@@ -85,18 +81,13 @@ class RgbtBackbone(nn.Module):
         """The maps of one level along the batch: every view of the first pass, then the next."""
         by_view: list[tuple[Tensor, ...]] = []
         for view in views:
-            if view == "rgbt":
-                fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
-                by_view.append(self._normalise(level, fused, passes))
-            else:
+            if view != "rgbt":
                 by_view.append(maps[view][level].chunk(passes))
-        parts = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    def _normalise(self, level: int, fused: Tensor, passes: int) -> tuple[Tensor, ...]:
-        """Batch normalisation of each pass; without batch statistics all are one call."""
-        norm = self.norm_layers[LEVELS[level]]
-        if self.training:
-            return tuple(norm(part) for part in fused.chunk(passes))
-        normalised: Tensor = norm(fused)
-        return normalised.chunk(passes)
+                continue
+            fused, norm = self.fuse(maps["rgb"][level], maps["thermal"][level]), LEVELS[level]
+            # Without batch statistics all passes are one call.
+            parts = fused.chunk(passes) if self.training else (fused,)
+            normed = [self.norm_layers[norm](part) for part in parts]
+            by_view.append(tuple(normed) if self.training else normed[0].chunk(passes))
+        joined = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
+        return torch.cat(joined) if len(joined) > 1 else joined[0]

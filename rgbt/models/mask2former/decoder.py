@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, PixelPyramid
-from rgbt.models.mask2former.position import sine_code
+from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, PixelPyramid, sine_code
 
 
 class Predictions(NamedTuple):
@@ -56,39 +55,23 @@ class QueryAttention(nn.Module):
         return projected
 
 
-class CrossAttentionLayer(nn.Module):
-    """Queries read one level; added, then normalised."""
+class AttentionLayer(nn.Module):
+    """Queries read one level, or each other; added, then normalised.
 
-    def __init__(self, dim: int, heads: int) -> None:
+    `name` is that of the attention in the release.
+    """
+
+    def __init__(self, name: str, dim: int, heads: int) -> None:
         super().__init__()
-        self.multihead_attn = QueryAttention(dim, heads)
+        self.add_module(name, QueryAttention(dim, heads))
         self.norm = nn.LayerNorm(dim)
 
     def forward(
-        self,
-        queries: Tensor,
-        query_position: Tensor,
-        memory: tuple[Tensor, Tensor],
-        allowed: Tensor,
+        self, queries: Tensor, placed: Tensor, memory: tuple[Tensor, Tensor], allowed: Tensor | None
     ) -> Tensor:
-        """(B, Q, C) -> (B, Q, C); `memory` is (keys, values), each (B, S, C)."""
-        read = self.multihead_attn(queries + query_position, *memory, allowed)
-        out: Tensor = self.norm(queries + read)
-        return out
-
-
-class SelfAttentionLayer(nn.Module):
-    """Queries read each other; added, then normalised."""
-
-    def __init__(self, dim: int, heads: int) -> None:
-        super().__init__()
-        self.self_attn = QueryAttention(dim, heads)
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, queries: Tensor, query_position: Tensor) -> Tensor:
-        """(B, Q, C) -> (B, Q, C)."""
-        placed = queries + query_position
-        out: Tensor = self.norm(queries + self.self_attn(placed, placed, queries, None))
+        """(B, Q, C), without and with position, and keys and values (B, S, C) -> (B, Q, C)."""
+        attention, norm = self.children()
+        out: Tensor = norm(queries + attention(placed, *memory, allowed))
         return out
 
 
@@ -144,10 +127,10 @@ class Predictor(nn.Module):
         super().__init__()
         dim, count = hidden_dim, range(num_layers)
         self.transformer_self_attention_layers = nn.ModuleList(
-            SelfAttentionLayer(dim, heads) for _ in count
+            AttentionLayer("self_attn", dim, heads) for _ in count
         )
         self.transformer_cross_attention_layers = nn.ModuleList(
-            CrossAttentionLayer(dim, heads) for _ in count
+            AttentionLayer("multihead_attn", dim, heads) for _ in count
         )
         self.transformer_ffn_layers = nn.ModuleList(FfnLayer(dim, ffn_dim) for _ in count)
         self.decoder_norm = nn.LayerNorm(dim)
@@ -159,8 +142,18 @@ class Predictor(nn.Module):
 
     def forward(self, pyramid: PixelPyramid) -> Predictions:
         """L = number of layers + 1 predictions, the last one final."""
-        memories = self._memories(pyramid)
-        reduced = _reduce(pyramid)
+        memories = []  # keys and values of the three levels, each (B, S_l, C)
+        every_level = zip(pyramid.tokens, pyramid.levels, self.level_embed.weight, strict=True)
+        for tokens, hw, embed in every_level:
+            values = tokens + embed
+            memories.append((values + sine_code(hw, values.shape[-1], values.device), values))
+        # Resizing is linear: a resized mask is the product of the embedding with resized features,
+        # which costs the size of the level instead of the size of the mask.
+        with torch.no_grad():
+            reduced = [
+                shrink(pyramid.fine, pyramid.fine.shape[-1] // columns).flatten(2)
+                for _, columns in pyramid.levels
+            ]
         position = self.query_embed.weight
         queries = self.query_feat.weight.expand(len(pyramid.fine), -1, -1)
         normed: list[Tensor] = [self.decoder_norm(queries)]
@@ -173,10 +166,14 @@ class Predictor(nn.Module):
         )
         for index, (cross_attention, self_attention, ffn) in enumerate(layers):
             level = index % NUM_LEVELS
-            with torch.no_grad():
-                allowed = _allowed(_mask_logits(embeds[-1], pyramid, reduced[level]))
-            queries = cross_attention(queries, position, memories[level], allowed)
-            queries = ffn(self_attention(queries, position))
+            with (
+                torch.no_grad()
+            ):  # read where the own mask has probability 1/2 or more, if anywhere
+                inside = _mask_logits(embeds[-1], pyramid, reduced[level]) >= 0
+                allowed = inside | ~inside.any(-1, keepdim=True)
+            queries = cross_attention(queries, queries + position, memories[level], allowed)
+            placed = queries + position
+            queries = ffn(self_attention(queries, placed, (placed, queries), None))
             normed.append(self.decoder_norm(queries))
             embeds.append(self.mask_embed(normed[-1]))
 
@@ -186,62 +183,19 @@ class Predictor(nn.Module):
         masks = masks.view(len(masks), len(embeds), -1, *pyramid.fine.shape[-2:])
         return Predictions(class_logits, masks.transpose(0, 1))
 
-    def _memories(self, pyramid: PixelPyramid) -> list[tuple[Tensor, Tensor]]:
-        """Keys and values of the three levels, each (B, S_l, C)."""
-        memories = []
-        for tokens, hw, embed in zip(
-            pyramid.tokens, pyramid.levels, self.level_embed.weight, strict=True
-        ):
-            values = tokens + embed
-            code = sine_code(hw, values.shape[-1], values.device)
-            memories.append((values + code, values))
-        return memories
-
 
 def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:
-    """Dot products of mask embeddings with mask features, the latter at any set of pixels.
-
-    Args:
-        embed: (B, Q, C).
-        pyramid: holds the map from fine to mask features.
-        fine: (B, C, pixels).
-
-    Returns:
-        (B, Q, pixels).
-    """
+    """(B, Q, C) mask embeddings times mask features of `fine` (B, C, pixels) -> (B, Q, pixels)."""
     offset = embed @ pyramid.bias[:, None]
     return torch.baddbmm(offset.expand(-1, -1, fine.shape[-1]), embed @ pyramid.weight, fine)
-
-
-@torch.no_grad()
-def _reduce(pyramid: PixelPyramid) -> list[Tensor]:
-    """Fine features at the size of each level, (B, C, S_l).
-
-    Resizing is linear: a resized mask is the product of the embedding with resized features,
-    which costs the size of the level instead of the size of the mask.
-    """
-    fine = pyramid.fine
-    return [shrink(fine, fine.shape[-1] // columns).flatten(2) for _, columns in pyramid.levels]
 
 
 def shrink(x: Tensor, factor: int) -> Tensor:
     """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
 
-    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU.
-
-    Args:
-        x: (..., H, W), sides multiples of `factor`.
-        factor: even.
-
-    Returns:
-        (..., H / factor, W / factor).
+    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU. Sides of x
+    (..., H, W) are multiples of `factor`: (..., H / factor, W / factor).
     """
     low, high = factor // 2 - 1, factor // 2
     rows = x[..., low::factor, :] + x[..., high::factor, :]
     return (rows[..., low::factor] + rows[..., high::factor]) / 4
-
-
-def _allowed(mask_logits: Tensor) -> Tensor:
-    """(B, Q, S) bool: where a mask has probability 1/2 or more; everywhere if nowhere."""
-    inside = mask_logits >= 0
-    return inside | ~inside.any(-1, keepdim=True)

@@ -7,12 +7,11 @@ Shape letters beside those of `rgbt.types`: `S` tokens of all levels together, `
 from __future__ import annotations
 
 import math
+from functools import lru_cache, reduce
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-from rgbt.models.mask2former.position import centre_grid, pixel_scale
 
 POINTS = 4
 """Sampling points per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)."""
@@ -20,17 +19,41 @@ POINTS = 4
 Levels = tuple[tuple[int, int], ...]
 
 
+@lru_cache(maxsize=64)
+def centre_grid(levels: Levels, device: torch.device) -> Tensor:
+    """Centre of every token of all levels, in the coordinates of `grid_sample`.
+
+        (x, y) = 2 (column + 1/2) / columns - 1,  2 (row + 1/2) / rows - 1
+
+    Source: Deformable DETR, Sec. 4.1 (reference points).
+
+    (2, tokens of all levels) float32, x first; kept per size.
+    """
+    with torch.inference_mode(False):
+        centres = []
+        for hw in levels:
+            y, x = ((2 * torch.arange(side, dtype=torch.float32) + 1) / side - 1 for side in hw)
+            centres.append(torch.stack([x.repeat(hw[0]), y.repeat_interleave(hw[1])]))
+        return torch.cat(centres, dim=1).to(device)
+
+
+@lru_cache(maxsize=64)
+def pixel_scale(levels: Levels, device: torch.device) -> Tensor:
+    """Length of one pixel in the coordinates of `grid_sample`: 2 / columns, 2 / rows.
+
+    (levels, 1, 2, 1) float32; kept per size.
+    """
+    with torch.inference_mode(False):
+        scale = torch.tensor([[2 / columns, 2 / rows] for rows, columns in levels])
+        return scale.view(-1, 1, 2, 1).to(device)
+
+
 class DeformableAttention(nn.Module):
     """Every token averages a few bilinear samples of each level, at places it chooses itself.
 
         out_q = W_o sum_j a_qj  value(reference_q + offset_qj),   sum_j a_qj = 1 per head
 
-    Source: Deformable DETR, Eq. (3).
-
-    Args:
-        dim: channels C.
-        heads: M; divides `dim`.
-        num_levels: E.
+    Source: Deformable DETR, Eq. (3). `dim` is C, `heads` M, which divides it, `num_levels` E.
     """
 
     def __init__(self, dim: int, *, heads: int, num_levels: int) -> None:
@@ -60,15 +83,10 @@ class DeformableAttention(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, query: Tensor, tokens: Tensor, levels: Levels) -> Tensor:
-        """Attention of all tokens to all levels.
+        """Attention of all tokens to all levels: (B, S, C) -> (B, S, C).
 
-        Args:
-            query: (B, S, C), tokens with their position code.
-            tokens: (B, S, C).
-            levels: rows and columns of each level; S is the sum of their products.
-
-        Returns:
-            (B, S, C).
+        `query` are the tokens with their position code; S is the sum of rows x columns of the
+        levels.
         """
         batch, length, dim = tokens.shape
         sizes = [rows * columns for rows, columns in levels]
@@ -78,33 +96,20 @@ class DeformableAttention(nn.Module):
         )
         weights = _project(self.attention_weights, query.transpose(1, 2))
         weights = weights.view(batch * self.heads, -1, length).softmax(1)
-        grids = self._grids(query, levels)
-
-        total: Tensor | None = None
-        per_level = zip(
-            torch.split(value, sizes, -1),
-            torch.split(weights, POINTS, 1),
-            grids,
-            levels,
-            strict=True,
-        )
-        for value_l, weight_l, grid_l, hw in per_level:
-            sampled = F.grid_sample(
-                value_l.view(*value_l.shape[:2], *hw), grid_l, align_corners=False
-            )
-            part = (sampled * weight_l[:, None]).sum(2)
-            total = part if total is None else total + part
-        assert total is not None, "there is at least one level"
-        return _project(self.output_proj, total.view(batch, dim, length)).transpose(1, 2)
-
-    def _grids(self, query: Tensor, levels: Levels) -> tuple[Tensor, ...]:
-        """Sampling places per level: (B M, J, S, 2), (x, y) in the coordinates of grid_sample."""
-        batch, length, _ = query.shape
+        # Sampling places: (B M, E, J, 2, S), (x, y) in the coordinates of grid_sample.
         offset = _project(self.sampling_offsets, query.transpose(1, 2))
         offset = offset.view(batch * self.heads, self.num_levels, POINTS, 2, length)
         centre, scale = centre_grid(levels, query.device), pixel_scale(levels, query.device)
-        grid = torch.addcmul(centre, offset, scale)
-        return tuple(level.transpose(2, 3) for level in grid.unbind(1))
+        grids = torch.addcmul(centre, offset, scale).unbind(1)
+
+        parts = []
+        values, shares = torch.split(value, sizes, -1), torch.split(weights, POINTS, 1)
+        for value_l, weight_l, grid, hw in zip(values, shares, grids, levels, strict=True):
+            maps = value_l.view(*value_l.shape[:2], *hw)
+            sampled = F.grid_sample(maps, grid.transpose(2, 3), align_corners=False)
+            parts.append((sampled * weight_l[:, None]).sum(2))
+        total = reduce(torch.add, parts).view(batch, dim, length)
+        return _project(self.output_proj, total).transpose(1, 2)
 
 
 def _project(layer: nn.Linear, x: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Annotated, Literal
 
 import torch
@@ -13,29 +14,16 @@ from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
-from rgbt.models.mask2former.decoder import Predictions, Predictor
+from rgbt.models.mask2former.decoder import Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
 from rgbt.models.mask2former.swin import PATCH, SwinShape
+from rgbt.models.parts import check_heads
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 from rgbt.requirements import Record
 from rgbt.types import VIEWS, MaskPair, Output, View
 
 FAINTEST = 1e-6
 """Smallest semantic score whose logarithm is taken."""
-
-
-class Mask2FormerHead(nn.Module):
-    """Pixel decoder, then query decoder."""
-
-    def __init__(self, pixel_decoder: PixelDecoder, predictor: Predictor) -> None:
-        super().__init__()
-        self.pixel_decoder = pixel_decoder
-        self.predictor = predictor
-
-    def forward(self, features: list[Tensor]) -> Predictions:
-        """Features at strides 4, 8, 16, 32 -> predictions of all layers."""
-        predictions: Predictions = self.predictor(self.pixel_decoder(features))
-        return predictions
 
 
 class Mask2Former(nn.Module):
@@ -59,7 +47,7 @@ class Mask2Former(nn.Module):
         encoder_layers: deformable layers of the pixel decoder.
         encoder_ffn_dim: width of their feed-forward networks.
         decoder_layers: layers of the query decoder, without the initial prediction.
-        decoder_ffn_dim: width of their feed-forward networks.
+        decoder_ffn_dim: width of theirs.
         attention_heads: heads of both decoders.
         pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
         inputs: normalisation of the images.
@@ -97,7 +85,12 @@ class Mask2Former(nn.Module):
     ) -> None:
         super().__init__()
         shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
-        _check(shape, hidden_dim, attention_heads)
+        if hidden_dim % GROUPS or hidden_dim % attention_heads:
+            raise InputError(
+                f"model.hidden_dim must be a multiple of {GROUPS} and of model.attention_heads "
+                f"({attention_heads}), got {hidden_dim}."
+            )
+        check_heads(shape.widths, num_heads)
         self.num_classes = num_classes
         self.drop_path_rate = drop_path_rate
         self.backbone = RgbtBackbone(
@@ -122,7 +115,8 @@ class Mask2Former(nn.Module):
             heads=attention_heads,
             ffn_dim=decoder_ffn_dim,
         )
-        self.sem_seg_head = Mask2FormerHead(pixel_decoder, predictor)
+        parts = {"pixel_decoder": pixel_decoder, "predictor": predictor}
+        self.sem_seg_head = nn.Sequential(OrderedDict(parts))
         self.inputs = inputs
 
     def forward(
@@ -162,7 +156,12 @@ class Mask2Former(nn.Module):
             InputError: mask cells that do not divide the padded image.
         """
         views = views or VIEWS[:1]
-        _check_passes(len(rgb), passes, views)
+        if passes < 1 or len(rgb) % passes:
+            raise ValueError(f"{len(rgb)} images are not {passes} stacked passes of one batch.")
+        if len(set(views)) < len(views):
+            raise ValueError(f"views must name each view at most once, got {views}.")
+        for view in views:
+            check_choice("view", view, VIEWS)
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 needs `generator`, got None.")
         image_hw = rgb.shape[2], rgb.shape[3]
@@ -185,13 +184,8 @@ class Mask2Former(nn.Module):
     def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
         """Class scores of every pixel in training, for losses that compare dense predictions.
 
-        Args:
-            output: of one pass and view, see `forward`.
-            image_hw: size of the images.
-
-        Returns:
-            (B, K, H, W) float32: logarithm of the semantic scores, so that their softmax is the
-            share of a class in the sum over classes.
+        `output` is of one pass and view. (B, K, H, W) float32: logarithm of the semantic scores, so
+        that their softmax is the share of a class in the sum over classes.
         """
         scores = semantic_logits(
             output.aux["class_logits"][-1, 0],
@@ -211,14 +205,8 @@ def semantic_logits(
 
     Source: Mask2Former release, semantic inference; the no-object class is dropped.
 
-    Args:
-        class_logits: (B, Q, K + 1).
-        mask_logits: (B, Q, h, w).
-        image_hw: size to return.
-        padded: size that h, w stand for; the image is its top left part.
-
-    Returns:
-        (B, K, H, W) float32, >= 0.
+    (B, Q, K + 1) and (B, Q, h, w), which stands for an image of size `padded` whose top left part
+    is `image_hw`, -> (B, K, H, W) float32, >= 0.
     """
     with torch.autocast(class_logits.device.type, enabled=False):
         masks = F.interpolate(
@@ -228,26 +216,3 @@ def semantic_logits(
         classes = class_logits.float().softmax(-1)[..., :-1]
         scores = classes.transpose(1, 2) @ masks.flatten(2)
         return scores.view(*scores.shape[:2], *image_hw)
-
-
-def _check_passes(count: int, passes: int, views: tuple[View, ...]) -> None:
-    if passes < 1 or count % passes:
-        raise ValueError(f"{count} images are not {passes} stacked passes of one batch.")
-    if len(set(views)) < len(views):
-        raise ValueError(f"views must name each view at most once, got {views}.")
-    for view in views:
-        check_choice("view", view, VIEWS)
-
-
-def _check(shape: SwinShape, hidden: int, heads: int) -> None:
-    """Refuse sizes that do not fit each other, naming the key."""
-    if hidden % GROUPS or hidden % heads:
-        raise InputError(
-            f"model.hidden_dim must be a multiple of {GROUPS} and of model.attention_heads "
-            f"({heads}), got {hidden}."
-        )
-    for index, (width, stage_heads) in enumerate(zip(shape.widths, shape.num_heads, strict=True)):
-        if width % stage_heads:
-            raise InputError(
-                f"model.num_heads[{index}] = {stage_heads} must divide the {width} channels."
-            )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -9,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.deformable import EncoderLayer, Levels
-from rgbt.models.mask2former.position import sine_code
 
 GROUPS = 32
 """Groups of every group normalisation (Mask2Former release)."""
@@ -35,6 +36,31 @@ class PixelPyramid(NamedTuple):
     bias: Tensor
     tokens: tuple[Tensor, ...]
     levels: Levels
+
+
+@lru_cache(maxsize=64)
+def sine_code(hw: tuple[int, int], dim: int, device: torch.device) -> Tensor:
+    """Position code of every token of a map: first half of the channels y, second half x.
+
+        angle(p, k) = 2 pi p / (P + 1e-6) / 10000^(2 floor(k / 2) / (dim / 2)),  p = 1..P
+        code(p, k) = sin(angle) for even k, cos(angle) for odd k
+
+    Source: DETR, supplement A.4; normalised variant as in Mask2Former.
+
+    `hw` are rows and columns, `dim` is a multiple of 4; (rows * columns, dim) float32, row-major,
+    kept per size.
+    """
+
+    def axis(size: int) -> Tensor:
+        position = torch.arange(1, size + 1, dtype=torch.float32) / (size + 1e-6) * (2 * math.pi)
+        pair = torch.arange(dim // 2, dtype=torch.float32).div(2, rounding_mode="floor")
+        angle = position[:, None] / 10_000 ** (2 * pair / (dim // 2))
+        return torch.stack([angle[:, 0::2].sin(), angle[:, 1::2].cos()], dim=-1).flatten(1)
+
+    with torch.inference_mode(False):
+        y, x = (axis(size) for size in hw)
+        code = torch.cat([y[:, None].expand(-1, hw[1], -1), x[None].expand(hw[0], -1, -1)], -1)
+        return code.flatten(0, 1).to(device)
 
 
 class ConvNorm(nn.Conv2d):
@@ -68,9 +94,7 @@ class LevelEncoder(nn.Module):
         """(B, S, C) -> (B, S, C)."""
         codes = (sine_code(hw, tokens.shape[-1], tokens.device) for hw in levels)
         position = torch.cat([c + e for c, e in zip(codes, self.level_embed, strict=True)])
-        layers = self.encoder["layers"]
-        assert isinstance(layers, nn.ModuleList), "set in the constructor"
-        for layer in layers:
+        for layer in self.encoder["layers"].children():
             tokens = layer(tokens, position, levels)
         return tokens
 
@@ -80,9 +104,8 @@ class PixelDecoder(nn.Module):
 
     Source: Mask2Former, Sec. 3.2 and 4.1; MSDeformAttn variant of its release.
 
-    Args:
-        widths: channels of the features at strides 4, 8, 16, 32.
-        fp32: run in single precision under autocast too.   Released: true.
+    `widths` are channels at strides 4, 8, 16, 32; `fp32` runs it in single precision under autocast
+    too (released: true).
     """
 
     def __init__(
@@ -108,15 +131,10 @@ class PixelDecoder(nn.Module):
         self.layer_1 = ConvNorm(hidden_dim, hidden_dim, 3)
         self.mask_features = nn.Conv2d(hidden_dim, hidden_dim, 1)
         nn.init.kaiming_uniform_(self.mask_features.weight, a=1)
-        biased = [self.mask_features]
         for projection in self.input_proj:
-            conv = projection.get_submodule("0")
-            assert isinstance(conv, nn.Conv2d), "set above"
-            nn.init.xavier_uniform_(conv.weight)
-            biased.append(conv)
-        for conv in biased:
-            assert conv.bias is not None, "these convolutions have a bias"
-            nn.init.zeros_(conv.bias)
+            nn.init.xavier_uniform_(projection.get_submodule("0").get_parameter("weight"))
+            nn.init.zeros_(projection.get_submodule("0").get_parameter("bias"))
+        nn.init.zeros_(self.mask_features.get_parameter("bias"))
 
     def forward(self, features: list[Tensor]) -> PixelPyramid:
         """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens."""
@@ -139,8 +157,7 @@ class PixelDecoder(nn.Module):
         )
         # Contiguous, because group normalisation's gradient is slow where channels come last.
         summed = self.adapter_1(fine.contiguous()) + upsampled
-        last = self.mask_features
-        assert last.bias is not None, "set in the constructor"
+        weight, bias = (self.mask_features.get_parameter(name) for name in ("weight", "bias"))
         return PixelPyramid(
-            F.relu(self.layer_1(summed)), last.weight.flatten(1), last.bias, per_level, levels
+            F.relu(self.layer_1(summed)), weight.flatten(1), bias, per_level, levels
         )

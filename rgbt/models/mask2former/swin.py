@@ -8,13 +8,13 @@ of Swin and in the CRM and SpatialSeg releases, and unlike the ImageNet classifi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.windows import relative_index, shift_mask
-from rgbt.models.stochastic import add_residual, keep_factors
+from rgbt.models.parts import add_residual, keep_factors
 
 PATCH = 4
 
@@ -35,6 +35,44 @@ class SwinShape:
         """Channels of the four stages."""
         c = self.embed_dim
         return c, 2 * c, 4 * c, 8 * c
+
+
+def relative_index(window: int) -> Tensor:
+    """Row of the bias table for each (query, key) pair of a window.
+
+        index = (dy + window - 1) * (2 window - 1) + (dx + window - 1)
+
+    Source: Swin Transformer, Sec. 3.2, "Relative position bias".
+
+    `window` is the side in tokens; (window^2, window^2) int64, dy, dx = query minus key position.
+    """
+    axis = torch.arange(window)
+    yx = torch.stack(torch.meshgrid(axis, axis, indexing="ij")).flatten(1)
+    dy, dx = yx[:, :, None] - yx[:, None, :] + window - 1
+    index: Tensor = dy * (2 * window - 1) + dx
+    return index
+
+
+@lru_cache(maxsize=64)
+def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.device) -> Tensor:
+    """What is added to attention scores so that tokens brought together by the roll stay apart.
+
+    Source: Swin Transformer, Sec. 3.2, "Efficient batch computation for shifted configuration".
+
+    For a map of `hw` tokens, multiples of `window`, that was rolled by 0 < `shift` < window:
+    (windows, 1, window^2, window^2) float32, 0 within a region, -100 across regions. Kept per size.
+    """
+    with torch.inference_mode(False):
+        # 0 before the last window, 1 in it, 2 in the tokens that the roll brought from the front.
+        rows, columns = (
+            (position >= side - window).long() + (position >= side - shift).long()
+            for side, position in ((side, torch.arange(side)) for side in hw)
+        )
+        region = 3 * rows[:, None] + columns[None, :]
+        grid = region.view(hw[0] // window, window, hw[1] // window, window)
+        flat = grid.transpose(1, 2).reshape(-1, window * window)
+        apart = flat[:, :, None] != flat[:, None, :]
+        return (apart[:, None] * -100.0).to(device)
 
 
 class SwinPatchEmbed(nn.Module):
@@ -78,14 +116,9 @@ class WindowAttention(nn.Module):
         self.register_buffer("relative_position_index", index, persistent=False)
 
     def forward(self, x: Tensor, shift: int) -> Tensor:
-        """Attention in every window of a map, before the output projection.
+        """Attention in every window of (N, H, W, C), before the output projection.
 
-        Args:
-            x: (N, H, W, C), H and W multiples of the window, rolled by -`shift` already.
-            shift: tokens the map was rolled by.
-
-        Returns:
-            (N, H, W, C).
+        H and W are multiples of the window; the map has been rolled by -`shift` already.
         """
         n, height, width, dim = x.shape
         side, rows, columns = self.window, height // self.window, width // self.window
@@ -96,21 +129,17 @@ class WindowAttention(nn.Module):
         )
         q, k, v = qkv.unbind(0)
 
+        # (heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2.
+        bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)
+        bias = bias.permute(2, 0, 1)
+        if shift:
+            bias = bias + shift_mask((height, width), side, shift, bias.device)
         scores = (q * self.scale) @ k.transpose(-2, -1)
-        scores = scores + self._bias((height, width), shift)
-        out = scores.softmax(-1) @ v
+        out = (scores + bias).softmax(-1) @ v
 
         out = out.view(n, rows, columns, self.heads, side, side, -1)
         merged: Tensor = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
         return merged
-
-    def _bias(self, hw: tuple[int, int], shift: int) -> Tensor:
-        """(heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2."""
-        bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)
-        bias = bias.permute(2, 0, 1)
-        if shift == 0:
-            return bias
-        return bias + shift_mask(hw, self.window, shift, bias.device)
 
 
 class Mlp(nn.Module):
@@ -202,10 +231,7 @@ class Stage(nn.Module):
 class Swin(nn.Module):
     """One modality's branch: four maps at strides 4, 8, 16, 32, each layer-normalised.
 
-    Args:
-        in_channels: channels of the image, 3 for RGB and 1 for thermal.
-        shape: sizes.
-        shared: stages to use instead of own ones, by index (Python objects are shared).
+    `shared` are stages to use instead of own ones, by index (Python objects are shared).
     """
 
     def __init__(self, in_channels: int, *, shape: SwinShape, shared: dict[int, Stage]) -> None:
@@ -223,30 +249,25 @@ class Swin(nn.Module):
     def forward(
         self, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
     ) -> list[Tensor]:
-        """Normalised maps of the four stages.
+        """Normalised maps of the four stages, (N, C_s, H/s, W/s), channels last in memory.
 
         Args:
             image: (N, c, H, W) normalised, sides multiples of 32.
             hidden: (N, H/4, W/4) bool, True = the token is replaced by the mask token; None: none.
             generator: draws stochastic depth; only read in training mode with a rate above 0.
-
-        Returns:
-            four (N, C_s, H/s, W/s), s = 4, 8, 16, 32, channels last in memory.
         """
         x = self.patch_embed(image)
         if hidden is not None:
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
         keeps: list[Tensor | None] = [None] * 4
         if self.training and self.shape.drop_path_rate > 0:
-            keeps = list(torch.split(self._draw_keep(x, generator), list(self.shape.depths)))
+            # Factors of every residual of every sample; rates rise from 0.
+            rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
+            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)
+            keeps = list(torch.split(drawn, list(self.shape.depths)))
         maps = []
         for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):
             x = stage(x, keep)
             maps.append(self.get_submodule(f"norm{index}")(x).permute(0, 3, 1, 2))
             x = stage.get_submodule("downsample")(x)
         return maps
-
-    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Factors of every residual of every sample, (blocks, 2, N, 1, 1, 1); rates rise from 0."""
-        rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
-        return keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)

@@ -1,33 +1,30 @@
-"""Small problems for the set criterion, and the reference it is compared with."""
+"""Small problems for the losses, and recorded ones."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
+import json
 from typing import Any
 
-import pytest
+import numpy as np
 import torch
 from torch import Tensor
 
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.types import Batch, Output
+from tests.models.golden import FOLDER, fill_rule
+
+NOTHING = torch.Generator()
 
 
-@pytest.fixture(scope="session")
-def reference() -> ModuleType:
-    """The set criterion as a loop over passes, layers and images."""
-    path = Path(__file__).parents[1] / "benchmarks" / "reference_criterion.py"
-    spec = importlib.util.spec_from_file_location("reference_criterion", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["reference_criterion"] = module
-    spec.loader.exec_module(module)
-    return module
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def recorded_losses(group: str) -> tuple[Any, dict[str, Any], dict[str, Any], Any]:
+    """Rule of the numbers, recipes of a group, what is said of the outputs, stored arrays."""
+    facts = json.loads((FOLDER / "losses.json").read_text())
+    arrays = np.load(FOLDER / "losses.npz")
+    return fill_rule(), facts["recipes"][group], facts["outputs"], arrays
 
 
 def batch_of(label: Tensor, position: Tensor | None = None, original_hw: Any = None) -> Batch:
@@ -71,7 +68,7 @@ def problem_of(
 ) -> tuple[Output, Batch]:
     """Predictions for (L, P, B) and a label of 4x4 blocks, some ignored, 2 rows short of 4h."""
     height, width = 6, 8
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     normal = {"generator": generator, "dtype": torch.float32}
     aux = {
         "class_logits": torch.randn(*sizes, queries, classes + 1, **normal).requires_grad_(),
@@ -82,23 +79,3 @@ def problem_of(
     label = torch.where(label == classes, 255, label)
     position = whole_image(sizes[2], 4 * height, 4 * width)[:, :, :-2] / 2 + 3
     return Output(None, aux), batch_of(label, position, (20, 24))
-
-
-@pytest.fixture
-def make_batch() -> Callable[..., Batch]:
-    return batch_of
-
-
-@pytest.fixture
-def make_positions() -> Callable[..., Tensor]:
-    return whole_image
-
-
-@pytest.fixture
-def make_criterion() -> Callable[..., SetCriterion]:
-    return criterion_of
-
-
-@pytest.fixture
-def make_problem() -> Callable[..., tuple[Output, Batch]]:
-    return problem_of

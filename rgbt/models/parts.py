@@ -1,0 +1,108 @@
+"""What networks share: random drops in training, from a given generator, and up blocks.
+
+The up blocks are the decoder of HeatNet and of the modified DeepLab.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.ranges import ShareBelowOne
+
+DropRates = tuple[ShareBelowOne, ShareBelowOne]
+"""Channel dropout before the first block, and after every block; each in [0, 1)."""
+
+
+def keep_factors(
+    rates: Tensor, shape: tuple[int, ...], generator: torch.Generator | None, device: torch.device
+) -> Tensor:
+    """Factors of residuals that are dropped at random: 0, or 1 / (1 - rate) where kept.
+
+    Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
+
+    `rates` are (n,) probabilities of being dropped, in [0, 1); `shape` is that of the draws for
+    each of them, such as (samples,). Returns (n, *shape) float32 on `device`.
+
+    Raises:
+        ValueError: no generator.
+    """
+    if generator is None:
+        raise ValueError("training with random drops needs `generator`, got None.")
+    probability = 1 - rates.view(-1, *(1 for _ in shape)).to(generator.device)
+    draw = torch.rand(len(rates), *shape, generator=generator, device=generator.device)
+    return ((draw < probability) / probability).to(device, non_blocking=True)
+
+
+def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
+    """``x + factor * residual``; None, where nothing is dropped, is 1."""
+    return x + residual if factor is None else torch.addcmul(x, residual, factor)
+
+
+def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
+    """Whole channels of (N, C, H, W) set to 0 with probability `rate`, the others rescaled.
+
+    Source: Tompson et al., Efficient Object Localization (spatial dropout; torch's Dropout2d).
+    """
+    if rate == 0:
+        return x
+    n, channels = x.shape[:2]
+    factor = keep_factors(torch.tensor([rate]), (n, channels, 1, 1), generator, x.device)
+    return x * factor[0].to(x.dtype)
+
+
+class UpBlock(nn.Module):
+    """Twice the size (bilinear), 3x3 convolution, normalisation, PReLU with one slope.
+
+    Source: HeatNet release, PSPNet decoder; thesis, Fig. 5.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, *, align_corners: bool) -> None:
+        super().__init__()
+        self.align_corners = align_corners
+        self.conv = nn.Sequential(
+            nn.Conv2d(in_channels, out_channels, 3, padding=1),
+            nn.BatchNorm2d(out_channels),
+            nn.PReLU(),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, out, 2 H, 2 W)."""
+        larger = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=self.align_corners)
+        result: Tensor = self.conv(larger)
+        return result
+
+
+def enlarge(
+    x: Tensor, blocks: Iterable[nn.Module], rates: DropRates, generator: torch.Generator | None
+) -> Tensor:
+    """`x` (N, C, H, W) through the blocks, with channels dropped before the first and after each.
+
+    Rates (0, 0) drop nothing and need no generator, as in evaluation.
+
+    Raises:
+        ValueError: a rate above 0 without a generator.
+    """
+    first, later = rates
+    x = drop_channels(x, first, generator)
+    for block in blocks:
+        x = drop_channels(block(x), later, generator)
+    return x
+
+
+def check_heads(widths: Iterable[int], heads: Iterable[int]) -> None:
+    """Refuse heads that do not divide the channels of their stage.
+
+    Raises:
+        InputError: naming the stage.
+    """
+    for stage, (width, number) in enumerate(zip(widths, heads, strict=True)):
+        if width % number:
+            raise InputError(
+                f"model.num_heads[{stage}] = {number} must divide the {width} channels of the "
+                "stage."
+            )
