@@ -12,19 +12,17 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import info
 from sweeps import attributes as names
-from sweeps.run_specs import PlannedRun, plan_run, specify_run
 from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_links, study_folder
 from sweeps.worker.driver import drive
-from sweeps.worker.owner import Owner
-from sweeps.worker.planner import Planner
+from sweeps.worker.planner import PlannedRun, Planner, specify_run
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.sampler_source import SamplerSource
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_store import TrialStore, counted_trials
+from sweeps.worker.trial_sources import SamplerSource
+from sweeps.worker.trial_store import Owner, TrialStore, counted_trials
 
 
 @dataclass(frozen=True)
@@ -34,8 +32,6 @@ class Search:
     Attributes:
         study: name of the study.
         fixed: overrides that all trials share.
-        parameters: the space.
-        runs: finished runs.
         identity: overrides of `fixed` that must not change in a study: all but paths.
     """
 
@@ -84,7 +80,12 @@ def search(request: Search, settings: SweepSettings) -> None:
     store = TrialStore(study, storage, Owner.this_process())
     info(f"study {request.study}: run the same command on other machines to share it.")
     _drive(request, settings, store)
-    _check_result(store, request.study)
+    trials = store.trials()
+    states = Counter(trial.state.name for trial in trials)
+    for trial in [trial for trial in trials if trial.state.name == "FAIL"][:5]:
+        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
+    if trials and not states["COMPLETE"] and not states["RUNNING"]:
+        raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
     runs_dir = request.runs.runs_dir
     links = report(study, study_folder(runs_dir, request.study), request.runs.tracking)
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
@@ -93,12 +94,11 @@ def search(request: Search, settings: SweepSettings) -> None:
 def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
     """The run at the lowest point of the space; the highest one is checked too.
 
-    Raises:
-        InputError: an end of a range that a setting does not accept, a point that cannot be
-            composed, a missing data set, or an objective that the runs do not measure.
+    Both refuse what the runs would: an end of a range that a setting does not accept, a missing
+    data set, or an objective that the runs do not measure.
     """
     specify_run((*request.fixed, *_end_of(request.parameters, "high")))
-    lowest = plan_run((*request.fixed, *_end_of(request.parameters, "low")), {})
+    lowest = Planner().plan_run((*request.fixed, *_end_of(request.parameters, "low")))
     for objective in settings.objectives:
         split = objective.metric.partition("/")[0]
         if objective.is_consistency and split not in lowest.consistency_splits:
@@ -170,13 +170,3 @@ def _preview(request: Search, settings: SweepSettings) -> None:
     if settings.trials is not None:
         left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
-
-
-def _check_result(store: TrialStore, name: str) -> None:
-    trials = store.trials()
-    states = Counter(trial.state.name for trial in trials)
-    failed = [trial for trial in trials if trial.state.name == "FAIL"]
-    for trial in failed[:5]:
-        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
-    if trials and not states["COMPLETE"] and not states["RUNNING"]:
-        raise RunError(f"no trial of {name} has finished; see the reasons above.")

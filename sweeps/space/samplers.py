@@ -79,8 +79,13 @@ def build_sampler(
     from sweeps.space.per_trial import PerTrialSampler
 
     check_choice("sampler.kind", kind, SAMPLERS)
-    if kind == "cmaes":
-        _check_cmaes(objectives)
+    if kind == "cmaes" and importlib.util.find_spec("cmaes") is None:
+        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
+    if kind == "cmaes" and objectives > 1:
+        raise InputError(
+            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
+            "take tpe, gp or nsga2."
+        )
     make = getattr(optuna.samplers, SAMPLERS[kind])
     checked = _options("sampler", kind, make, options)
 
@@ -120,22 +125,13 @@ def build_pruner(kind: str, options: Mapping[str, Any], objectives: int = 1) -> 
     return pruner
 
 
-def _check_cmaes(objectives: int) -> None:
-    if importlib.util.find_spec("cmaes") is None:
-        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
-    if objectives > 1:
-        raise InputError(
-            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
-            "take tpe, gp or nsga2."
-        )
-
-
 def _options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     """`given`, checked against the signature of `make`."""
     import pydantic
 
     parameters = inspect.signature(make).parameters
-    words = {name: _annotation(one) for name, one in parameters.items() if name not in NOT_OPTIONS}
+    types = {name: one.annotation for name, one in parameters.items() if name not in NOT_OPTIONS}
+    words = {n: t if isinstance(t, str) else getattr(t, "__name__", "") for n, t in types.items()}
     known = {name: PLAIN[word] for name, word in words.items() if word in PLAIN}
     for name in known:
         if parameters[name].default is inspect.Parameter.empty and name not in given:
@@ -150,11 +146,6 @@ def _options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> dict[
             wanted = words[name].replace("None", "null")
             raise InputError(f"{what}.{name}: expected {wanted}, got {value!r}.") from error
     return dict(given)
-
-
-def _annotation(parameter: inspect.Parameter) -> str:
-    annotation = parameter.annotation
-    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
 
 
 def _construct(what: str, kind: str, make: partial[Any]) -> Any:

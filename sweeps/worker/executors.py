@@ -64,11 +64,7 @@ class Executor(Protocol):
 
 
 class LocalExecutor:
-    """Processes on this machine, forked from one that has imported torch.
-
-    Args:
-        workers: processes at a time.
-    """
+    """Processes on this machine, at most `workers` at a time."""
 
     def __init__(self, workers: int = 1) -> None:
         if workers > 1:
@@ -100,11 +96,7 @@ class LocalExecutor:
 
 
 def check_gpus(gpus: tuple[int, ...] | None) -> None:
-    """Refuse numbers of GPUs that this machine does not have, or does not show to us.
-
-    Raises:
-        InputError: naming the first.
-    """
+    """Refuse numbers of GPUs that this machine does not have, or does not show to us."""
     if gpus is None:
         return
     shown = os.environ.get(GPUS)

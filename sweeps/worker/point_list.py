@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
+from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
-from sweeps.worker.list_source import (
+from sweeps.worker.planner import PlannedPoint, Planner
+from sweeps.worker.progress import ProgressView
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.trial_sources import (
     ListSource,
     PointStatus,
     State,
@@ -22,16 +27,7 @@ from sweeps.worker.list_source import (
     is_evaluated,
     reason_of,
 )
-from sweeps.worker.owner import Owner
-from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.progress import ProgressView
-from sweeps.worker.run_monitor import training_seconds
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
-
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
+from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
 
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 """States of points that a command runs."""
@@ -42,7 +38,6 @@ class Outcome:
     """A point with its state and its finished runs.
 
     Attributes:
-        point: the point.
         state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
         reason: why it failed, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
@@ -63,8 +58,10 @@ class Outcome:
     @property
     def seconds(self) -> float | None:
         """Duration of its runs; None where one of them is unknown."""
-        each = [training_seconds(result.folder) for result in self.results]
-        return None if not each or None in each else sum(s for s in each if s is not None)
+        found = [read_result(result.folder) or {} for result in self.results]
+        each = [result.get("seconds_of_last_process") for result in found]
+        known = [float(seconds) for seconds in each if seconds is not None]
+        return sum(known) if known and len(known) == len(each) else None
 
 
 @dataclass(frozen=True)
@@ -72,10 +69,9 @@ class PointList:
     """A named list of points.
 
     Attributes:
-        study: name of the study.
+        study: its name.
         title: shown above the progress.
         kind: "grid" or "list".
-        points: the points.
         runs: finished runs; the points' overrides name the same folder.
         base: overrides that all have.
         distributions: of the parameters of a grid, by name.
@@ -107,26 +103,24 @@ def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     planned = _PlannedPoints(points)
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
-    return planned.outcomes(lambda plan: _status(plan, trials.get(plan.key, []), points.runs))
 
+    def status(plan: PlannedPoint) -> PointStatus:
+        results = finished_runs(plan, points.runs) or ()
+        if results and is_evaluated(plan, results):
+            return PointStatus("finished", results=results)
+        same = trials.get(plan.key, [])
+        states = [trial.state.name for trial in same]
+        if "RUNNING" in states:
+            return PointStatus("running")
+        if states and states[-1] == "FAIL":
+            return PointStatus("failed", reason_of(same[-1]), results)
+        return PointStatus("waiting", results=results)
 
-def _status(plan: PlannedPoint, trials: Sequence[FrozenTrial], runs: RunStore) -> PointStatus:
-    results = finished_runs(plan, runs) or ()
-    if results and is_evaluated(plan, results):
-        return PointStatus("finished", results=results)
-    states = [trial.state.name for trial in trials]
-    if "RUNNING" in states:
-        return PointStatus("running")
-    if states and states[-1] == "FAIL":
-        return PointStatus("failed", reason_of(trials[-1]), results)
-    return PointStatus("waiting", results=results)
+    return planned.outcomes(status)
 
 
 def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
-    """Run all unfinished points; a failed point does not stop the others.
-
-    Returns:
-        one outcome per point, in their order.
+    """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
 
     Raises:
         InputError: the storage or the executor cannot be used.
@@ -165,13 +159,8 @@ class _PlannedPoints:
         if self.errors and not self.plans:
             # An error of every point is one of the command and not of a point.
             raise InputError(next(iter(self.errors.values())))
-        self._merge_tags(points.study)
-
-    def _merge_tags(self, study: str) -> None:
-        """Give points of the same run in other words (1 and 1.0) the tags of all of them.
-
-        Every run gets its own colour, and the keys that vary, which begin its name.
-        """
+        # Points of the same run in other words (1 and 1.0) get the tags of all of them. Every run
+        # gets its own colour, and the keys that vary, which begin its name.
         varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}
         for plan in self.plans.values():
@@ -181,7 +170,7 @@ class _PlannedPoints:
                 values += [] if value in values else [value]
         for index, plan in self.plans.items():
             merged = {name: " | ".join(each) for name, each in tags[plan.key].items()}
-            merged |= {VARIED: varied, COLOUR: colour(study, list(tags).index(plan.key))}
+            merged |= {VARIED: varied, COLOUR: colour(points.study, list(tags).index(plan.key))}
             self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
 
     def outcomes(self, status_of: Callable[[PlannedPoint], PointStatus]) -> list[Outcome]:

@@ -15,9 +15,8 @@ from rgbt.files.atomic import is_held
 from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.run_specs import PlannedRun
 from sweeps.worker.executors import GRACE_S, Job
-from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.planner import PlannedPoint, PlannedRun
 from sweeps.worker.run_monitor import MetricsReader, failure_reason, signal_lock_holder
 from sweeps.worker.run_store import RunStore
 
@@ -41,13 +40,7 @@ class TrialPruned(Exception):  # noqa: N818 - not an error, Optuna's name for it
 
 @dataclass(frozen=True)
 class ExecutionContext:
-    """What a trial needs of its driver.
-
-    Attributes:
-        runs: finished runs.
-        start: starts processes.
-        timeout_s: of a run; None for no limit.
-    """
+    """What a trial needs of its driver; `timeout_s` is of a run, None for no limit."""
 
     runs: RunStore
     start: Start
@@ -55,14 +48,7 @@ class ExecutionContext:
 
 
 class RunningTrial:
-    """Executes one trial; never blocks.
-
-    Args:
-        plan: its point.
-        number: of the trial.
-        context: see `ExecutionContext`.
-        report: called with every validation of the first run, or None.
-    """
+    """Executes one trial; never blocks. `report` is called with validations of the first run."""
 
     def __init__(
         self,
@@ -80,9 +66,8 @@ class RunningTrial:
         self.score = math.nan
         """Last mIoU on the selection split, a fraction."""
 
+        self._context = context
         self._runs = context.runs
-        self._start = context.start
-        self._timeout_s = context.timeout_s
         self._report = report
         self._job: Job | None = None
         self._adopted: Path | None = None
@@ -124,10 +109,10 @@ class RunningTrial:
             return self._results
         except (TrialError, TrialPruned) as end:
             self._end = end
+            raise
         except RunError as error:
             self._end = TrialError(str(error))
-        if self._end is not None:
-            raise self._end
+            raise self._end from error
         self._report_lines()
         return None
 
@@ -222,7 +207,7 @@ class RunningTrial:
         log = self._runs.runs_dir / LOGS / f"{key}.log"
         begin = log.stat().st_size if log.exists() else 0
         try:
-            self._job = self._start(command, log)
+            self._job = self._context.start(command, log)
         except OSError as error:
             raise TrialError(f"its process could not be started ({error})") from error
         code = yield from self._wait(self._job.poll)
@@ -230,11 +215,15 @@ class RunningTrial:
 
     def _wait(self, poll: Callable[[], int | None]) -> Generator[None, None, int]:
         """Wait for an exit code, and read the metrics of the run meanwhile."""
-        limit = self._timeout_s
+        limit = self._context.timeout_s
         began = time.monotonic()
         while True:
             code = poll()
-            self._read_metrics()
+            lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
+            if lines:
+                self.score = lines[-1].values.get("mIoU", math.nan)
+            if self._report is not None and self._index == 0:
+                self._unreported += lines
             if code is not None:
                 return code
             if self._prune_reason:
@@ -254,14 +243,6 @@ class RunningTrial:
             if self._adopted is not None and time.monotonic() > kill_at:
                 signal_lock_holder(self._adopted, signal.SIGKILL)
             yield
-
-    def _read_metrics(self) -> None:
-        """Read new metric lines; `advance` reports those of the first run."""
-        lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
-        if lines:
-            self.score = lines[-1].values.get("mIoU", math.nan)
-        if self._report is not None and self._index == 0:
-            self._unreported += lines
 
 
 def mean_scores(results: Sequence[RunResult]) -> Mapping[str, float]:

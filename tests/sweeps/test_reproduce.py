@@ -7,13 +7,11 @@ from typing import Any
 
 import pytest
 
-from rgbt.checks import InputError
-from rgbt.config.options import parse, types_of
+from rgbt.config.options import types_of
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.options import OF_THE_TABLE, Options, settings_of
 from sweeps.point import Point
 from sweeps.rendering import publish
-from sweeps.reproduce import entry
+from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
@@ -144,16 +142,6 @@ def test_reproduce_full_disk_prints_table_without_files(
     assert_one_sentence(err, "No space left on device; the files were not written")
 
 
-def test_reproduce_unrunnable_table_shows_published_values(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
-    asked = driven("finished")
-    code, out, _ = call(entry, "table=spatialseg/fps", "tracking=none")
-    assert (code, asked) == (0, [])
-    assert "Cannot be run yet: " in out
-    assert (place / "runs/tables/spatialseg/fps_demo/table.md").exists()
-
-
 @pytest.mark.slow
 def test_a_table_of_sizes_runs_nothing_and_has_values(
     call: Call, place: Path, driven: Callable[..., Asked]
@@ -173,17 +161,6 @@ def test_a_table_of_sizes_runs_nothing_and_has_values(
     code, out, _ = call(entry, *words, "dry_run=true")
     assert (code, asked[0][0].points) == (0, ())
     assert "0 runs: none." in out
-
-
-def test_a_network_that_cannot_be_built_is_told(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
-    driven("finished")
-    words = ("table=multihead/table5", "tracking=none", "model.depths=[3]")
-    code, out, err = call(entry, *words)
-    assert code == 1
-    assert "depths" in out
-    assert_one_sentence(err, "no value although nothing is missing")
 
 
 def test_dry_run_lists_the_cells_and_writes_nothing(
@@ -249,18 +226,3 @@ def test_mistakes_cost_one_sentence(
 
 def test_reproduce_options_are_sweep_settings() -> None:
     assert set(types_of(Options)) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
-
-
-def test_settings_of_command_have_sweeper_defaults() -> None:
-    def given(*words: str) -> SweepSettings:
-        return settings_of(parse(Options, ["table=a", *words])[0])
-
-    plain = given()
-    assert (plain.workers, plain.storage, plain.gpus, plain.submitit) == (1, None, None, {})
-    url = "postgresql://me@host/db?a=b"
-    options = (f"storage={url}", "gpus=[0,1]", "executor=submitit")
-    changed = given(*options, "submitit={cluster: slurm, timeout_min: 9}")
-    assert (changed.storage, changed.gpus) == (url, (0, 1))
-    assert changed.submitit == {"cluster": "slurm", "timeout_min": 9}
-    with pytest.raises(InputError, match="'gpus\\[0\\]' must be a whole number"):
-        given("gpus=[0")

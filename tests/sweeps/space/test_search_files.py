@@ -78,9 +78,3 @@ def test_ranges_hold_the_published_values() -> None:
     released = flatten(compose("+experiment=crm"))
     for parameter in parse_space(space_of("loss")):
         assert parameter.low < released[parameter.key] < parameter.high
-
-
-def test_another_experiment_can_be_chosen() -> None:
-    config = compose("+search=grbm", "experiment=grbm_released")
-    assert (config.name, config.masker.sampler) == ("grbm_released", "gaussian_count")
-    assert compose("+search=grbm", "masker=crm").masker.sampler == "uniform"

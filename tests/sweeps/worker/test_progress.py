@@ -106,20 +106,6 @@ def test_progress_time_left_uses_finished_trials(console: Make) -> None:
     assert ProgressView("search", None, 2, lambda: 0)._left(works(Shown())) == ""
 
 
-def test_what_other_drivers_finished_is_counted_now_and_then(
-    console: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    console(True)
-    done = [1]
-    with ProgressView("table", 10, 2, lambda: done[0]) as view:
-        done[0] = 7
-        assert view._headline([]).startswith("table: 1 of 10")
-        later = progress.time.monotonic() + 60
-        monkeypatch.setattr(progress.time, "monotonic", lambda: later)
-        view.update([])
-        assert view._headline([]).startswith("table: 7 of 10")
-
-
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [(0, "0 s"), (89.4, "89 s"), (90, "2 min"), (3600, "60 min"), (5400, "1 h 30 min"),

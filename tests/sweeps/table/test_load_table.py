@@ -10,20 +10,9 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.config.component import build
-from rgbt.metrics.named import parse
-from rgbt.spec.specify import specify
-from sweeps.table.load_table import load_table, table_names
+from sweeps.table.load_table import load_table
 from sweeps.table.table import Column, Row, Table
-from tests.sweeps.composed import row_config
 
-TABLES = {name: load_table(name) for name in table_names(Path("none"))}
-ROWS = [
-    pytest.param(table, row, id=f"{name}: {row.label}")
-    for name, table in TABLES.items()
-    for row in table.rows
-    if row.experiment is not None
-]
 SMALL: dict[str, Any] = {
     "paper": "my",
     "number": "1",
@@ -70,19 +59,6 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
     assert table.rows[1].values == {"mIoU": 61.0, "Var": None}
     with pytest.raises(FrozenInstanceError):
         table.rows[0].label = "other"  # type: ignore[misc]
-
-
-def test_path_and_name_find_the_same_table(tmp_path: Path) -> None:
-    path = write(tmp_path)
-    assert load_table(str(path)) == load_table("my/ablation", tmp_path)
-
-
-def test_names_list_published_tables_and_ones_own(tmp_path: Path) -> None:
-    write(tmp_path)
-    names = table_names(tmp_path)
-    assert names[-1] == "my/ablation"
-    assert {"crm/table2a", "spatialseg/fps", "temporal/table5", "multihead/table1"} < set(names)
-    assert len(names) == 26
 
 
 @pytest.mark.parametrize(
@@ -172,20 +148,6 @@ def test_refuses(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("paper: my\npaper: yours\n", "duplicate key"),
-        ("rows: [", "cannot be read as YAML"),
-        ("- a\n", "the whole file"),
-    ],
-)
-def test_refuses_what_is_no_table(tmp_path: Path, text: str, sentence: str) -> None:
-    (tmp_path / "broken.yaml").write_text(text)
-    with pytest.raises(InputError, match=sentence):
-        load_table("broken", tmp_path)
-
-
 def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'spatialseg/table3'"):
         load_table("spatialseg/tabel3", tmp_path)
@@ -217,20 +179,6 @@ def test_table_overrides_precede_row_overrides() -> None:
         table.overrides(table.rows[1], "demo")
 
 
-def test_a_row_runs_unless_a_part_is_missing() -> None:
-    def runnable(row_needs: str | None, table_needs: str | None, experiment: str | None) -> bool:
-        row = Row(label="a", experiment=experiment, needs=row_needs)
-        table = Table(
-            paper="", number="", caption="", data="", columns=(), rows=(row,), needs=table_needs
-        )
-        return table.runnable(row)
-
-    assert runnable(None, None, "crm")
-    assert not runnable("a part", None, "crm")
-    assert not runnable(None, "a part", "crm")
-    assert not runnable(None, None, None)
-
-
 def test_columns_of_row_omit_dependent_columns() -> None:
     row = Row(label="a", experiment="crm", without=("night",))
     columns = (
@@ -242,160 +190,3 @@ def test_columns_of_row_omit_dependent_columns() -> None:
     table = Table(paper="", number="", caption="", data="", columns=columns, rows=(row,))
     assert [column.name for column in table.columns_of(row)] == ["day"]
     assert table.columns_of(Row(label="b")) == columns
-
-
-@pytest.mark.parametrize(("table", "row"), ROWS)
-def test_published_row_composes_and_its_masks_fit(table: Table, row: Row) -> None:
-    config = row_config(table, row, "demo")
-    grid = build(config.masker).grid_hw(tuple(config.transform.crop_hw))
-    assert min(grid) > 1
-
-
-@pytest.mark.parametrize("scale", ["demo", pytest.param("paper", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "cells",
-    [
-        [
-            ("spatialseg/table3", "Ny/4"),
-            ("spatialseg/table4", "PS 64"),
-            ("spatialseg/table5", "alpha 0"),
-            ("spatialseg/table6", "no weighting"),
-        ],
-        [
-            ("spatialseg/table5", "alpha 2"),
-            ("spatialseg/table6", "Edge"),
-            ("spatialseg/table7", "Ours (Swin-S)"),
-        ],
-        [
-            ("crm/table1", "Ours"),
-            ("crm/table2a", "Ours (Swin-S)"),
-            ("crm/table3a", "Ours"),
-            ("crm/table3b", "Patch (32)"),
-            ("crm/table4", "CRM"),
-        ],
-        [("temporal/table1", "(A)"), ("temporal/table2", "(A)")],
-        [("temporal/table1", "(G)"), ("temporal/table4", "Ours-dice")],
-        [
-            ("temporal/table1", "(H)"),
-            ("temporal/table2", "(D)"),
-            ("temporal/table3", "(E)"),
-            ("temporal/table4", "Ours-con"),
-        ],
-        [("temporal/table1", "(I)"), ("temporal/table4", "Ours-con-acc")],
-    ],
-)
-def test_rows_that_are_printed_twice_are_one_run(cells: list[tuple[str, str]], scale: str) -> None:
-    keys, printed = set(), set()
-    for name, label in cells:
-        (row,) = [row for row in TABLES[name].rows if row.label == label]
-        keys.add(specify(row_config(TABLES[name], row, scale)).key)
-        miou = row.values.get("mIoU", row.values.get("rgbt_mIoU"))
-        assert miou is not None
-        printed.add(round(miou, 1))
-    assert len(keys) == 1
-    assert len(printed) == 1
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["crm/table3a", "crm/table3b", "crm/table4"]
-    + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)]
-    + [f"temporal/table{number}" for number in (1, 2, 3)],
-)
-def test_rows_of_an_ablation_are_different_runs(name: str) -> None:
-    table = TABLES[name]
-    keys = {specify(row_config(table, row, "demo")).key for row in table.rows}
-    assert len(keys) == len(table.rows)
-
-
-@pytest.mark.parametrize(("table", "row"), ROWS)
-def test_settings_say_what_the_overrides_do(table: Table, row: Row) -> None:
-    masker, loss = (row_config(table, row, "demo")[node] for node in ("masker", "loss"))
-    printed = {key: value for key, value in row.settings.items() if value is not None}
-    found = {
-        "patch_size": 2 * (masker.patch_size or 0),  # pixels are halved at demo scale
-        "alpha": loss.get("spatial", loss).get("alpha"),
-        "beta": loss.get("beta"),
-        "focus": loss.get("spatial", {}).get("focus"),
-        "masking_ratio": masker.ratio,
-        "masking": {"indiv": "irm", "rand_comp": "crm"}.get(masker.pairing or ""),
-    }
-    if masker.sigma_div is not None:
-        found["sigma_p"] = "Ny" if masker.sigma_div == 1 else f"Ny/{masker.sigma_div:g}"
-    shared = set(printed) & set(found)
-    assert {key: printed[key] for key in shared} == {key: found[key] for key in shared}
-
-
-@pytest.mark.parametrize("name", ["crm/table3b", "crm/table4", "spatialseg/table4"])
-def test_x_is_the_printed_factor(name: str) -> None:
-    key = "masking_ratio" if name == "crm/table4" else "patch_size"
-    assert [row.x for row in TABLES[name].rows] == [row.settings[key] for row in TABLES[name].rows]
-
-
-def test_gaussian_x_equals_share_of_rows() -> None:
-    shares: dict[str | None, float | None]
-    shares = {"Ny" if n == 1 else f"Ny/{n}": 1 / n for n in (1, 2, 4, 8, 16, 32)}
-    found = {row.settings["sigma_p"]: row.x for row in TABLES["spatialseg/table3"].rows}
-    assert found == shares | {None: None}
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_columns_are_scores_that_can_be_computed(name: str) -> None:
-    for row in TABLES[name].rows:
-        for column in TABLES[name].columns:
-            if column.metric is not None:
-                parse(column.metric.format_map(row.settings))
-
-
-def test_crm_table1_drops_images_and_own_features() -> None:
-    found = TABLES["crm/table1"]
-    dropped = {
-        column.name: (column.corruption, column.modality)
-        for column in found.columns
-        if column.metric is not None
-    }
-    assert dropped == {
-        "rgbt_mIoU": (None, "default"),
-        "rgb_drop_mIoU": ("removed:rgb", "default"),
-        "thr_drop_mIoU": ("removed:thermal", "default"),
-        "rgb_drop_features_mIoU": (None, "thermal"),
-        "thr_drop_features_mIoU": (None, "rgb"),
-    }
-    assert all(found.runnable(row) for row in found.rows)
-    columns = {row.label: len(found.columns_of(row)) for row in found.rows}
-    assert columns == {"RTFNet": 5, "CMXNet": 5, "Ours": 9}
-
-
-def test_imported_rows_are_published_only() -> None:
-    for table in TABLES.values():
-        for row in table.rows:
-            imported = row.origin in ("imported", "imported_inferred", "mixed")
-            assert not (imported and row.experiment)
-
-
-def test_published_row_is_runnable_or_has_needs() -> None:
-    silent = [
-        (name, row.label)
-        for name, table in TABLES.items()
-        for row in table.rows
-        if (row.origin or "").startswith("own")
-        and not (table.runnable(row) or row.needs or table.needs)
-    ]
-    assert silent == []
-
-
-@pytest.mark.parametrize("number", [3, 4, 5, 6])
-def test_printed_variance_is_the_population_variance_of_the_rings(number: int) -> None:
-    for row in TABLES[f"spatialseg/table{number}"].rows:
-        rings = [row.values[f"IoU{ring}"] for ring in range(1, 6)]
-        mean = sum(value for value in rings if value is not None) / 5
-        variance = sum((value - mean) ** 2 for value in rings if value is not None) / 5
-        printed = row.values["Var"]
-        assert printed is not None
-        assert (abs(variance - printed) > 0.02) == ("Var" in row.doubtful), (row.label, variance)
-
-
-def test_doubtful_cells_are_explained() -> None:
-    doubtful = [row for table in TABLES.values() for row in table.rows if row.doubtful]
-    assert len(doubtful) == 11
-    assert all(row.remarks for row in doubtful)
