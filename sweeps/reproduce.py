@@ -23,7 +23,7 @@ from sweeps.table.new_table import NewOptions, new
 from sweeps.table.request import TableRequest, seeds_of
 
 if TYPE_CHECKING:
-    from sweeps.worker.point_list import Outcome
+    from sweeps.worker.trial_sources import Outcome
 
 ALL = "all"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -58,7 +58,14 @@ def search(request: Search, settings: SweepSettings) -> None:
             "retry=failed is for grids and tables; a search continues with other points: give it "
             "more trials, or retries=1 to retry each failed point at once."
         )
-    sampler, pruner = _sampler_and_pruner(settings)
+    sampler = build_sampler(settings.sampler, len(settings.objectives))
+    first = settings.objectives[0]
+    if settings.pruner is not None and not first.is_reported:
+        raise InputError(
+            f"pruner: trials are compared while they train, but {first.metric} is known at the end "
+            "alone; choose val/mIoU or hydra.sweeper.pruner=null."
+        )
+    pruner = build_pruner(settings.pruner, len(settings.objectives))
     if settings.dry_run:
         _preview(request, settings)
         return
@@ -129,31 +136,6 @@ def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
         request.fixed, request.parameters, store, Planner(), settings, view.rejected
     )
     drive(view, source, store, request.runs, settings)
-
-
-def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
-    count = len(settings.objectives)
-    kind, seed, options = _chosen(settings.sampler, "sampler")
-    sampler = build_sampler(kind, seed, options, count)
-    if settings.pruner is None:
-        return sampler, build_pruner("none", {}, count)
-    kind, _, options = _chosen(settings.pruner, "pruner")
-    if not settings.objectives[0].is_reported:
-        raise InputError(
-            f"pruner: trials are compared while they train, but {settings.objectives[0].metric} is "
-            "known at the end alone; choose val/mIoU or hydra.sweeper.pruner=null."
-        )
-    return sampler, build_pruner(kind, options, count)
-
-
-def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any]]:
-    options = {key: value for key, value in node.items() if key not in ("kind", "seed")}
-    if "kind" not in node:
-        raise InputError(f"hydra.sweeper.{what}: 'kind' has no value, such as {{kind: tpe}}.")
-    seed = node.get("seed", 0)
-    if not isinstance(seed, int):
-        raise InputError(f"hydra.sweeper.{what}.seed: expected a whole number, got {seed}.")
-    return str(node["kind"]), seed, options
 
 
 def _preview(request: Search, settings: SweepSettings) -> None:

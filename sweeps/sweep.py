@@ -33,8 +33,6 @@ from sweeps.space.grid import (
 )
 from sweeps.space.space import as_overrides
 from sweeps.worker.point_list import (
-    UNFINISHED,
-    Outcome,
     PointList,
     estimated_seconds,
     other_code_line,
@@ -43,6 +41,7 @@ from sweeps.worker.point_list import (
 )
 from sweeps.worker.progress import duration
 from sweeps.worker.run_store import open_run_store
+from sweeps.worker.trial_sources import UNFINISHED, Outcome
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""

@@ -43,13 +43,7 @@ SHIFT = 0.13
 
 @dataclass(frozen=True)
 class Series:
-    """Values along an axis; NaN: there is none.
-
-    Attributes:
-        positions: along the axis.
-        means: values.
-        sds: half lengths of the error bars; NaN: none.
-    """
+    """Values along an axis and half lengths of their error bars; NaN: there is none."""
 
     positions: Sequence[float]
     means: Sequence[float]

@@ -18,7 +18,8 @@ from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE
 from sweeps.table.request import TableRequest, parameter_cells
 from sweeps.table.scoring import ScoredTable, score
-from sweeps.worker.point_list import Outcome, other_code_line
+from sweeps.worker.point_list import other_code_line
+from sweeps.worker.trial_sources import Outcome
 
 if TYPE_CHECKING:
     from rgbt.tracking.tracker import Tracking

@@ -9,7 +9,7 @@ from rgbt.tracking.tables import ABSENT, TextTable, number
 from sweeps.point import Point
 from sweeps.rendering.rendered_table import TextCell
 from sweeps.table.cells import TableCell, Value, over_seeds
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 
 MOST_REGIONS = 99
 

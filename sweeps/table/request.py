@@ -19,7 +19,7 @@ from sweeps.table.cells import NO_VALUE, CellId, TableCell, evaluation_of, is_co
 from sweeps.table.table import Table
 
 if TYPE_CHECKING:
-    from sweeps.worker.point_list import Outcome
+    from sweeps.worker.trial_sources import Outcome
 
 DEFAULT_SCALE = "demo"
 """The scale of a run without ``scale=...``."""

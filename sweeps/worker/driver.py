@@ -26,13 +26,7 @@ from sweeps.settings import SweepSettings
 from sweeps.worker.executors import GPUS, Executor, Job, LocalExecutor, check_gpus
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import (
-    ExecutionContext,
-    RunningTrial,
-    TrialError,
-    TrialPruned,
-    mean_scores,
-)
+from sweeps.worker.running_trial import RunningTrial, TrialError, TrialPruned, mean_scores
 from sweeps.worker.trial_sources import TrialSource
 from sweeps.worker.trial_store import HEARTBEAT_S, TrialStore
 
@@ -133,8 +127,8 @@ class Driver:
                 return
             slot = min(set(range(self.settings.workers)) - set(self.running))
             start = partial(self._start, slot=slot, tags=claimed.plan.point.tags)
-            context = ExecutionContext(self.runs, start, limit)
-            trial = RunningTrial(claimed.plan, claimed.number, context, claimed.report)
+            plan, number, report = claimed.plan, claimed.number, claimed.report
+            trial = RunningTrial(plan, number, self.runs, start, limit, report)
             self.view.began(trial)
             self.running[slot] = trial
             # A point that was finished elsewhere needs no process: its slot is free at once.

@@ -42,11 +42,9 @@ class Job(Protocol):
 
     def poll(self) -> int | None:
         """Its exit code, negative for a signal; None while it runs."""
-        ...
 
     def stop(self) -> None:
         """Ask it to stop; where it does not, later calls of `poll` kill it."""
-        ...
 
 
 class Executor(Protocol):
@@ -60,7 +58,6 @@ class Executor(Protocol):
             environment: variables set beside those of this process.
             log: file that takes stdout and stderr, appended to.
         """
-        ...
 
 
 class LocalExecutor:

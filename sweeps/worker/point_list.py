@@ -9,8 +9,6 @@ from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
-from rgbt.tracking.run_files import read_result
-from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.settings import SweepSettings
@@ -20,48 +18,14 @@ from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
 from sweeps.worker.trial_sources import (
+    UNFINISHED,
     ListSource,
-    PointStatus,
-    State,
+    Outcome,
     finished_runs,
     is_evaluated,
     reason_of,
 )
 from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
-
-UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command runs."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A point with its state and its finished runs.
-
-    Attributes:
-        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
-        reason: why it failed, or "".
-        results: its finished runs; of a waiting point, runs that lack further evaluations only.
-        keys: of its runs; () where its configuration is wrong.
-    """
-
-    point: Point
-    state: State
-    reason: str = ""
-    results: tuple[RunResult, ...] = ()
-    keys: tuple[str, ...] = ()
-
-    @property
-    def is_trained(self) -> bool:
-        """Whether it lacks further evaluations of its runs only."""
-        return self.state in UNFINISHED and bool(self.results)
-
-    @property
-    def seconds(self) -> float | None:
-        """Duration of its runs; None where one of them is unknown."""
-        found = [read_result(result.folder) or {} for result in self.results]
-        each = [result.get("seconds_of_last_process") for result in found]
-        known = [float(seconds) for seconds in each if seconds is not None]
-        return sum(known) if known and len(known) == len(each) else None
 
 
 @dataclass(frozen=True)
@@ -104,17 +68,17 @@ def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
 
-    def status(plan: PlannedPoint) -> PointStatus:
+    def status(plan: PlannedPoint) -> Outcome:
         results = finished_runs(plan, points.runs) or ()
         if results and is_evaluated(plan, results):
-            return PointStatus("finished", results=results)
+            return Outcome.of(plan, "finished", results=results)
         same = trials.get(plan.key, [])
         states = [trial.state.name for trial in same]
         if "RUNNING" in states:
-            return PointStatus("running")
+            return Outcome.of(plan, "running")
         if states and states[-1] == "FAIL":
-            return PointStatus("failed", reason_of(same[-1]), results)
-        return PointStatus("waiting", results=results)
+            return Outcome.of(plan, "failed", reason_of(same[-1]), results)
+        return Outcome.of(plan, "waiting", results=results)
 
     return planned.outcomes(status)
 
@@ -173,19 +137,14 @@ class _PlannedPoints:
             merged |= {VARIED: varied, COLOUR: colour(points.study, list(tags).index(plan.key))}
             self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
 
-    def outcomes(self, status_of: Callable[[PlannedPoint], PointStatus]) -> list[Outcome]:
+    def outcomes(self, status_of: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:
         """One outcome per point, in order."""
-        outcomes = []
-        for index, point in enumerate(self.points):
-            if index in self.errors:
-                outcomes.append(Outcome(point, "failed", self.errors[index]))
-                continue
-            plan = self.plans[index]
-            status = status_of(plan)
-            keys = tuple(run.key for run in plan.runs)
-            outcome = Outcome(plan.point, status.state, status.reason, status.results, keys)
-            outcomes.append(outcome)
-        return outcomes
+        return [
+            Outcome(point, "failed", self.errors[index])
+            if index in self.errors
+            else status_of(self.plans[index])
+            for index, point in enumerate(self.points)
+        ]
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:

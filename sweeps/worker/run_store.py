@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,20 +27,19 @@ FETCHED = ".fetched"
 Answer = TypeVar("Answer")
 
 
+@dataclass
 class RunStore:
     """All finished runs that this machine can reach.
 
-    Args:
-        runs_dir: the folder of runs.
+    Attributes:
         tracking: as the configuration builds it; MLflow is searched for runs without a result here.
         fresh: ignore finished runs that other code made, so that they are trained again.
     """
 
-    def __init__(self, runs_dir: Path, tracking: Tracking, *, fresh: bool = False) -> None:
-        self.runs_dir = runs_dir
-        self.tracking = tracking
-        self.fresh = fresh
-        self._is_unreachable = False
+    runs_dir: Path
+    tracking: Tracking
+    fresh: bool = False
+    _is_unreachable: bool = field(default=False, init=False)
 
     def find(self, key: str, dataset: str) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.

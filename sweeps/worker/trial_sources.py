@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics.names import in_percent
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
@@ -31,6 +32,8 @@ PAUSE_S = 5.0
 """How long a search waits after a point that is being run already."""
 
 State = Literal["finished", "failed", "running", "waiting"]
+UNFINISHED: tuple[State, ...] = ("waiting", "failed")
+"""States of points that a command runs."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +56,9 @@ class TrialSource(Protocol):
 
     def next(self) -> ClaimedTrial | None:
         """The next trial, claimed for this driver; None when there is none at the moment."""
-        ...
 
     def is_exhausted(self, *, wait: bool) -> bool:
         """Whether no trial is left; with `wait`, whether other drivers have finished too."""
-        ...
 
 
 def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
@@ -72,63 +73,83 @@ def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
 
 
 @dataclass(frozen=True)
-class PointStatus:
-    """The state of a point.
+class Outcome:
+    """A point with its state and its finished runs.
 
     Attributes:
+        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
         reason: why it failed, or "".
-        results: its finished runs.
-        replaced: numbers of its earlier trials that a new trial replaces.
+        results: its finished runs; of a waiting point, runs that lack further evaluations only.
+        keys: of its runs; () where its configuration is wrong.
     """
 
+    point: Point
     state: State
     reason: str = ""
     results: tuple[RunResult, ...] = ()
-    replaced: tuple[int, ...] = ()
+    keys: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        plan: PlannedPoint,
+        state: State,
+        reason: str = "",
+        results: tuple[RunResult, ...] = (),
+    ) -> Outcome:
+        """Of a planned point."""
+        return cls(plan.point, state, reason, results, tuple(run.key for run in plan.runs))
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether it lacks further evaluations of its runs only."""
+        return self.state in UNFINISHED and bool(self.results)
+
+    @property
+    def seconds(self) -> float | None:
+        """Duration of its runs; None where one of them is unknown."""
+        found = [read_result(result.folder) or {} for result in self.results]
+        each = [result.get("seconds_of_last_process") for result in found]
+        known = [float(seconds) for seconds in each if seconds is not None]
+        return sum(known) if known and len(known) == len(each) else None
 
 
+@dataclass
 class ListSource:
     """Claims the points of a list in their order.
 
-    Args:
-        plans: the points; of equal keys the last one counts.
-        store: the study.
-        runs: finished runs.
+    Attributes:
+        points: planned; of equal keys the last one counts.
         settings: `retries` and `retry` count here.
         distributions: of the parameters of a grid, by name.
     """
 
-    requeues = False
-    rejected = 0
+    points: InitVar[Sequence[PlannedPoint]]
+    store: TrialStore
+    runs: RunStore
+    settings: SweepSettings
+    distributions: Mapping[str, Any]
+    requeues: bool = field(default=False, init=False)
+    rejected: int = field(default=0, init=False)
 
-    def __init__(
-        self,
-        plans: Sequence[PlannedPoint],
-        store: TrialStore,
-        runs: RunStore,
-        settings: SweepSettings,
-        distributions: Mapping[str, Any],
-    ) -> None:
-        self.plans = {plan.key: plan for plan in plans}
-        self._store = store
-        self._runs = runs
-        self._retries = settings.retries
-        self._distributions = distributions
-        before = store.trials() if settings.retry == "failed" else []
+    def __post_init__(self, points: Sequence[PlannedPoint]) -> None:
+        self.plans = {plan.key: plan for plan in points}
+        before = self.store.trials() if self.settings.retry == "failed" else []
         self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
-        self._finished: dict[str, PointStatus] = {}
+        self._finished: dict[str, tuple[RunResult, ...]] = {}
         self._rechecked: set[tuple[str, int]] = set()
 
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
-        by_key = self._store.by_key()
+        by_key = self.store.by_key()
         for plan in self.plans.values():
-            status = self.status(plan, by_key)
-            if status.state != "waiting":
+            if self.status(plan, by_key).state != "waiting":
                 continue
-            params = {k: v for k, v in plan.point.params.items() if k in self._distributions}
-            known = {name: self._distributions[name] for name in params}
-            number = self._store.claim(trial_attributes(plan), params, known, status.replaced)
+            params = {k: v for k, v in plan.point.params.items() if k in self.distributions}
+            known = {name: self.distributions[name] for name in params}
+            # Failed trials of the point, and those whose runs were deleted.
+            replaced = [trial.number for trial in by_key.get(plan.key, ())]
+            number = self.store.claim(trial_attributes(plan), params, known, replaced)
             if number is not None:
                 return ClaimedTrial(plan, number)
         return None
@@ -138,40 +159,38 @@ class ListSource:
         states = {status.state for status in self.statuses()}
         return not states & ({"running", "waiting"} if wait else {"waiting"})
 
-    def statuses(self) -> list[PointStatus]:
+    def statuses(self) -> list[Outcome]:
         """The states of all points."""
-        by_key = self._store.by_key()
+        by_key = self.store.by_key()
         return [self.status(plan, by_key) for plan in self.plans.values()]
 
-    def status(
-        self, plan: PlannedPoint, by_key: Mapping[str, Sequence[FrozenTrial]]
-    ) -> PointStatus:
+    def status(self, plan: PlannedPoint, by_key: Mapping[str, Sequence[FrozenTrial]]) -> Outcome:
         """The state of a point by the study and the finished runs."""
-        if plan.key in self._finished:
-            return self._finished[plan.key]
         trials = by_key.get(plan.key, ())
         states = {trial.state.name for trial in trials}
-        if "RUNNING" in states:
-            return PointStatus("running")
-        if "COMPLETE" in states and self._is_finished(plan):
-            return self._finished[plan.key]
+        is_known = plan.key in self._finished
+        if "RUNNING" in states and not is_known:
+            return Outcome.of(plan, "running")
+        if (is_known or "COMPLETE" in states) and self._is_finished(plan):
+            return Outcome.of(plan, "finished", results=self._finished[plan.key])
         failed = [trial for trial in trials if trial.state.name == "FAIL"]
         counted = [trial for trial in failed if trial.number not in self._forgiven]
-        if len(counted) <= self._retries:
-            return PointStatus("waiting", replaced=tuple(trial.number for trial in trials))
+        if len(counted) <= self.settings.retries:
+            return Outcome.of(plan, "waiting")
         # Its runs may have been finished by hand since.
         last = (plan.key, counted[-1].number)
         if last not in self._rechecked:
             self._rechecked.add(last)
             if self._is_finished(plan):
-                return self._finished[plan.key]
-        return PointStatus("failed", reason_of(counted[-1]))
+                return Outcome.of(plan, "finished", results=self._finished[plan.key])
+        return Outcome.of(plan, "failed", reason_of(counted[-1]))
 
     def _is_finished(self, plan: PlannedPoint) -> bool:
-        results = finished_runs(plan, self._runs)
-        if results is None or not is_evaluated(plan, results):
-            return False
-        self._finished[plan.key] = PointStatus("finished", results=results)
+        if plan.key not in self._finished:
+            results = finished_runs(plan, self.runs)
+            if results is None or not is_evaluated(plan, results):
+                return False
+            self._finished[plan.key] = results
         return True
 
 
@@ -206,7 +225,6 @@ class SamplerSource:
 
     Attributes:
         fixed: overrides that all trials share.
-        parameters: the space.
         settings: `trials`, `replicates`, `pruner` and `objectives` count here.
         on_reject: called with (label, reason) for a point whose configuration is wrong.
     """

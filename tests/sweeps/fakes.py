@@ -365,7 +365,7 @@ def search_desk(
 ) -> Desk:
     """A driver of a search over x in 0..1, or over `space`."""
     wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
-    sampler = build_sampler("random", 0, {}, len(wanted.objectives))
+    sampler = build_sampler({"kind": "random"}, len(wanted.objectives))
     storage = memory() if storage is None else storage
     store = store_on(storage, owner, wanted, sampler=sampler, pruner=pruner)
     runs = RunStore(runs_dir, NoTracking())

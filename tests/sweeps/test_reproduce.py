@@ -15,7 +15,8 @@ from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
-from sweeps.worker.point_list import Outcome, PointList
+from sweeps.worker.point_list import PointList
+from sweeps.worker.trial_sources import Outcome
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
 
@@ -33,6 +34,7 @@ rows:
 """
 
 Asked = list[tuple[PointList, SweepSettings]]
+Driven = Callable[..., Asked]
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
+def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     """Put a driver in place that tells `states` in turn instead of running anything."""
 
     def drive(*states: str) -> Asked:
@@ -69,7 +71,7 @@ def _outcome(point: Point, state: str, index: int) -> Outcome:
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]
 
 
-def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) -> None:
+def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     asked = driven("finished")
     words = ("table=my/small", "seeds=2", "workers=2", "tracking=none", "dataset.root=/x")
     code, out, err = call(entry, *words)
@@ -95,9 +97,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) ->
     assert rows[2]["reason"] == "flow"
 
 
-def test_reproduce_table_file_is_named_by_paper(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_reproduce_table_file_is_named_by_paper(call: Call, place: Path, driven: Driven) -> None:
     asked = driven("finished")
     path = place / "elsewhere" / "mine.yaml"
     path.parent.mkdir()
@@ -107,9 +107,7 @@ def test_reproduce_table_file_is_named_by_paper(
     assert (place / "runs/tables/my/mine_demo/table.md").exists()
 
 
-def test_reproduce_failed_cell_prints_table(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_reproduce_failed_cell_prints_table(call: Call, place: Path, driven: Driven) -> None:
     driven("finished", "failed")
     code, out, err = call(entry, "table=my/small", "tracking=none", "out=here")
     assert code == 1
@@ -118,9 +116,7 @@ def test_reproduce_failed_cell_prints_table(
     assert "failed" in (place / "here" / "table.md").read_text()
 
 
-def test_cells_of_other_drivers_are_no_failure(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_cells_of_other_drivers_are_no_failure(call: Call, place: Path, driven: Driven) -> None:
     driven("finished", "running")
     code, out, err = call(entry, "table=my/small", "tracking=none")
     assert code == 0
@@ -129,7 +125,7 @@ def test_cells_of_other_drivers_are_no_failure(
 
 
 def test_reproduce_full_disk_prints_table_without_files(
-    call: Call, place: Path, driven: Callable[..., Asked], monkeypatch: pytest.MonkeyPatch
+    call: Call, place: Path, driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
@@ -144,7 +140,7 @@ def test_reproduce_full_disk_prints_table_without_files(
 
 @pytest.mark.slow
 def test_a_table_of_sizes_runs_nothing_and_has_values(
-    call: Call, place: Path, driven: Callable[..., Asked]
+    call: Call, place: Path, driven: Driven
 ) -> None:
     """HeatNet 54,361,105 and the thesis' two heads 44,564,656 parameters at 14 classes."""
     asked = driven("finished")
@@ -164,7 +160,7 @@ def test_a_table_of_sizes_runs_nothing_and_has_values(
 
 
 def test_dry_run_lists_the_cells_and_writes_nothing(
-    call: Call, place: Path, driven: Callable[..., Asked]
+    call: Call, place: Path, driven: Driven
 ) -> None:
     driven("waiting", "failed")
     code, out, err = call(entry, "table=my/small", "seeds=1", "dry_run=true", "tracking=none")
@@ -179,9 +175,7 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
     assert not (place / "runs").exists()
 
 
-def test_all_tables_are_listed_and_only_listed(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: Driven) -> None:
     driven("waiting")
     code, out, _ = call(entry, "table=all", "dry_run=true", "tracking=none")
     assert code == 0
@@ -216,7 +210,7 @@ def test_all_tables_are_listed_and_only_listed(
     ],
 )
 def test_mistakes_cost_one_sentence(
-    call: Call, place: Path, driven: Callable[..., Asked], words: tuple[str, ...], sentence: str
+    call: Call, place: Path, driven: Driven, words: tuple[str, ...], sentence: str
 ) -> None:
     asked = driven("finished")
     code, _, err = call(entry, *words)

@@ -56,9 +56,7 @@ def test_values_are_taken_as_their_types(composed: DictConfig) -> None:
     assert settings.points == (("a=1", "b=[2,3]"), ("a=4",))
 
 
-def test_read_settings_keeps_interpolations(
-    composed: DictConfig,
-) -> None:
+def test_read_settings_keeps_interpolations(composed: DictConfig) -> None:
     space = {"masker.patch_size": {"type": "categorical", "choices": ["${px:8}", "${px:64}"]}}
     settings = read_settings(
         changed(composed, space=space, params={"a": "${px:8},2"}, points=[["a=${px:8}"]])

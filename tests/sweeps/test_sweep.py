@@ -17,7 +17,8 @@ from sweeps.point import Point
 from sweeps.search import Search
 from sweeps.settings import SweepSettings
 from sweeps.sweep import study_command, sweep
-from sweeps.worker.point_list import Outcome, PointList
+from sweeps.worker.point_list import PointList
+from sweeps.worker.trial_sources import Outcome
 
 
 class Asked:

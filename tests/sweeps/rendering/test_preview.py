@@ -8,7 +8,7 @@ from typing import Any
 from sweeps.rendering.preview import cells_grid, summary
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 FRAMES = (

@@ -48,7 +48,7 @@ def study_on(storage: Any, kind: str, objectives: int = 1) -> optuna.Study:
         study_name="s",
         load_if_exists=True,
         directions=["minimize"] * objectives,
-        sampler=build_sampler(kind, 7, EARLY.get(kind, {}), objectives),
+        sampler=build_sampler({"kind": kind, "seed": 7, **EARLY.get(kind, {})}, objectives),
     )
 
 
@@ -129,7 +129,7 @@ def test_seeds_differ_and_stay_what_they_are() -> None:
         (build_sampler, "tpee", {}, "'tpe'"),
         (build_sampler, "qmc", {}, "not a choice"),
         (build_sampler, "tpe", {"n_startup": 3}, "'n_startup_trials'"),
-        (build_sampler, "tpe", {"seed": 3}, "sampler.seed"),
+        (build_sampler, "tpe", {"seed": "x"}, "sampler.seed"),
         (build_sampler, "tpe", {"gamma": 3}, "sampler.gamma"),
         (build_sampler, "tpe", {"n_startup_trials": "ten"}, "expected int"),
         (build_sampler, "tpe", {"multivariate": 1}, "expected bool | null"),
@@ -148,25 +148,24 @@ def test_seeds_differ_and_stay_what_they_are() -> None:
 def test_sampler_and_pruner_mistakes_are_refused(
     build: Any, kind: str, options: dict[str, Any], word: str
 ) -> None:
-    arguments = (0, options) if build is build_sampler else (options,)
     with pytest.raises(InputError) as error:
-        build(kind, *arguments)
+        build({"kind": kind, **options})
     assert word in str(error.value)
 
 
 def test_cmaes_is_an_extra_for_one_objective(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install cmaes"):
-        build_sampler("cmaes", 0, {})
+        build_sampler({"kind": "cmaes"})
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     with pytest.raises(InputError, match="follows one objective, and this search has 2"):
-        build_sampler("cmaes", 0, {}, objectives=2)
+        build_sampler({"kind": "cmaes"}, objectives=2)
 
 
 def test_options_reach_optuna() -> None:
-    sampler = build_sampler("nsga2", 0, {"population_size": 6})
+    sampler = build_sampler({"kind": "nsga2", "population_size": 6})
     assert sampler.make(0).population_size == 6  # type: ignore[attr-defined]
-    pruner = build_pruner("median", {"n_startup_trials": 9})
+    pruner = build_pruner({"kind": "median", "n_startup_trials": 9})
     assert pruner._n_startup_trials == 9  # type: ignore[attr-defined]
     assert set(SAMPLERS) == {"tpe", "random", "gp", "nsga2", "cmaes"}
 
@@ -192,7 +191,7 @@ def curve(quality: int, at: int, kind: str) -> float:
 def test_pruners_stop_bad_trials_at_validation_steps(kind: str) -> None:
     """Reports every 120 steps: the good trials end, of the bad ones some do not."""
     study = optuna.create_study(
-        direction="maximize", study_name="p", pruner=build_pruner(kind, OPTIONS[kind])
+        direction="maximize", study_name="p", pruner=build_pruner({"kind": kind, **OPTIONS[kind]})
     )
     states: dict[int, list[TrialState]] = {}
     for number in range(24):
@@ -210,8 +209,8 @@ def test_pruners_stop_bad_trials_at_validation_steps(kind: str) -> None:
 
 def test_pruners_need_one_objective() -> None:
     with pytest.raises(InputError, match="this search has 2 objectives"):
-        build_pruner("median", {}, objectives=2)
-    assert isinstance(build_pruner("none", {}, objectives=2), optuna.pruners.NopPruner)
+        build_pruner({"kind": "median"}, objectives=2)
+    assert isinstance(build_pruner(None, objectives=2), optuna.pruners.NopPruner)
 
 
 def test_the_modules_are_light() -> None:

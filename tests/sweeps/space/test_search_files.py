@@ -43,11 +43,8 @@ def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None
     settings = read_settings(sweeper)
     assert settings.trials
     assert settings.space
-    sampler = dict(settings.sampler)
-    objectives = len(settings.objectives)
-    build_sampler(sampler.pop("kind"), sampler.pop("seed"), sampler, objectives)
-    pruner = {"kind": "none"} if settings.pruner is None else dict(settings.pruner)
-    build_pruner(pruner.pop("kind"), pruner, objectives)
+    build_sampler(settings.sampler, len(settings.objectives))
+    build_pruner(settings.pruner, len(settings.objectives))
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -7,7 +7,7 @@ from sweeps.evaluation import ExtraEvaluation
 from sweeps.reproduce import Options, request_of
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 COLUMNS = (

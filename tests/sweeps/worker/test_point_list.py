@@ -16,14 +16,9 @@ from rgbt.tracking.run_result import RunResult
 from sweeps.point import COLOUR, Point, colour
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.point_list import (
-    Outcome,
-    PointList,
-    estimated_seconds,
-    other_code_line,
-    preview_points,
-)
+from sweeps.worker.point_list import PointList, estimated_seconds, other_code_line, preview_points
 from sweeps.worker.run_store import RunStore
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.fakes import finish, plan_of, settings
 
 
@@ -33,9 +28,7 @@ def made(folder: Path, seconds: float) -> Outcome:
     return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
 
 
-def test_estimated_seconds_is_median_over_workers(
-    tmp_path: Path,
-) -> None:
+def test_estimated_seconds_is_median_over_workers(tmp_path: Path) -> None:
     known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
     left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
     assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]

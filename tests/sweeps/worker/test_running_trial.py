@@ -19,7 +19,6 @@ from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import (
     LOGS,
-    ExecutionContext,
     PruningCallback,
     RunningTrial,
     TrialError,
@@ -71,8 +70,7 @@ class Bench:
     ) -> None:
         self.executor = FakeExecutor(runs_dir, behaviour)
         self.runs = RunStore(runs_dir, NoTracking())
-        context = ExecutionContext(self.runs, self._start, timeout_s)
-        self.work = RunningTrial(plan, 0, context, report)
+        self.work = RunningTrial(plan, 0, self.runs, self._start, timeout_s, report)
 
     def _start(self, command: Any, log: Path) -> Any:
         return self.executor.start(command, {}, log)

@@ -62,9 +62,7 @@ def test_open_storage_error_hides_password(tmp_path: Path, monkeypatch: pytest.M
     assert "secret" not in str(error.value)
 
 
-def test_open_storage_retries_while_tables_are_created(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_open_storage_retries_while_tables_are_created(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stores, "PAUSE_S", 0.0)
     tries: list[int] = []
 

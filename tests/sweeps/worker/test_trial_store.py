@@ -42,7 +42,7 @@ def states(store: TrialStore) -> list[str]:
 
 def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
     """The store of a search; every driver has a study object and a sampler of its own."""
-    return store_on(storage, owner, sampler=build_sampler("random", 0, {}, 1))
+    return store_on(storage, owner, sampler=build_sampler({"kind": "random"}))
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
@@ -134,16 +134,6 @@ def test_ask_by_three_drivers_respects_total(tmp_path: Path, kind: str, total: i
     assert len(set(drawn)) == len(drawn) == total
 
 
-def test_running_trials_of_other_drivers_count_in_total() -> None:
-    storage = memory()
-    mine, theirs = searching(storage), searching(storage, DEAD)
-    taken(theirs)
-    taken(mine)
-    assert mine.ask(2) is None
-    assert len(mine.study.trials) == 2, "none was made to be dropped"
-    assert mine.ask(3) is not None
-
-
 def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) -> None:
     storage = memory()
     mine, theirs = searching(storage), searching(storage, DEAD)
@@ -211,13 +201,6 @@ def test_stale_trials_exclude_fresh_unowned_trial(monkeypatch: pytest.MonkeyPatc
     later = time.time() + 2 * STALE_S
     monkeypatch.setattr(time, "time", lambda: later)
     assert stale_trials(store) == [0]
-
-
-def test_release_allows_new_claim(store: TrialStore) -> None:
-    claim(store)
-    store.release(0, "its driver was gone", requeue=False)
-    assert store.trials() == []
-    assert claim(store) == 1
 
 
 def test_release_requeues_search_trial_with_parameters() -> None:
