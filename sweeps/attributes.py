@@ -13,7 +13,7 @@ OVERRIDES = "rgbt.overrides"
 
 LABEL = "rgbt.label"
 OWNER = "rgbt.owner"
-"""Driver of the trial: host, process, start of the process, see `sweeps.worker.owner`."""
+"""Driver of the trial: host, process, start of the process, see `worker.trial_store.Owner`."""
 
 HEARTBEAT = "rgbt.beat"
 """Time of the owner's last heartbeat, seconds since 1970."""

@@ -41,9 +41,8 @@ class ExtraEvaluation:
         """
         if self.frames is not None:
             return f"consistency, {self.frames}"
-        head = "" if self.head == "as trained" else f", {self.head} head"
-        corrupted = f", {self._corrupted}" if self.corruption else ""
-        return f"{self.modality}, {self.regions}{head}{corrupted}"
+        head = [] if self.head == "as trained" else [f"{self.head} head"]
+        return ", ".join([self.modality, self.regions, *head, *self._corrupted])
 
     @property
     def command(self) -> tuple[str, ...]:
@@ -53,24 +52,24 @@ class ExtraEvaluation:
         """
         if self.frames is not None:
             return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
-        head = () if self.head == "as trained" else (f"head={self.head}",)
-        corruption = () if self.corruption is None else (f"corruption={self.corruption}",)
-        severity = () if self.severity is None else (f"severity={self.severity:g}",)
-        arguments = (f"modality={self.modality}", f"regions={self.regions}")
-        return ("rgbt.evaluate", *arguments, *head, *corruption, *severity)
+        words = [f"modality={self.modality}", f"regions={self.regions}"]
+        words += [] if self.head == "as trained" else [f"head={self.head}"]
+        words += [] if self.corruption is None else [f"corruption={self.corruption}"]
+        words += [] if self.severity is None else [f"severity={self.severity:g}"]
+        return ("rgbt.evaluate", *words)
 
     @property
     def path(self) -> str:
         """Path of its counts inside the run folder, and among the run's files in MLflow."""
         if self.frames is not None:
             return file_name(self.frames, "test")
-        head = "" if self.head == "as trained" else f"_{self.head}-head"
-        corrupted = f"_{self._corrupted}" if self.corruption else ""
+        head = [] if self.head == "as trained" else [f"{self.head}-head"]
         regions = self.regions.replace(" ", "-")
-        return f"evaluations/table_{self.modality}_{regions}{head}{corrupted}.npz"
+        name = "_".join(["table", self.modality, regions, *head, *self._corrupted])
+        return f"evaluations/{name}.npz"
 
     @property
-    def _corrupted(self) -> str:
-        """The corruption with its severity, as part of a name."""
+    def _corrupted(self) -> list[str]:
+        """The corruption with its severity, as part of a name; [] without one."""
         severity = "" if self.severity is None else f"-{self.severity:g}"
-        return f"{row_name(self.corruption or '')}{severity}"
+        return [f"{row_name(self.corruption)}{severity}"] if self.corruption else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,19 +12,17 @@ from rgbt.checks import InputError, RunError
 from rgbt.tracking.provenance import command_line
 from rgbt.tracking.terminal import info
 from sweeps import attributes as names
-from sweeps.run_specs import PlannedRun, plan_run, specify_run
 from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_links, study_folder
 from sweeps.worker.driver import drive
-from sweeps.worker.owner import Owner
-from sweeps.worker.planner import Planner
+from sweeps.worker.planner import PlannedRun, Planner, specify_run
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.sampler_source import SamplerSource
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_store import TrialStore, counted_trials
+from sweeps.worker.trial_sources import SamplerSource
+from sweeps.worker.trial_store import Owner, TrialStore, counted_trials
 
 
 @dataclass(frozen=True)
@@ -34,8 +32,6 @@ class Search:
     Attributes:
         study: name of the study.
         fixed: overrides that all trials share.
-        parameters: the space.
-        runs: finished runs.
         identity: overrides of `fixed` that must not change in a study: all but paths.
     """
 
@@ -62,7 +58,14 @@ def search(request: Search, settings: SweepSettings) -> None:
             "retry=failed is for grids and tables; a search continues with other points: give it "
             "more trials, or retries=1 to retry each failed point at once."
         )
-    sampler, pruner = _sampler_and_pruner(settings)
+    sampler = build_sampler(settings.sampler, len(settings.objectives))
+    first = settings.objectives[0]
+    if settings.pruner is not None and not first.is_reported:
+        raise InputError(
+            f"pruner: trials are compared while they train, but {first.metric} is known at the end "
+            "alone; choose val/mIoU or hydra.sweeper.pruner=null."
+        )
+    pruner = build_pruner(settings.pruner, len(settings.objectives))
     if settings.dry_run:
         _preview(request, settings)
         return
@@ -84,7 +87,12 @@ def search(request: Search, settings: SweepSettings) -> None:
     store = TrialStore(study, storage, Owner.this_process())
     info(f"study {request.study}: run the same command on other machines to share it.")
     _drive(request, settings, store)
-    _check_result(store, request.study)
+    trials = store.trials()
+    states = Counter(trial.state.name for trial in trials)
+    for trial in [trial for trial in trials if trial.state.name == "FAIL"][:5]:
+        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
+    if trials and not states["COMPLETE"] and not states["RUNNING"]:
+        raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
     runs_dir = request.runs.runs_dir
     links = report(study, study_folder(runs_dir, request.study), request.runs.tracking)
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
@@ -93,12 +101,11 @@ def search(request: Search, settings: SweepSettings) -> None:
 def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
     """The run at the lowest point of the space; the highest one is checked too.
 
-    Raises:
-        InputError: an end of a range that a setting does not accept, a point that cannot be
-            composed, a missing data set, or an objective that the runs do not measure.
+    Both refuse what the runs would: an end of a range that a setting does not accept, a missing
+    data set, or an objective that the runs do not measure.
     """
     specify_run((*request.fixed, *_end_of(request.parameters, "high")))
-    lowest = plan_run((*request.fixed, *_end_of(request.parameters, "low")), {})
+    lowest = Planner().plan_run((*request.fixed, *_end_of(request.parameters, "low")))
     for objective in settings.objectives:
         split = objective.metric.partition("/")[0]
         if objective.is_consistency and split not in lowest.consistency_splits:
@@ -131,31 +138,6 @@ def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
     drive(view, source, store, request.runs, settings)
 
 
-def _sampler_and_pruner(settings: SweepSettings) -> tuple[Any, Any]:
-    count = len(settings.objectives)
-    kind, seed, options = _chosen(settings.sampler, "sampler")
-    sampler = build_sampler(kind, seed, options, count)
-    if settings.pruner is None:
-        return sampler, build_pruner("none", {}, count)
-    kind, _, options = _chosen(settings.pruner, "pruner")
-    if not settings.objectives[0].is_reported:
-        raise InputError(
-            f"pruner: trials are compared while they train, but {settings.objectives[0].metric} is "
-            "known at the end alone; choose val/mIoU or hydra.sweeper.pruner=null."
-        )
-    return sampler, build_pruner(kind, options, count)
-
-
-def _chosen(node: Mapping[str, Any], what: str) -> tuple[str, int, dict[str, Any]]:
-    options = {key: value for key, value in node.items() if key not in ("kind", "seed")}
-    if "kind" not in node:
-        raise InputError(f"hydra.sweeper.{what}: 'kind' has no value, such as {{kind: tpe}}.")
-    seed = node.get("seed", 0)
-    if not isinstance(seed, int):
-        raise InputError(f"hydra.sweeper.{what}.seed: expected a whole number, got {seed}.")
-    return str(node["kind"]), seed, options
-
-
 def _preview(request: Search, settings: SweepSettings) -> None:
     """Say what would be searched, and what there is; write nothing."""
     study = find_study(request.study, settings.storage, request.runs.runs_dir)
@@ -170,13 +152,3 @@ def _preview(request: Search, settings: SweepSettings) -> None:
     if settings.trials is not None:
         left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
-
-
-def _check_result(store: TrialStore, name: str) -> None:
-    trials = store.trials()
-    states = Counter(trial.state.name for trial in trials)
-    failed = [trial for trial in trials if trial.state.name == "FAIL"]
-    for trial in failed[:5]:
-        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
-    if trials and not states["COMPLETE"] and not states["RUNNING"]:
-        raise RunError(f"no trial of {name} has finished; see the reasons above.")

@@ -74,12 +74,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
-    """Print the tables of a study, write its files and send them to the tracker.
-
-    Args:
-        study: finished or still running.
-        out: folder for ``study.md``, ``trials.csv`` and the PNGs, made where it is missing.
-        tracking: where a run of kind "study" is recorded.
+    """Print the tables of a study, write its files into `out` and send them to the tracker.
 
     Returns:
         links to everything, as (name, address).

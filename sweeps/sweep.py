@@ -21,15 +21,18 @@ from rgbt.tracking.terminal import info, print_rich, rich_table
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
-from sweeps.run_specs import open_run_store
 from sweeps.search import Search, search
 from sweeps.settings import SweepSettings, read_settings
-from sweeps.space.grid import GridPoint, SweptValues, distributions, grid_points, list_points, split
-from sweeps.space.merge import merge_space
+from sweeps.space.grid import (
+    GridPoint,
+    distributions,
+    grid_points,
+    list_points,
+    merge_space,
+    split,
+)
 from sweeps.space.space import as_overrides
 from sweeps.worker.point_list import (
-    UNFINISHED,
-    Outcome,
     PointList,
     estimated_seconds,
     other_code_line,
@@ -37,7 +40,8 @@ from sweeps.worker.point_list import (
     run_points,
 )
 from sweeps.worker.progress import duration
-from sweeps.worker.run_store import RunStore
+from sweeps.worker.run_store import open_run_store
+from sweeps.worker.trial_sources import UNFINISHED, Outcome
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""
@@ -58,9 +62,15 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     settings = read_settings(config.hydra.sweeper)
     # `fresh` is for the sweep, which decides for each point: no setting of its runs.
     arguments = [word for word in arguments if word.partition("=")[0] != "fresh"]
-    typed = [*_params(settings), *arguments]
-    fixed, swept, intervals = split(typed, loader)
-    base = tuple(_forwarded(config))
+    # Text of `params` stands as it would be typed, other values as Hydra reads them.
+    texts = {key: value for key, value in settings.params.items() if isinstance(value, str)}
+    others = {key: value for key, value in settings.params.items() if key not in texts}
+    typed = [f"{key}={value}" for key, value in texts.items()] + [*as_overrides(others)]
+    fixed, swept, intervals = split([*typed, *arguments], loader)
+    # Overrides of Hydra itself that a run needs too; without a sweep of its own.
+    given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
+    is_search = "search" in config.hydra.runtime.choices
+    base = (*given, *(["hydra.mode=RUN"] if is_search else []))
     runs = open_run_store(config)
     if settings.space or intervals:
         parameters = merge_space(settings.space, fixed, swept, intervals)
@@ -73,21 +83,29 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
         return
     _refuse_search_settings(settings)
-    points = _points(settings, fixed, swept)
-    if len(points) == 1:
+    grid = grid_points(fixed, swept)
+    if settings.points:
+        grid = [
+            GridPoint({**each.params, **own.params}, own.overrides)
+            for each in grid
+            for own in list_points(settings.points, each.overrides)
+        ]
+    if len(grid) == 1:
         info("no list of values was given (such as seed=0,1,2): this is one point.")
-    name = settings.study or _name(
-        config.name, list(points[0].params), [p.overrides for p in points]
+    name = settings.study or _name(config.name, list(grid[0].params), [p.overrides for p in grid])
+    tags = {f"rgbt.study/{name}": "grid"}
+    points = tuple(
+        Point(_label(point) or name, point.overrides, params=point.params, tags=tags)
+        for point in grid
     )
     kind = "list" if settings.points else "grid"
-    _grid(_point_list(name, kind, points, runs, base), settings)
+    _grid(PointList(name, name, kind, points, runs, base, distributions(grid)), settings)
 
 
-def _params(settings: SweepSettings) -> list[str]:
-    """`params` as overrides: text as it would be typed, other values as Hydra reads them."""
-    typed = {key: value for key, value in settings.params.items() if isinstance(value, str)}
-    others = {key: value for key, value in settings.params.items() if key not in typed}
-    return [*(f"{key}={value}" for key, value in typed.items()), *as_overrides(others)]
+def _label(point: GridPoint) -> str:
+    """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
+    names = short_names([key.lstrip("+") for key in point.params])
+    return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
 def _refuse_search_settings(settings: SweepSettings) -> None:
@@ -102,38 +120,6 @@ def _refuse_search_settings(settings: SweepSettings) -> None:
             f"hydra.sweeper.{key} is for searches, and nothing is searched here; give a range "
             "(optimizer.lr=interval(0.001,0.01) or +search=...), or omit it."
         )
-
-
-def _points(settings: SweepSettings, fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
-    grid = grid_points(fixed, swept)
-    if not settings.points:
-        return grid
-    return [
-        GridPoint({**each.params, **own.params}, own.overrides)
-        for each in grid
-        for own in list_points(settings.points, each.overrides)
-    ]
-
-
-def _point_list(
-    name: str, kind: str, points: Sequence[GridPoint], runs: RunStore, base: tuple[str, ...]
-) -> PointList:
-    every = tuple(
-        Point(
-            label=_label(point) or name,
-            overrides=point.overrides,
-            params=point.params,
-            tags={f"rgbt.study/{name}": "grid"},
-        )
-        for point in points
-    )
-    return PointList(name, name, kind, every, runs, base, distributions(points))
-
-
-def _label(point: GridPoint) -> str:
-    """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
-    names = short_names([key.lstrip("+") for key in point.params])
-    return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
 
 
 def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
@@ -210,10 +196,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain for plain in map(_plain, value) if plain is not None]
     return value
-
-
-def _forwarded(config: DictConfig) -> list[str]:
-    """Overrides of Hydra itself that a run needs too; without a sweep of its own."""
-    given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
-    is_search = "search" in config.hydra.runtime.choices
-    return [*given, *(["hydra.mode=RUN"] if is_search else [])]

@@ -8,18 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rgbt.metrics import names
-from sweeps.rendering.panel import OURS, PUBLISHED, Series, draw_pair, title_and_legend
-from sweeps.table.parameter_counts import SCALE
+from sweeps.table.request import SCALE
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+OURS, PUBLISHED = "#0072B2", "#D55E00"
+"""Blue and vermilion of Okabe and Ito, which colour-blind eyes tell apart."""
+
+FAR_APART = 2.0
+"""Two sets of values get an axis each where the gap between them is this many times their range."""
 
 MAX_PANELS = 4
 """Columns of a table without headlines up to which each has a panel."""
@@ -34,16 +41,21 @@ SHIFT = 0.13
 """How far published markers stand beside ours, in rows or columns."""
 
 
+@dataclass(frozen=True)
+class Series:
+    """Values along an axis and half lengths of their error bars; NaN: there is none."""
+
+    positions: Sequence[float]
+    means: Sequence[float]
+    sds: Sequence[float]
+
+    def known(self) -> list[float]:
+        """The values that there are."""
+        return [mean for mean in self.means if not math.isnan(mean)]
+
+
 def draw_table(scored: ScoredTable, path: Path) -> bool:
-    """Draw the figure as PNG.
-
-    Args:
-        scored: the table.
-        path: the file.
-
-    Returns:
-        whether there was anything to draw.
-    """
+    """Draw the figure as PNG; whether there was anything to draw."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure = figure_of(scored)
@@ -57,15 +69,12 @@ def draw_table(scored: ScoredTable, path: Path) -> bool:
 def main_columns(scored: ScoredTable) -> list[Column]:
     """What the figure shows: the headlines that the table has, else all of a few columns."""
     columns = [column for column in scored.table.columns if _has_values(scored, column)]
-    chosen = [column for column in columns if _is_headline(column)]
+    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
+    headlines = {part + score for part in parts for score in HEADLINES}
+    chosen = [column for column in columns if column.metric in headlines]
     if chosen:
         return chosen[:MAX_HEADLINES]
     return columns if len(columns) <= MAX_PANELS else []
-
-
-def _is_headline(column: Column) -> bool:
-    *part, score = (column.metric or "").split("/")
-    return score in HEADLINES and part in ([], [names.DAY], [names.NIGHT])
 
 
 def figure_of(scored: ScoredTable) -> Figure | None:
@@ -97,29 +106,24 @@ def _over_factor(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
     panels = figure.subplots(len(columns), 1, sharex=True, squeeze=False)[:, 0]
     for axes, column in zip(panels, columns, strict=True):
         positions = [row.x or 0.0 for row in rows]
-        ours, theirs = _series(scored, [(row, column) for row in rows], positions, positions)
-        lower, upper = draw_pair(axes, ours, theirs, across=False, joined=True)
+        series = _series(scored, [(row, column) for row in rows], positions)
+        lower, upper = _draw_pair(axes, *series, across=False, joined=True)
         axes.set_ylabel(column.name)
-        for row in scored.table.rows:
-            if row.x is None:
-                _level(scored, row, column, (lower, upper))
+        # Rows outside the factor, such as the baseline, are levels.
+        for row in (row for row in scored.table.rows if row.x is None):
+            cell = scored.cells.get((row.label, column.name))
+            if cell is not None and not math.isnan(cell.mean):
+                lower.axhline(cell.mean, color=OURS, ls="--", lw=1, label=f"{row.label}, ours")
+            printed = published(row, column)
+            if printed is not None:
+                label = f"{row.label}, published"
+                upper.axhline(printed, color=PUBLISHED, ls=":", lw=1, label=label)
     last = panels[-1]
     last.set_xscale(factor.axis)
     last.set_xlabel(factor.name)
     last.set_xticks([row.x for row in rows], [f"{row.x:g}" for row in rows])
     last.minorticks_off()
-    title_and_legend(figure, _title(scored))
-    return figure
-
-
-def _level(scored: ScoredTable, row: Row, column: Column, sides: tuple[Axes, Axes]) -> None:
-    """A row outside the factor, such as the baseline, as a level."""
-    cell = scored.cells.get((row.label, column.name))
-    printed = published(row, column)
-    if cell is not None and not math.isnan(cell.mean):
-        sides[0].axhline(cell.mean, color=OURS, ls="--", lw=1, label=f"{row.label}, ours")
-    if printed is not None:
-        sides[1].axhline(printed, color=PUBLISHED, ls=":", lw=1, label=f"{row.label}, published")
+    return _finished(figure, scored)
 
 
 def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
@@ -130,16 +134,13 @@ def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
     figure = Figure(figsize=(max(size[0], 6.4), size[1]), layout="constrained")
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
-        positions = [float(index) for index in range(len(rows))]
-        beside = [position + SHIFT for position in positions]
-        ours, theirs = _series(scored, [(row, column) for row in rows], positions, beside)
-        draw_pair(axes, ours, theirs, across=True, joined=False)
+        series = _series(scored, [(row, column) for row in rows], range(len(rows)), SHIFT)
+        _draw_pair(axes, *series, across=True, joined=False)
         axes.set_xlabel(column.name)
         axes.grid(axis="y", alpha=0.25)
     panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
     panels[0].set_ylim(len(rows) - 0.5, -0.5)
-    title_and_legend(figure, _title(scored))
-    return figure
+    return _finished(figure, scored)
 
 
 def _profiles(scored: ScoredTable) -> Figure:
@@ -152,39 +153,89 @@ def _profiles(scored: ScoredTable) -> Figure:
     width = max(2.6, 0.28 * len(columns))
     figure = Figure(figsize=(0.6 + width * abreast, 1 + 2.1 * height), layout="constrained")
     panels = figure.subplots(height, abreast, sharex=True, squeeze=False).ravel()
+    rotation = 0 if max(len(column.name) for column in columns) <= 2 else 90
     for axes, row in zip(panels, rows, strict=False):
-        positions = [float(index) for index in range(len(columns))]
-        pairs = [(row, column) for column in columns]
-        draw_pair(axes, *_series(scored, pairs, positions, positions), across=False, joined=True)
+        positions = range(len(columns))
+        series = _series(scored, [(row, column) for column in columns], positions)
+        _draw_pair(axes, *series, across=False, joined=True)
         axes.set_title(row.label, fontsize=9)
-        rotation = 0 if max(len(column.name) for column in columns) <= 2 else 90
         axes.set_xticks(positions, [column.name for column in columns], rotation=rotation)
         axes.tick_params(labelsize=7)
     for axes in panels[len(rows) :]:
         axes.set_visible(False)
-    title_and_legend(figure, _title(scored))
-    return figure
+    return _finished(figure, scored)
 
 
 def _series(
     scored: ScoredTable,
     pairs: Sequence[tuple[Row, Column]],
-    ours_at: Sequence[float],
-    theirs_at: Sequence[float],
+    positions: Sequence[float],
+    shift: float = 0.0,
 ) -> tuple[Series, Series]:
+    """Ours, and the published values `shift` beside them."""
     cells = [scored.cells.get((row.label, column.name)) for row, column in pairs]
-    means = tuple(math.nan if cell is None else cell.mean for cell in cells)
-    sds = tuple(math.nan if cell is None else cell.sd for cell in cells)
+    means = [math.nan if cell is None else cell.mean for cell in cells]
+    sds = [math.nan if cell is None else cell.sd for cell in cells]
     printed = (published(row, column) for row, column in pairs)
-    theirs = tuple(math.nan if value is None else value for value in printed)
-    nothing = (math.nan,) * len(theirs)
-    return Series(tuple(ours_at), means, sds), Series(tuple(theirs_at), theirs, nothing)
+    theirs = [math.nan if value is None else value for value in printed]
+    beside = [position + shift for position in positions]
+    return Series(positions, means, sds), Series(beside, theirs, [math.nan] * len(theirs))
 
 
-def _title(scored: ScoredTable) -> str:
-    if not scored.seeds:
-        counted = f"ours: counted at scale={SCALE}" if scored.cells else "published"
-        return f"{scored.name} ({counted})"
-    seeds = len(scored.seeds)
-    spread = f", mean ± sd of {seeds} seeds" if seeds > 1 else f", seed {scored.seeds[0]}"
-    return f"{scored.name} (ours: scale={scored.scale}{spread})"
+def are_far_apart(ours: Sequence[float], theirs: Sequence[float]) -> bool:
+    """Whether one axis for both would press each into a line."""
+    if not ours or not theirs:
+        return False
+    gap = max(min(ours) - max(theirs), min(theirs) - max(ours))
+    widest = max(max(ours) - min(ours), max(theirs) - min(theirs))
+    return gap > FAR_APART * widest and gap > 0
+
+
+def _draw_pair(
+    axes: Axes, ours: Series, theirs: Series, *, across: bool, joined: bool
+) -> tuple[Axes, Axes]:
+    """Both series in one panel; the axes of ours and of the published values.
+
+    With `across`, values run to the right and places down, instead of values up.
+    """
+    other = axes
+    if are_far_apart(ours.known(), theirs.known()):
+        other = axes.twiny() if across else axes.twinx()
+        side, second = ("x", "top") if across else ("y", "right")
+        axes.tick_params(axis=side, colors=OURS)  # type: ignore[arg-type]
+        other.tick_params(axis=side, colors=PUBLISHED)  # type: ignore[arg-type]
+        other.spines[second].set_color(PUBLISHED)
+        other.set(**{f"{side}label": "published"})
+        getattr(other, f"{side}axis").label.set_color(PUBLISHED)
+    line = "-" if joined else "none"
+    style: dict[str, Any] = {"fmt": "o", "ms": 5, "lw": 1, "capsize": 3}
+    named = [(axes, ours, OURS, "ours", OURS), (other, theirs, PUBLISHED, "published", "none")]
+    for target, series, colour, label, face in named:
+        if not series.known():
+            continue
+        values, positions = series.means, series.positions
+        bars = None if all(map(math.isnan, series.sds)) else series.sds
+        x, y = (values, positions) if across else (positions, values)
+        xerr, yerr = (bars, None) if across else (None, bars)
+        marker = style | {"ls": line, "color": colour, "mfc": face, "label": label}
+        target.errorbar(x, y, yerr, xerr, **marker)
+    axes.grid(axis="x" if across else "y", alpha=0.25)
+    return axes, other
+
+
+def _finished(figure: Figure, scored: ScoredTable) -> Figure:
+    """With a title above all panels, and below them one legend for all."""
+    if scored.seeds:
+        many = len(scored.seeds)
+        spread = f", mean ± sd of {many} seeds" if many > 1 else f", seed {scored.seeds[0]}"
+        ours = f"ours: scale={scored.scale}{spread}"
+    else:
+        ours = f"ours: counted at scale={SCALE}" if scored.cells else "published"
+    figure.suptitle(f"{scored.name} ({ours})", fontsize=10)
+    handles: dict[str, Artist] = {}
+    for axes in figure.axes:
+        artists, labels = axes.get_legend_handles_labels()
+        handles |= dict(zip(labels, artists, strict=True))
+    artists, labels = list(handles.values()), list(handles)
+    figure.legend(artists, labels, loc="outside lower center", ncols=4, fontsize=8)
+    return figure

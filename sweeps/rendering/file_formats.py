@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterable
 
 from rgbt.tracking.csv_files import csv_text
-from sweeps.rendering.rendered_table import RenderedTable
-from sweeps.rendering.text_cell import TextCell
+from sweeps.rendering.rendered_table import RenderedTable, TextCell
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, published
 

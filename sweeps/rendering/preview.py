@@ -7,11 +7,10 @@ from collections import Counter
 from collections.abc import Sequence
 
 from rgbt.tracking.tables import ABSENT, TextTable
-from sweeps.table.parameter_counts import SCALE
-from sweeps.table.request import TableRequest
-from sweeps.worker.list_source import State
-from sweeps.worker.point_list import Outcome, estimated_seconds, other_code_line
+from sweeps.table.request import SCALE, TableRequest
+from sweeps.worker.point_list import estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
+from sweeps.worker.trial_sources import Outcome, State
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"

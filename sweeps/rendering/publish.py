@@ -16,10 +16,10 @@ from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE
-from sweeps.table.parameter_counts import parameter_cells
-from sweeps.table.request import TableRequest
+from sweeps.table.request import TableRequest, parameter_cells
 from sweeps.table.scoring import ScoredTable, score
-from sweeps.worker.point_list import Outcome, other_code_line
+from sweeps.worker.point_list import other_code_line
+from sweeps.worker.trial_sources import Outcome
 
 if TYPE_CHECKING:
     from rgbt.tracking.tracker import Tracking
@@ -28,13 +28,7 @@ if TYPE_CHECKING:
 def publish_table(
     request: TableRequest, outcomes: Sequence[Outcome], out: Path, tracking: Tracking
 ) -> int:
-    """Print the table, write its files, record it in MLflow.
-
-    Args:
-        request: the table.
-        outcomes: of its points.
-        out: folder for table.md, table.csv, table.tex and figure.png.
-        tracking: as the configuration builds it.
+    """Print the table, write its files into `out`, record it in MLflow.
 
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from sweeps.rendering.line_builder import LineBuilder
-from sweeps.rendering.text_cell import Footnotes, TableLine, TextCell
-from sweeps.table.parameter_counts import SCALE
-from sweeps.table.scoring import ScoredTable
-from sweeps.table.table import Column
+from rgbt.tracking.tables import number
+from sweeps.table.cells import NO_VALUE, is_counted, is_of_runs, metric_of
+from sweeps.table.request import SCALE
+from sweeps.table.scoring import ScoredTable, published
+from sweeps.table.table import Column, Row
 
+MAX_ON_ONE_LINE = 3
+"""Most columns with ours, published and difference on one line; more columns use several lines."""
+
+WITH_SD = 12
+"""Most columns with the standard deviation behind its mean; with more it has its own line."""
+
+BESIDE_OURS = ("published", "difference")
+"""Header of the columns that belong to the one before."""
+
+DASH = "-"
+DOUBTFUL = "The printed value does not agree with the others of its row."
 DEMO = (
     "scale=demo: data and network are small; compare the order of the rows with the paper, not the "
     "values."
@@ -22,6 +34,37 @@ ORDER = (
 )
 NOT_PRINTED = "Not in the paper."
 PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without discriminators."
+
+
+@dataclass(frozen=True)
+class TextCell:
+    """One cell.
+
+    Attributes:
+        text: without marks.
+        spread: standard deviation, or "".
+        rank: 1 best of the column, 2 second best, 0 neither.
+        notes: numbers of its footnotes.
+    """
+
+    text: str = ""
+    spread: str = ""
+    rank: int = 0
+    notes: tuple[int, ...] = ()
+
+    @property
+    def whole(self) -> str:
+        """With its spread."""
+        return f"{self.text} ± {self.spread}" if self.spread else self.text
+
+
+@dataclass(frozen=True)
+class TableLine:
+    """One line: "ours", "sd", "published", "difference" or "all" of a row; "order" below all."""
+
+    kind: str
+    label: TextCell
+    fields: tuple[TextCell, ...]
 
 
 @dataclass(frozen=True)
@@ -49,33 +92,18 @@ class RenderedTable:
 
 
 def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTable:
-    """Format a computed table.
-
-    Args:
-        scored: the table.
-        extra: overrides that the user added to every row.
-    """
-    table, notes = scored.table, Footnotes()
-    builder = LineBuilder(scored, notes)
-    title = TextCell(f"{table.paper}, {table.number}: {table.caption}")
-    title_notes = notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
-    columns = [
-        TextCell(column.name, notes=notes(*_column_notes(column))) for column in table.columns
-    ]
+    """Format a computed table; `extra` are overrides that the user added to every row."""
+    table, builder = scored.table, _LineBuilder(scored)
+    title_notes = builder.notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
+    header = builder.header()
     lines = [line for row in table.rows for line in builder.row(row)] + builder.order()
     return RenderedTable(
-        title=TextCell(title.text, notes=title_notes),
-        header=builder.header(columns),
+        title=TextCell(f"{table.paper}, {table.number}: {table.caption}", notes=title_notes),
+        header=header,
         lines=tuple(lines),
-        notes=tuple(notes.sentences),
+        notes=tuple(builder.sentences),
         remarks=tuple(_remarks(scored, extra)),
     )
-
-
-def _column_notes(column: Column) -> list[str]:
-    """Footnotes of a column: not in the paper, not computed."""
-    ours = [] if column.printed else [NOT_PRINTED]
-    return ours + ([f"Not computed: {column.needs}"] if column.needs else [])
 
 
 def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
@@ -102,3 +130,151 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
         commits = ", ".join(f"{commit} ({count})" for commit, count in named)
         remarks.append(f"Runs of ours come from several git commits: {commits}.")
     return remarks
+
+
+@dataclass
+class _LineBuilder:
+    """Makes the lines of a table, of every row ours, published and difference.
+
+    Attributes:
+        sentences: footnotes in the order of their first use.
+    """
+
+    scored: ScoredTable
+    sentences: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        table, cells = self.scored.table, self.scored.cells
+        self.columns = table.columns
+        self.on_one_line = len(self.columns) <= MAX_ON_ONE_LINE
+        spread = any(cell.seeds > 1 for cell in cells.values())
+        self.sd_apart = len(self.columns) > WITH_SD and spread
+        # Published values have as many decimals as the paper prints.
+        printed = [value for row in table.rows for value in row.values.values()]
+        digits = [repr(value).partition(".")[2] for value in printed if value is not None]
+        self.decimals = max((len(each.rstrip("0")) for each in digits), default=2)
+
+    def notes(self, *sentences: str | None) -> tuple[int, ...]:
+        """Numbers of footnotes; the same sentence keeps its number."""
+        given = [sentence for sentence in sentences if sentence]
+        self.sentences += [one for one in dict.fromkeys(given) if one not in self.sentences]
+        return tuple(self.sentences.index(sentence) + 1 for sentence in given)
+
+    def header(self) -> tuple[TextCell, ...]:
+        """Above the fields of a line: the names of the columns."""
+        names = []
+        for column in self.columns:
+            ours = None if column.printed else NOT_PRINTED
+            notes = self.notes(ours, column.needs and f"Not computed: {column.needs}")
+            names.append(TextCell(column.name, notes=notes))
+        if not self.on_one_line:
+            return (TextCell(), TextCell("seeds"), *names)
+        return (TextCell("seeds"), *self._beside(names, [TextCell(word) for word in BESIDE_OURS]))
+
+    def _beside(self, texts: Sequence[TextCell], others: Sequence[TextCell]) -> list[TextCell]:
+        """A text per column, with `others` behind those of printed columns."""
+        pairs = zip(self.columns, texts, strict=True)
+        parts = [(text, *(others if column.printed else ())) for column, text in pairs]
+        return [text for part in parts for text in part]
+
+    def row(self, row: Row) -> list[TableLine]:
+        """The lines of one row: a single one for few columns."""
+        columns = self.columns
+        needs = row.needs and f"Cannot be run yet: {row.needs}"
+        remarks = row.remarks if not row.doubtful else ()
+        label = TextCell(row.label, notes=self.notes(needs, self._same_runs(row), *remarks))
+        if self.on_one_line:
+            texts = []
+            for column in columns:
+                texts.append(self._ours(row, column))
+                if column.printed:
+                    texts += [self._published(row, column), self._difference(row, column)]
+            return [TableLine("all", label, (self._seeds(row), *texts))]
+        runs = any((row.label, column.name) in self.scored.cells for column in columns)
+        printed = any(published(row, column) is not None for column in columns)
+        both = any(not math.isnan(self.scored.difference(row, column)) for column in columns)
+        kinds = (
+            ("ours", self._ours, runs),
+            ("sd", self._sd, runs and self.sd_apart),
+            ("published", self._published, printed or not runs),
+            ("difference", self._difference, both),
+        )
+        lines: list[TableLine] = []
+        for kind, text, is_shown in kinds:
+            if is_shown:
+                word = TextCell("± sd" if kind == "sd" else kind)
+                seeds = self._seeds(row) if kind == "ours" else TextCell()
+                fields = (word, seeds, *(text(row, column) for column in columns))
+                lines.append(TableLine(kind, TextCell() if lines else label, fields))
+        return lines
+
+    def order(self) -> list[TableLine]:
+        """The lines that compare the order of the rows with the paper's."""
+        orders = [self.scored.orders[column.name] for column in self.columns]
+        if not any(order.rows for order in orders):
+            return []
+        rhos = [TextCell(_signed(order.rho)) for order in orders]
+        rows = [TextCell(str(order.rows)) for order in orders]
+        if not self.on_one_line:
+            rho, n = (TextCell("rho"), TextCell(), *rhos), (TextCell("n"), TextCell(), *rows)
+            labels = TextCell("order of rows"), TextCell()
+        else:
+            nothing = [TextCell()] * len(BESIDE_OURS)
+            rho = (TextCell(), *self._beside(rhos, nothing))
+            n = (TextCell(), *self._beside(rows, nothing))
+            labels = TextCell("order of rows: rho"), TextCell("n")
+        return [TableLine("order", labels[0], rho), TableLine("order", labels[1], n)]
+
+    def _same_runs(self, row: Row) -> str | None:
+        """A note on an equal row: at scale=demo networks of all sizes are one."""
+        keys = self._keys(row)
+        counted = list(filter(is_counted, self.columns))
+        metrics = [metric_of(column, row) for column in counted]
+        for other in self.scored.table.rows[: self.scored.table.rows.index(row)]:
+            is_same = metrics == [metric_of(column, other) for column in counted]
+            if keys and keys == self._keys(other) and is_same:
+                return f"At scale={self.scored.scale} the same runs as row '{other.label}'."
+        return None
+
+    def _keys(self, row: Row) -> tuple[str, ...]:
+        cells = (self.scored.cells.get((row.label, column.name)) for column in self.columns)
+        return next((cell.keys for cell in cells if cell is not None and cell.keys), ())
+
+    def _seeds(self, row: Row) -> TextCell:
+        """How many seeds the row's values are means of."""
+        columns = filter(is_of_runs, self.columns)
+        cells = [self.scored.cells.get((row.label, column.name)) for column in columns]
+        there = [cell.seeds for cell in cells if cell is not None]
+        counts = sorted({seeds for seeds in there if seeds} or set(there))
+        return TextCell("-".join(dict.fromkeys(map(str, counts[:1] + counts[-1:]))))
+
+    def _ours(self, row: Row, column: Column) -> TextCell:
+        cell_id = (row.label, column.name)
+        cell = self.scored.cells.get(cell_id)
+        if cell is None:
+            return TextCell(DASH)
+        notes = self.notes(cell.reason and f"{cell.reason.removesuffix('.')}.")
+        if math.isnan(cell.mean):
+            return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
+        spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
+        rank = self.scored.ranks_ours.get(cell_id, 0)
+        return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
+
+    def _sd(self, row: Row, column: Column) -> TextCell:
+        cell = self.scored.cells.get((row.label, column.name))
+        return TextCell(DASH if cell is None else number(cell.sd))
+
+    def _published(self, row: Row, column: Column) -> TextCell:
+        printed = published(row, column)
+        if printed is None:
+            return TextCell(DASH)
+        doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
+        rank = self.scored.ranks_published.get((row.label, column.name), 0)
+        return TextCell(f"{printed:.{self.decimals}f}", rank=rank, notes=self.notes(*doubts))
+
+    def _difference(self, row: Row, column: Column) -> TextCell:
+        return TextCell(_signed(self.scored.difference(row, column)))
+
+
+def _signed(value: float) -> str:
+    return DASH if math.isnan(value) else f"{value:+.2f}"

@@ -7,19 +7,15 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, TextTable, number
 from sweeps.point import Point
-from sweeps.rendering.text_cell import TextCell
+from sweeps.rendering.rendered_table import TextCell
 from sweeps.table.cells import TableCell, Value, over_seeds
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 
 MOST_REGIONS = 99
 
 
 def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     """Scores on the test split by configuration.
-
-    Args:
-        title: shown above.
-        outcomes: of the points of a grid.
 
     Returns:
         columns: configuration, seeds that went into the row ("2 of 3" where some are missing),
@@ -29,14 +25,21 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     groups: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         groups.setdefault(configuration(outcome.point), []).append(outcome)
-    metrics = _metrics(outcomes)
+    known = {name for outcome in outcomes for run in outcome.results for name in run.scores()}
+    regions = map(names.region, range(1, MOST_REGIONS))
+    measured = [name for name in regions if f"test/{name}" in known]
+    metrics = [names.MIOU, names.VAR, *measured]
     has_seeds = any(len(members) > 1 for members in groups.values())
     rows = []
     for label, members in groups.items():
         cells = [_cell(metric, members) for metric in metrics]
-        seeds, key = _seeds(cells[0], members), members[0].keys
-        beside = [] if has_seeds else [" ".join(key) or ABSENT]
-        rows.append((label, seeds, *map(_shown, cells), *beside))
+        count = cells[0].seeds
+        seeds = f"{count} of {len(members)}" if count < len(members) else str(count)
+        spreads = [number(cell.sd) if cell.seeds > 1 else "" for cell in cells]
+        pairs = zip(cells, spreads, strict=True)
+        shown = [TextCell(number(cell.mean), spread).whole for cell, spread in pairs]
+        beside = [] if has_seeds else [" ".join(members[0].keys) or ABSENT]
+        rows.append((label, seeds, *shown, *beside))
     header = ("configuration", "seeds", *metrics, *([] if has_seeds else ["run"]))
     return TextTable(title, header, tuple(rows))
 
@@ -58,13 +61,6 @@ def configuration(point: Point) -> str:
     return label or next((value for key, _, value in named if key == "+experiment"), ABSENT)
 
 
-def _metrics(outcomes: Sequence[Outcome]) -> list[str]:
-    """Names of the columns: mIoU, Var and the regions that some run has."""
-    known = {name for outcome in outcomes for run in outcome.results for name in run.scores()}
-    regions = map(names.region, range(1, MOST_REGIONS))
-    return [names.MIOU, names.VAR, *(name for name in regions if f"test/{name}" in known)]
-
-
 def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
     values: dict[int, Value] = {}
     for index, outcome in enumerate(members):
@@ -73,12 +69,3 @@ def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
         )
         values[index] = scores.get(f"test/{metric}", outcome.reason or outcome.state)
     return over_seeds(values)
-
-
-def _seeds(cell: TableCell, members: Sequence[Outcome]) -> str:
-    return f"{cell.seeds} of {len(members)}" if cell.seeds < len(members) else str(cell.seeds)
-
-
-def _shown(cell: TableCell) -> str:
-    spread = number(cell.sd) if cell.seeds > 1 else ""
-    return TextCell(number(cell.mean), spread).whole

@@ -8,9 +8,7 @@ from dataclasses import replace
 from rich.text import Text as RichText
 
 from rgbt.tracking.terminal import SHORTEST, WIDTH, blocks, shortened
-from sweeps.rendering.line_builder import BESIDE_OURS, WITH_SD
-from sweeps.rendering.rendered_table import RenderedTable
-from sweeps.rendering.text_cell import TextCell
+from sweeps.rendering.rendered_table import BESIDE_OURS, WITH_SD, RenderedTable, TextCell
 
 STYLES = ("", "bold", "underline")
 SIGNS = ("", "*", "_")
@@ -37,7 +35,11 @@ def terminal(rendered: RenderedTable, *, plain: bool = False, width: int = WIDTH
     rows = [*header, *((line.label, *line.fields) for line in rendered.lines)]
     fields = _fields(rows, plain=plain)
     if sum(_widths(fields)) + GAP * (len(fields[0]) - 1) > width:
-        fields = _fields(_with_short_labels(rows, max(SHORTEST, width // 3)), plain=plain)
+        limits = [max(SHORTEST, width // 3)] * len(rows)
+        labels = shortened([row[0].text for row in rows], limits)
+        named = zip(rows, labels, strict=True)
+        short = [(replace(row[0], text=label), *row[1:]) for row, label in named]
+        fields = _fields(short, plain=plain)
     widths = _widths(fields)
     # The labels: of the row, of the line where a row has several, and the number of seeds.
     first = 2 if any(line.kind == "all" for line in rendered.lines) else 3
@@ -53,27 +55,22 @@ def terminal(rendered: RenderedTable, *, plain: bool = False, width: int = WIDTH
 
 
 def _fields(rows: Sequence[Sequence[TextCell]], *, plain: bool) -> list[list[RichText]]:
-    columns = list(zip(*rows, strict=True))
-    tails = [max(len(_tail(text)) for text in column) for column in columns]
-    return [
-        [_rich(text, tail, plain=plain) for text, tail in zip(row, tails, strict=True)]
-        for row in rows
-    ]
+    """The cells, filled behind their numbers so that these stand below each other."""
+    columns: list[list[RichText]] = []
+    for column in zip(*rows, strict=True):
+        tails = [text.whole.removeprefix(text.text) + _bracketed(text) for text in column]
+        width = max(map(len, tails))
+        columns.append([])
+        for text, tail in zip(column, tails, strict=True):
+            sign = SIGNS[text.rank] if plain else ""
+            # Styled in parts: the padding beside a number is not underlined.
+            field = RichText().append(f"{sign}{text.text}", STYLES[text.rank])
+            columns[-1].append(field.append(tail.ljust(width)))
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _widths(fields: Sequence[Sequence[RichText]]) -> list[int]:
     return [max(field.cell_len for field in column) for column in zip(*fields, strict=True)]
-
-
-def _with_short_labels(
-    rows: Sequence[Sequence[TextCell]], limit: int
-) -> list[tuple[TextCell, ...]]:
-    labels = [row[0].text for row in rows]
-    short = shortened(labels, [limit] * len(labels))
-    return [
-        (replace(label, text=text), *others)
-        for (label, *others), text in zip(rows, short, strict=True)
-    ]
 
 
 def _block(rendered: RenderedTable, fields: Sequence[Sequence[RichText]]) -> list[RichText]:
@@ -95,15 +92,12 @@ def _stacked(header: Sequence[TextCell]) -> list[tuple[TextCell, ...]]:
         return [tuple(header)]
     broken = [text.text.split("_") for text in header]
     height = max(map(len, broken))
-    filled = [[""] * (height - len(words)) + words for words in broken]
-    lines = [
-        [replace(text, text=words[i], notes=()) for text, words in zip(header, filled, strict=True)]
-        for i in range(height)
-    ]
-    lines[-1] = [
-        replace(text, notes=whole.notes) for text, whole in zip(lines[-1], header, strict=True)
-    ]
-    return [tuple(line) for line in lines]
+    lines = []
+    for above in reversed(range(height)):
+        words = [parts[-1 - above] if above < len(parts) else "" for parts in broken]
+        notes = [text.notes if above == 0 else () for text in header]
+        lines.append(tuple(TextCell(w, notes=n) for w, n in zip(words, notes, strict=True)))
+    return lines
 
 
 def _aligned(row: Sequence[RichText], widths: Sequence[int], numeric: Sequence[bool]) -> RichText:
@@ -114,19 +108,6 @@ def _aligned(row: Sequence[RichText], widths: Sequence[int], numeric: Sequence[b
         line.append(" " * GAP if index else "").append_text(text)
     line.rstrip()
     return line
-
-
-def _rich(text: TextCell, tail_width: int, *, plain: bool) -> RichText:
-    """A field whose tail takes `tail_width` characters, so that numbers stand below each other."""
-    sign = SIGNS[text.rank] if plain else ""
-    tail = _tail(text).ljust(tail_width)
-    # Styled in parts: the padding beside a number is not underlined.
-    return RichText().append(f"{sign}{text.text}", STYLES[text.rank]).append(tail)
-
-
-def _tail(text: TextCell) -> str:
-    """Spread and footnotes, behind the number."""
-    return text.whole.removeprefix(text.text) + _bracketed(text)
 
 
 def _bracketed(text: TextCell) -> str:

@@ -1,4 +1,4 @@
-"""Points of a grid or a list, from a command line or a file."""
+"""Points of a grid or a list, and ranges of a search, from a command line and a file."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hydra.core.override_parser.types import IntervalSweep, Override, Sweep
 
 from rgbt.checks import InputError, nearest
 from sweeps.point import Value
+from sweeps.space.space import Parameter, parse_space, plain_space
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -56,8 +57,22 @@ def split(
     """
     last = {one.get_key_element(): one for one in _parsed(overrides, config_loader)}
     fixed = tuple(_typed(one) for one in last.values() if not one.is_sweep_override())
-    swept = {key: _values(one) for key, one in last.items() if one.is_discrete_sweep()}
-    intervals = {key: _interval(one) for key, one in last.items() if one.is_interval_sweep()}
+    swept: SweptValues = {}
+    intervals: dict[str, dict[str, Any]] = {}
+    for key, override in last.items():
+        value = override.value()
+        if override.is_discrete_sweep():
+            swept[key] = list(override.sweep_string_iterator())
+            if not swept[key]:
+                raise InputError(f"'{_typed(override)}' has no values; widen it.")
+            _check_tags(override, ())
+        elif isinstance(value, IntervalSweep):
+            # Hydra's interval leaves out its end, which an entry of a space takes in.
+            _check_tags(override, ("log",))
+            whole = isinstance(value.start, int) and isinstance(value.end, int)
+            kind = "int" if whole else "float"
+            ends = {"low": value.start, "high": value.end}
+            intervals[key] = {"type": kind, **ends, "log": "log" in value.tags}
     return fixed, swept, intervals
 
 
@@ -106,21 +121,21 @@ def distributions(points: Sequence[GridPoint]) -> dict[str, BaseDistribution]:
 
     Numbers are ranges, which may grow in a study; other choices may not.
     """
-    values: dict[str, list[Value]] = {}
-    for key, value in (pair for point in points for pair in point.params.items()):
-        values.setdefault(key, []).append(value)
-    return {key: _distribution(seen) for key, seen in values.items()}
-
-
-def _distribution(seen: Sequence[Value]) -> BaseDistribution:
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    numbers = [one for one in seen if isinstance(one, int | float) and not isinstance(one, bool)]
-    if len(numbers) < len(seen):
-        return CategoricalDistribution(tuple(dict.fromkeys(seen)))
-    if all(isinstance(one, int) for one in numbers):
-        return IntDistribution(int(min(numbers)), int(max(numbers)))
-    return FloatDistribution(min(numbers), max(numbers))
+    values: dict[str, list[Any]] = {}
+    for key, value in (pair for point in points for pair in point.params.items()):
+        values.setdefault(key, []).append(value)
+    found: dict[str, BaseDistribution] = {}
+    for key, seen in values.items():
+        numbers = [each for each in seen if type(each) in (int, float)]
+        if len(numbers) < len(seen):
+            found[key] = CategoricalDistribution(tuple(dict.fromkeys(seen)))
+        elif all(isinstance(each, int) for each in numbers):
+            found[key] = IntDistribution(int(min(numbers)), int(max(numbers)))
+        else:
+            found[key] = FloatDistribution(min(numbers), max(numbers))
+    return found
 
 
 def _parsed(overrides: Iterable[str], config_loader: ConfigLoader | None = None) -> list[Override]:
@@ -137,34 +152,16 @@ def _bare(override: Override) -> str:
 
 
 def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
-    parsed = [one for one in _parsed(own) if not one.is_delete()]
-    params = {one.get_key_element(): _plain(one) for one in parsed}
+    params: dict[str, Value] = {}
+    for override in _parsed(own):
+        value = override.value()
+        if override.is_delete():
+            continue
+        if value is None or isinstance(value, str | int | float):
+            params[override.get_key_element()] = value
+        else:
+            params[override.get_key_element()] = override.get_value_element_as_str()
     return GridPoint(params, (*fixed, *own))
-
-
-def _plain(override: Override) -> Value:
-    value = override.value()
-    if value is None or isinstance(value, str | int | float):
-        return value
-    return override.get_value_element_as_str()
-
-
-def _values(override: Override) -> list[str]:
-    values = list(override.sweep_string_iterator())
-    if not values:
-        raise InputError(f"'{_typed(override)}' has no values; widen it.")
-    _check_tags(override, ())
-    return values
-
-
-def _interval(override: Override) -> dict[str, Any]:
-    """Entry of a search space; Hydra's interval leaves out its end, which an entry takes in."""
-    _check_tags(override, ("log",))
-    value = override.value()
-    assert isinstance(value, IntervalSweep)
-    whole = isinstance(value.start, int) and isinstance(value.end, int)
-    kind = "int" if whole else "float"
-    return {"type": kind, "low": value.start, "high": value.end, "log": "log" in value.tags}
 
 
 def _check_tags(override: Override, known: Sequence[str]) -> None:
@@ -173,3 +170,57 @@ def _check_tags(override: Override, known: Sequence[str]) -> None:
         if tag not in known:
             hint = nearest(tag, known) if known else "tags are for interval() alone"
             raise InputError(f"'{_typed(override)}': tag '{tag}' means nothing; {hint}.")
+
+
+def merge_space(
+    space: Mapping[str, Any],
+    fixed: Sequence[str],
+    swept: SweptValues,
+    intervals: Mapping[str, Mapping[str, Any]],
+) -> tuple[Parameter, ...]:
+    """The parameters of a search; the command line has priority for every key.
+
+    Args:
+        space: as in ``conf/search``.
+        fixed: overrides as typed. One for a key of `space` takes it out of the search, and with it
+            the parameters whose conditions it rules out.
+        swept: key -> values; they are the choices of the key.
+        intervals: key -> entry of a space; it is the range of the key. Like `swept` it takes the
+            place of an entry of `space` and keeps its ``when``.
+
+    Raises:
+        InputError: as `parse_space`, for `space` as it is and for what is made of it.
+    """
+    parse_space(space)
+    merged = plain_space(space)
+    choices = {key: [_value(f"{key}={text}") for text in texts] for key, texts in swept.items()}
+    entries = {key: {"type": "categorical", "choices": values} for key, values in choices.items()}
+    for key, entry in {**entries, **intervals}.items():
+        kept = {"when": merged[key]["when"]} if merged.get(key, {}).get("when") else {}
+        merged[key] = {**entry, **kept}
+    keys = {word.partition("=")[0]: word for word in fixed}
+    left = _without(merged, {key: _value(word) for key, word in keys.items() if key in merged})
+    return parse_space(left)
+
+
+def _value(override: str) -> Any:
+    (parsed,) = _parsed([override])
+    return parsed.value()
+
+
+def _without(space: Mapping[str, Any], fixed: Mapping[str, Any]) -> dict[str, Any]:
+    """`space` where some keys have one value: without them and without what they rule out."""
+    left: dict[str, Any] = {}
+    for key, entry in space.items():
+        when = {
+            other: wanted if isinstance(wanted, list | tuple) else [wanted]
+            for other, wanted in (entry.get("when") or {}).items()
+        }
+        # What is gone without being fixed was ruled out itself.
+        impossible = any(other not in left and other not in fixed for other in when)
+        unmet = any(fixed[other] not in when[other] for other in when if other in fixed)
+        if key in fixed or impossible or unmet:
+            continue
+        open_conditions = {other: wanted for other, wanted in when.items() if other not in fixed}
+        left[key] = {**entry, "when": open_conditions} if when else entry
+    return left

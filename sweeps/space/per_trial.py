@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from threading import Lock
 from typing import Any
 
 from optuna.distributions import BaseDistribution
@@ -30,17 +29,14 @@ class PerTrialSampler(BaseSampler):
         self.make = make
         self.seed = seed
         self._inner: dict[int, BaseSampler] = {}
-        self._lock = Lock()
 
     def __str__(self) -> str:
         return f"{self.make(0)} per trial"
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
         """Begin a trial, also one that another process began and this one resumes."""
-        inner = self.make(trial_seed(self.seed, trial.number))
-        with self._lock:
-            self._inner[trial.number] = inner
-        inner.before_trial(study, trial)
+        self._inner[trial.number] = self.make(trial_seed(self.seed, trial.number))
+        self._inner[trial.number].before_trial(study, trial)
 
     def infer_relative_search_space(
         self, study: Study, trial: FrozenTrial
@@ -73,13 +69,10 @@ class PerTrialSampler(BaseSampler):
     ) -> None:
         """End a trial; one that this process never began is ended all the same."""
         self._of(trial).after_trial(study, trial, state, values)
-        with self._lock:
-            self._inner.pop(trial.number, None)
+        self._inner.pop(trial.number, None)
 
     def _of(self, trial: FrozenTrial) -> BaseSampler:
-        with self._lock:
-            inner = self._inner.get(trial.number)
-        return inner or self.make(trial_seed(self.seed, trial.number))
+        return self._inner.get(trial.number) or self.make(trial_seed(self.seed, trial.number))
 
 
 def trial_seed(seed: int, number: int) -> int:

@@ -59,15 +59,12 @@ NOT_OPTIONS = (
 """The seed has its own key; Optuna 6 drops the others."""
 
 
-def build_sampler(
-    kind: str, seed: int, options: Mapping[str, Any], objectives: int = 1
-) -> PerTrialSampler:
+def build_sampler(node: Mapping[str, Any], objectives: int = 1) -> PerTrialSampler:
     """The sampler of a search.
 
     Args:
-        kind: one of `SAMPLERS`.
-        seed: one worker with the same seed proposes the same points, see `PerTrialSampler`.
-        options: of Optuna's constructor, e.g. ``{"n_startup_trials": 5}``.
+        node: its kind, one of `SAMPLERS`; its seed: one worker with the same seed proposes the same
+            points, see `PerTrialSampler`; options of Optuna's constructor.
         objectives: how many numbers the search follows.
 
     Raises:
@@ -78,27 +75,35 @@ def build_sampler(
 
     from sweeps.space.per_trial import PerTrialSampler
 
-    check_choice("sampler.kind", kind, SAMPLERS)
-    if kind == "cmaes":
-        _check_cmaes(objectives)
+    kind, options = _kind("sampler", node, SAMPLERS)
+    seed = options.pop("seed", 0)
+    if not isinstance(seed, int):
+        raise InputError(f"hydra.sweeper.sampler.seed: expected a whole number, got {seed}.")
+    if kind == "cmaes" and importlib.util.find_spec("cmaes") is None:
+        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
+    if kind == "cmaes" and objectives > 1:
+        raise InputError(
+            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
+            "take tpe, gp or nsga2."
+        )
     make = getattr(optuna.samplers, SAMPLERS[kind])
-    checked = _options("sampler", kind, make, options)
+    _check_options("sampler", kind, make, options)
 
     def seeded(trial_seed: int) -> optuna.samplers.BaseSampler:
-        sampler: optuna.samplers.BaseSampler = make(**checked, seed=trial_seed)
+        sampler: optuna.samplers.BaseSampler = make(**options, seed=trial_seed)
         return sampler
 
     _construct("sampler", kind, partial(seeded, 0))
     return PerTrialSampler(seeded, seed)
 
 
-def build_pruner(kind: str, options: Mapping[str, Any], objectives: int = 1) -> BasePruner:
+def build_pruner(node: Mapping[str, Any] | None, objectives: int = 1) -> BasePruner:
     """The pruner of a search; trials report at their validation steps.
 
     Args:
-        kind: one of `PRUNERS`.
-        options: of Optuna's constructor. Those that count steps (``n_warmup_steps``,
-            ``min_resource``) count steps of the optimizer, not validations.
+        node: its kind, one of `PRUNERS`, and options of Optuna's constructor; None: no pruner.
+            Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
+            optimizer, not validations.
         objectives: how many numbers the search follows.
 
     Raises:
@@ -107,35 +112,38 @@ def build_pruner(kind: str, options: Mapping[str, Any], objectives: int = 1) -> 
     """
     import optuna
 
-    check_choice("pruner.kind", kind, PRUNERS)
+    kind, options = _kind("pruner", {"kind": "none"} if node is None else node, PRUNERS)
     if kind != "none" and objectives > 1:
         raise InputError(
             f"pruner.kind={kind} compares trials by one number, and this search has {objectives} "
             "objectives; take hydra.sweeper.pruner=null or one objective."
         )
+    options.pop("seed", None)
     make = getattr(optuna.pruners, PRUNERS[kind])
     fixed = {"wrapped_pruner": None} if kind == "patient" else {}
-    checked = _options("pruner", kind, make, options)
-    pruner: BasePruner = _construct("pruner", kind, partial(make, **fixed, **checked))
+    _check_options("pruner", kind, make, options)
+    pruner: BasePruner = _construct("pruner", kind, partial(make, **fixed, **options))
     return pruner
 
 
-def _check_cmaes(objectives: int) -> None:
-    if importlib.util.find_spec("cmaes") is None:
-        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
-    if objectives > 1:
-        raise InputError(
-            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
-            "take tpe, gp or nsga2."
-        )
+def _kind(
+    what: str, node: Mapping[str, Any], known: Mapping[str, str]
+) -> tuple[str, dict[str, Any]]:
+    options = dict(node)
+    if "kind" not in options:
+        raise InputError(f"hydra.sweeper.{what}: 'kind' has no value, such as {{kind: tpe}}.")
+    kind = str(options.pop("kind"))
+    check_choice(f"{what}.kind", kind, known)
+    return kind, options
 
 
-def _options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """`given`, checked against the signature of `make`."""
+def _check_options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> None:
+    """Refuse options that are not in the signature of `make`, or of another type."""
     import pydantic
 
     parameters = inspect.signature(make).parameters
-    words = {name: _annotation(one) for name, one in parameters.items() if name not in NOT_OPTIONS}
+    types = {name: one.annotation for name, one in parameters.items() if name not in NOT_OPTIONS}
+    words = {n: t if isinstance(t, str) else getattr(t, "__name__", "") for n, t in types.items()}
     known = {name: PLAIN[word] for name, word in words.items() if word in PLAIN}
     for name in known:
         if parameters[name].default is inspect.Parameter.empty and name not in given:
@@ -149,12 +157,6 @@ def _options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> dict[
         except pydantic.ValidationError as error:
             wanted = words[name].replace("None", "null")
             raise InputError(f"{what}.{name}: expected {wanted}, got {value!r}.") from error
-    return dict(given)
-
-
-def _annotation(parameter: inspect.Parameter) -> str:
-    annotation = parameter.annotation
-    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
 
 
 def _construct(what: str, kind: str, make: partial[Any]) -> Any:

@@ -33,16 +33,13 @@ class ScoredRun(Protocol):
     @property
     def key(self) -> str:
         """Its config key."""
-        ...
 
     @property
     def commit(self) -> str | None:
         """Git commit of the code that made it."""
-        ...
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
         """Counts of the test split; InputError where they are missing or damaged."""
-        ...
 
 
 class CellRun(Protocol):
@@ -51,17 +48,14 @@ class CellRun(Protocol):
     @property
     def state(self) -> str:
         """The state: "finished", or another word."""
-        ...
 
     @property
     def reason(self) -> str:
         """Why it is not finished, else empty."""
-        ...
 
     @property
     def results(self) -> Sequence[ScoredRun]:
         """The finished run, or empty."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -121,21 +115,16 @@ def is_of_runs(column: Column) -> bool:
 
 
 def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[CellId, TableCell]:
-    """The cells of one row, in columns with values of runs.
-
-    Args:
-        table: the table.
-        row: one of its rows.
-        outcomes: the row's runs by seed.
-    """
+    """The cells of one row, whose runs are given by seed, in columns with values of runs."""
     by_seed = {seed: _values(table, row, outcome) for seed, outcome in outcomes.items()}
     keys = tuple(run.key for outcome in outcomes.values() for run in outcome.results)
     cells = {}
     for column in filter(is_of_runs, table.columns_of(row)):
         by_column = {seed: values[column.name] for seed, values in by_seed.items() if values}
+        missing = [outcomes[seed] for seed, each in by_column.items() if isinstance(each, str)]
+        marks = [NO_VALUE if run.state == "finished" else run.state for run in missing]
         if by_column:
-            marks = {seed: _mark(outcomes[seed], value) for seed, value in by_column.items()}
-            cells[row.label, column.name] = over_seeds(by_column, marks, keys)
+            cells[row.label, column.name] = over_seeds(by_column, "".join(marks[:1]), keys)
     return cells
 
 
@@ -185,37 +174,24 @@ def derived(column: Column, values: Sequence[Value]) -> Value:
     return statistics.fmean(known) if column.minus is None else known[0] - known[1]
 
 
-def _mark(outcome: CellRun, value: Value) -> str:
-    if not isinstance(value, str):
-        return ""
-    return NO_VALUE if outcome.state == "finished" else outcome.state
-
-
 def over_seeds(
-    by_seed: Mapping[int, Value], marks: Mapping[int, str] | None = None, keys: tuple[str, ...] = ()
+    by_seed: Mapping[int, Value], mark: str = "", keys: tuple[str, ...] = ()
 ) -> TableCell:
-    """Mean and spread of the values of several seeds.
-
-    Args:
-        by_seed: values by seed.
-        marks: by seed, the reason in a word where a value is missing.
-        keys: of the runs.
-    """
+    """Mean and spread of the values of several seeds; for `mark` and `keys` see `TableCell`."""
     values = [each for each in by_seed.values() if not isinstance(each, str)]
-    reasons: dict[str, list[int]] = {}
+    reasons: dict[str, list[str]] = {}
     for seed, each in by_seed.items():
         if isinstance(each, str):
-            reasons.setdefault(each, []).append(seed)
-    sentences = [f"{_seeds(seeds)}: {reason}" for reason, seeds in reasons.items()]
+            reasons.setdefault(each, []).append(str(seed))
+    sentences = [
+        f"seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}: {reason}"
+        for reason, seeds in reasons.items()
+    ]
     return TableCell(
         mean=statistics.fmean(values) if values else math.nan,
         sd=statistics.stdev(values) if len(values) > 1 else math.nan,
         seeds=len(values),
         reason="; ".join(sentences),
-        mark=next((mark for mark in (marks or {}).values() if mark), ""),
+        mark=mark,
         keys=keys,
     )
-
-
-def _seeds(seeds: Sequence[int]) -> str:
-    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"

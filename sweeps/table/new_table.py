@@ -17,9 +17,9 @@ from rgbt.config.command import composing
 from rgbt.config.compose import PIXELS
 from rgbt.config.options import Help
 from rgbt.files.atomic import write_atomic
-from sweeps.run_specs import specify_run
 from sweeps.table.load_table import OWN as FOLDER
 from sweeps.table.load_table import PUBLISHED, load_table
+from sweeps.worker.planner import specify_run
 
 RINGS = 5
 END = "\n..."
@@ -101,14 +101,16 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         overrides: of `python -m rgbt.run`; comma lists are varied, all with all.
         folder: of the user's tables.
 
-    Returns:
-        the file.
-
     Raises:
         InputError: the file exists already, nothing is varied, or a row does not fit.
     """
     path = folder / f"{name}.yaml"
-    _check_name(name, path)
+    if path.exists():
+        raise InputError(f"{path} exists already; edit it, or choose another name.")
+    if (PUBLISHED / f"{name}.yaml").exists():
+        raise InputError(f"table={name} is a published table; choose another name.")
+    if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
     factors = [_factor(override) for override in overrides]
     for factor in factors:
         if factor.key == "seed":
@@ -127,26 +129,14 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     return path
 
 
-def _check_name(name: str, path: Path) -> None:
-    if path.exists():
-        raise InputError(f"{path} exists already; edit it, or choose another name.")
-    if (PUBLISHED / f"{name}.yaml").exists():
-        raise InputError(f"table={name} is a published table; choose another name.")
-    if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InputError(f"table={name}: expected a name such as my/ablation, without extension.")
-
-
 def _factor(override: str) -> VariedOverride:
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     with composing([override]):
         parsed = OverridesParser.create().parse_override(override)
-        if parsed.is_sweep_override():
-            values = tuple(parsed.sweep_string_iterator())
-        else:
-            values = (override.partition("=")[2],)
-    key, _, _ = override.partition("=")
-    return VariedOverride(key, values)
+        key, _, value = override.partition("=")
+        is_varied = parsed.is_sweep_override()
+        return VariedOverride(key, tuple(parsed.sweep_string_iterator()) if is_varied else (value,))
 
 
 def _text(
@@ -166,8 +156,10 @@ def _text(
         "  - {name: Var, metric: Var, best: lowest}\n",
     ]
     axis = varied[0] if len(varied) == 1 and varied[0].numbers is not None else None
-    if axis is not None:
-        parts += _lines(factor={"name": _short(axis.key, varied), "axis": _axis(axis)})
+    if axis is not None and axis.numbers is not None:
+        low, high = min(axis.numbers), max(axis.numbers)
+        scale = "log" if low > 0 and high / low >= LOG_FROM else "linear"
+        parts += _lines(factor={"name": _short(axis.key, varied), "axis": scale})
     rows = (_row(experiment, factors, point, axis) for point in points)
     return "".join([*parts, ROWS, *rows])
 
@@ -195,12 +187,6 @@ def _short(key: str, varied: Sequence[VariedOverride]) -> str:
     last = key.lstrip("+").rpartition(".")[2]
     ends = [factor.key.lstrip("+").rpartition(".")[2] for factor in varied]
     return last if ends.count(last) == 1 else key.lstrip("+")
-
-
-def _axis(factor: VariedOverride) -> str:
-    numbers = factor.numbers or ()
-    spread = min(numbers) > 0 and max(numbers) / min(numbers) >= LOG_FROM
-    return "log" if spread else "linear"
 
 
 def _lines(**entries: Any) -> list[str]:

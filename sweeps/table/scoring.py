@@ -38,9 +38,7 @@ class ScoredTable:
 
     Attributes:
         name: e.g. "spatialseg/table3".
-        table: the file.
         scale: "demo" or "paper".
-        seeds: of the runs.
         cells: only rows that were run, and columns of parameters.
         orders: by name of the column.
         ranks_ours: 1 best, 2 second best of the column among our means.
@@ -78,9 +76,8 @@ def check_metrics(table: Table) -> None:
         InputError: naming the metric and the nearest known one.
     """
     columns = list(filter(is_counted, table.columns))
-    for metric in sorted(
-        {metric_of(column, row) for row in table.runnable_rows for column in columns}
-    ):
+    metrics = {metric_of(column, row) for row in table.runnable_rows for column in columns}
+    for metric in sorted(metrics):
         parse(metric)
 
 
@@ -99,7 +96,7 @@ def score(
         table: its file.
         runs: (label of the row, seed) -> the run.
         scale: "demo" or "paper".
-        sizes: cells of the columns of parameters, see `sweeps.table.parameter_counts`.
+        sizes: cells of the columns of parameters, see `sweeps.table.request.parameter_cells`.
     """
     seeds = sorted({seed for _, seed in runs})
     ran = {label for label, _ in runs}

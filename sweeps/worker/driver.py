@@ -23,19 +23,12 @@ from rgbt.metrics.names import CA, TC
 from rgbt.spec.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
-from sweeps.worker.executors import Executor, Job, LocalExecutor, check_gpus
-from sweeps.worker.owner import HEARTBEAT_S
+from sweeps.worker.executors import GPUS, Executor, Job, LocalExecutor, check_gpus
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import (
-    ExecutionContext,
-    RunningTrial,
-    TrialError,
-    TrialPruned,
-    mean_scores,
-)
-from sweeps.worker.trial_source import ClaimedTrial, TrialSource
-from sweeps.worker.trial_store import TrialStore
+from sweeps.worker.running_trial import RunningTrial, TrialError, TrialPruned, mean_scores
+from sweeps.worker.trial_sources import TrialSource
+from sweeps.worker.trial_store import HEARTBEAT_S, TrialStore
 
 POLL_S = 0.2
 RECONNECT_S = 600.0
@@ -51,12 +44,8 @@ class Driver:
     """One process that executes trials of one study.
 
     Attributes:
-        store: the study.
         source: claims trials.
         runs: finished runs.
-        executor: starts processes.
-        settings: objectives, workers, GPUs, budget.
-        view: the progress.
         running: trials in progress, by slot.
         failures: number of failed trials.
     """
@@ -109,9 +98,8 @@ class Driver:
             if self._advance(trial):
                 del self.running[slot]
         self._send_heartbeat()
-        now = time.monotonic()
         free = self.settings.workers - len(self.running)
-        due = now - self._last_claim > CLAIM_S
+        due = time.monotonic() - self._last_claim > CLAIM_S
         if free > 0 and due:
             self._claim(free)
         self.view.update(list(self.running.values()))
@@ -130,15 +118,21 @@ class Driver:
         executing = {trial.number for trial in self.running.values()}
         for stale in self.store.stale_trials(executing):
             self.store.release(stale.number, "its driver was gone", requeue=self.source.requeues)
+        minutes = self.settings.timeout_minutes
+        limit = None if minutes is None else 60 * minutes
         while free > 0 and not self._is_over():
             claimed = self.source.next()
             if claimed is None:
                 self._last_claim = time.monotonic()
                 return
             slot = min(set(range(self.settings.workers)) - set(self.running))
-            self.running[slot] = self._begin(claimed, slot)
+            start = partial(self._start, slot=slot, tags=claimed.plan.point.tags)
+            plan, number, report = claimed.plan, claimed.number, claimed.report
+            trial = RunningTrial(plan, number, self.runs, start, limit, report)
+            self.view.began(trial)
+            self.running[slot] = trial
             # A point that was finished elsewhere needs no process: its slot is free at once.
-            if self._advance(self.running[slot]):
+            if self._advance(trial):
                 del self.running[slot]
             else:
                 free -= 1
@@ -151,21 +145,12 @@ class Driver:
         failures = self.failures + self.source.rejected
         return spent or (most is not None and failures >= most)
 
-    def _begin(self, claimed: ClaimedTrial, slot: int) -> RunningTrial:
-        start = partial(self._start, slot=slot, tags=claimed.plan.point.tags)
-        minutes = self.settings.timeout_minutes
-        context = ExecutionContext(self.runs, start, None if minutes is None else 60 * minutes)
-        trial = RunningTrial(claimed.plan, claimed.number, context, claimed.report)
-        self.view.began(trial)
-        return trial
-
     def _start(
         self, command: Sequence[str], log: Path, *, slot: int, tags: Mapping[str, str]
     ) -> Job:
         environment = {TAGS: json.dumps(dict(tags))}
         if self.settings.gpus:
-            gpu = self.settings.gpus[slot % len(self.settings.gpus)]
-            environment |= {"CUDA_VISIBLE_DEVICES": str(gpu)}
+            environment[GPUS] = str(self.settings.gpus[slot % len(self.settings.gpus)])
         return self.executor.start(command, environment, log)
 
     def _advance(self, trial: RunningTrial) -> bool:
@@ -224,29 +209,23 @@ def drive(
     settings: SweepSettings,
 ) -> None:
     """Execute the trials of `source` with the executor of the settings, and show the progress."""
-    executor = make_executor(settings, runs.runs_dir)
+    executor: Executor
+    if settings.executor == "local":
+        check_gpus(settings.gpus)
+        executor = LocalExecutor(settings.workers)
+    else:
+        from sweeps.worker.submitit_executor import SubmititExecutor
+
+        executor = SubmititExecutor(runs.runs_dir / ".submitit", settings.submitit or {})
     with view:
         Driver(store, source, runs, executor, settings, view).run()
 
 
-def make_executor(settings: SweepSettings, runs_dir: Path) -> Executor:
-    """The executor that `executor` and its options name."""
-    if settings.executor == "local":
-        check_gpus(settings.gpus)
-        return LocalExecutor(settings.workers)
-    from sweeps.worker.submitit_executor import SubmititExecutor
-
-    return SubmititExecutor(runs_dir / ".submitit", settings.submitit or {})
-
-
 def _finite(name: str, scores: Mapping[str, float]) -> float:
     value = scores.get(name)
-    if value is None or not math.isfinite(value):
-        split, _, rest = name.partition("/")
-        measure = (
-            f"; rgbt consistency run=... split={split} measures it"
-            if rest.startswith((f"{TC}/", f"{CA}/"))
-            else ""
-        )
-        raise TrialError(f"its runs have no {name} that is a number{measure}")
-    return value
+    if value is not None and math.isfinite(value):
+        return value
+    split, _, rest = name.partition("/")
+    is_of_pairs = rest.startswith((f"{TC}/", f"{CA}/"))
+    measure = f"; rgbt consistency run=... split={split} measures it" if is_of_pairs else ""
+    raise TrialError(f"its runs have no {name} that is a number{measure}")

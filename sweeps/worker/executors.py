@@ -42,11 +42,9 @@ class Job(Protocol):
 
     def poll(self) -> int | None:
         """Its exit code, negative for a signal; None while it runs."""
-        ...
 
     def stop(self) -> None:
         """Ask it to stop; where it does not, later calls of `poll` kill it."""
-        ...
 
 
 class Executor(Protocol):
@@ -60,15 +58,10 @@ class Executor(Protocol):
             environment: variables set beside those of this process.
             log: file that takes stdout and stderr, appended to.
         """
-        ...
 
 
 class LocalExecutor:
-    """Processes on this machine, forked from one that has imported torch.
-
-    Args:
-        workers: processes at a time.
-    """
+    """Processes on this machine, at most `workers` at a time."""
 
     def __init__(self, workers: int = 1) -> None:
         if workers > 1:
@@ -100,11 +93,7 @@ class LocalExecutor:
 
 
 def check_gpus(gpus: tuple[int, ...] | None) -> None:
-    """Refuse numbers of GPUs that this machine does not have, or does not show to us.
-
-    Raises:
-        InputError: naming the first.
-    """
+    """Refuse numbers of GPUs that this machine does not have, or does not show to us."""
     if gpus is None:
         return
     shown = os.environ.get(GPUS)

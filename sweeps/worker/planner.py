@@ -6,33 +6,61 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from rgbt.config.compose import with_pixels
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.compose import compose, with_pixels
 from rgbt.spec.corruption_names import row_name
+from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.specify import specify
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-from sweeps.run_specs import PlannedRun, plan_run
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a point.
+
+    Attributes:
+        key: config key, which names its folder.
+        dataset: fingerprint of its data set.
+        overrides: of `python -m rgbt.run`.
+        steps: optimizer steps.
+        pixel_factor: size of its images relative to the paper's.
+        consistency_splits: splits on which it measures its temporal consistency.
+    """
+
+    key: str
+    dataset: str
+    overrides: tuple[str, ...]
+    steps: int
+    pixel_factor: float = 1.0
+    consistency_splits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class PlannedPoint:
-    """A point with its runs.
+    """A point with its runs: one, or one per seed.
 
     Attributes:
-        point: the point.
         key: identifies the point in a study: the key of its run; of several runs or with further
             evaluations, a hash.
-        runs: one, or one per seed.
     """
 
     point: Point
     key: str
     runs: tuple[PlannedRun, ...]
 
-    @property
-    def pixel_factor(self) -> float:
-        """Size of its images relative to the paper's."""
-        return self.runs[0].pixel_factor
+
+def specify_run(overrides: Sequence[str]) -> RunSpec:
+    """The specification of one run.
+
+    Raises:
+        InputError: Hydra or a component refuses an override, in the words of the command line.
+    """
+    with composing(overrides):
+        return specify(compose(overrides), overrides)
 
 
 class Planner:
@@ -52,9 +80,7 @@ class Planner:
         Raises:
             InputError: a configuration or a data set that does not fit, in one sentence.
         """
-        runs = tuple(
-            plan_run((*self.base, *overrides), self._fingerprints) for overrides in point.runs()
-        )
+        runs = tuple(self.plan_run((*self.base, *overrides)) for overrides in point.runs())
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
             evaluations = [_identity(evaluation) for evaluation in point.evaluations]
@@ -62,6 +88,29 @@ class Planner:
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
         label = with_pixels(point.label, runs[0].pixel_factor)
         return PlannedPoint(replace(point, label=label), key, runs)
+
+    def plan_run(self, overrides: tuple[str, ...]) -> PlannedRun:
+        """Specify one run and read its data set; raises as `plan`."""
+        spec = specify_run(overrides)
+        name = json.dumps(spec.dataset.plain, sort_keys=True)
+        if name not in self._fingerprints:
+            dataset: Any = spec.dataset.build()
+            if not any(dataset.has(split) for split in dataset.splits):
+                paths = ", ".join(dict.fromkeys(dataset.splits.values()))
+                raise InputError(
+                    f"{dataset.root} holds none of the lists or files {paths} of the data set; "
+                    "name its folder with dataset.root=..."
+                )
+            self._fingerprints[name] = str(dataset.fingerprint())
+        views = spec.consistency.values
+        return PlannedRun(
+            key=spec.key,
+            dataset=self._fingerprints[name],
+            overrides=overrides,
+            steps=spec.trainer.max_steps,
+            pixel_factor=spec.scale.pixel_factor,
+            consistency_splits=tuple(views["splits"]) if views["sets"] else (),
+        )
 
 
 def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:
@@ -71,12 +120,10 @@ def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:
     has the name that it had then, so that the keys of older studies stay the same.
     """
     defaults = vars(ExtraEvaluation())
-    identity = {
-        name: value
-        for name, value in vars(evaluation).items()
-        if name in ("modality", "regions") or value != defaults[name]
-    }
-    if evaluation.corruption is None:
-        return identity
-    named = {"corruption": ("degradation", row_name(evaluation.corruption))}
-    return dict(named.get(name, (name, value)) for name, value in identity.items())
+    identity: dict[str, object] = {}
+    for name, value in vars(evaluation).items():
+        if name == "corruption" and value is not None:
+            identity["degradation"] = row_name(value)
+        elif name in ("modality", "regions") or value != defaults[name]:
+            identity[name] = value
+    return identity

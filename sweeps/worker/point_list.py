@@ -5,66 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
-from rgbt.tracking.run_result import RunResult
 from sweeps import attributes as names
 from sweeps.point import COLOUR, Point, colour, varied_keys
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
-from sweeps.worker.list_source import (
+from sweeps.worker.planner import PlannedPoint, Planner
+from sweeps.worker.progress import ProgressView
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.trial_sources import (
+    UNFINISHED,
     ListSource,
-    PointStatus,
-    State,
+    Outcome,
     finished_runs,
     is_evaluated,
     reason_of,
 )
-from sweeps.worker.owner import Owner
-from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.progress import ProgressView
-from sweeps.worker.run_monitor import training_seconds
-from sweeps.worker.run_store import RunStore
-from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
-
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
-
-UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command runs."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A point with its state and its finished runs.
-
-    Attributes:
-        point: the point.
-        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
-        reason: why it failed, or "".
-        results: its finished runs; of a waiting point, runs that lack further evaluations only.
-        keys: of its runs; () where its configuration is wrong.
-    """
-
-    point: Point
-    state: State
-    reason: str = ""
-    results: tuple[RunResult, ...] = ()
-    keys: tuple[str, ...] = ()
-
-    @property
-    def is_trained(self) -> bool:
-        """Whether it lacks further evaluations of its runs only."""
-        return self.state in UNFINISHED and bool(self.results)
-
-    @property
-    def seconds(self) -> float | None:
-        """Duration of its runs; None where one of them is unknown."""
-        each = [training_seconds(result.folder) for result in self.results]
-        return None if not each or None in each else sum(s for s in each if s is not None)
+from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
 
 
 @dataclass(frozen=True)
@@ -72,10 +33,9 @@ class PointList:
     """A named list of points.
 
     Attributes:
-        study: name of the study.
+        study: its name.
         title: shown above the progress.
         kind: "grid" or "list".
-        points: the points.
         runs: finished runs; the points' overrides name the same folder.
         base: overrides that all have.
         distributions: of the parameters of a grid, by name.
@@ -107,26 +67,24 @@ def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     planned = _PlannedPoints(points)
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
-    return planned.outcomes(lambda plan: _status(plan, trials.get(plan.key, []), points.runs))
 
+    def status(plan: PlannedPoint) -> Outcome:
+        results = finished_runs(plan, points.runs) or ()
+        if results and is_evaluated(plan, results):
+            return Outcome.of(plan, "finished", results=results)
+        same = trials.get(plan.key, [])
+        states = [trial.state.name for trial in same]
+        if "RUNNING" in states:
+            return Outcome.of(plan, "running")
+        if states and states[-1] == "FAIL":
+            return Outcome.of(plan, "failed", reason_of(same[-1]), results)
+        return Outcome.of(plan, "waiting", results=results)
 
-def _status(plan: PlannedPoint, trials: Sequence[FrozenTrial], runs: RunStore) -> PointStatus:
-    results = finished_runs(plan, runs) or ()
-    if results and is_evaluated(plan, results):
-        return PointStatus("finished", results=results)
-    states = [trial.state.name for trial in trials]
-    if "RUNNING" in states:
-        return PointStatus("running")
-    if states and states[-1] == "FAIL":
-        return PointStatus("failed", reason_of(trials[-1]), results)
-    return PointStatus("waiting", results=results)
+    return planned.outcomes(status)
 
 
 def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
-    """Run all unfinished points; a failed point does not stop the others.
-
-    Returns:
-        one outcome per point, in their order.
+    """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
 
     Raises:
         InputError: the storage or the executor cannot be used.
@@ -165,13 +123,8 @@ class _PlannedPoints:
         if self.errors and not self.plans:
             # An error of every point is one of the command and not of a point.
             raise InputError(next(iter(self.errors.values())))
-        self._merge_tags(points.study)
-
-    def _merge_tags(self, study: str) -> None:
-        """Give points of the same run in other words (1 and 1.0) the tags of all of them.
-
-        Every run gets its own colour, and the keys that vary, which begin its name.
-        """
+        # Points of the same run in other words (1 and 1.0) get the tags of all of them. Every run
+        # gets its own colour, and the keys that vary, which begin its name.
         varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}
         for plan in self.plans.values():
@@ -181,22 +134,17 @@ class _PlannedPoints:
                 values += [] if value in values else [value]
         for index, plan in self.plans.items():
             merged = {name: " | ".join(each) for name, each in tags[plan.key].items()}
-            merged |= {VARIED: varied, COLOUR: colour(study, list(tags).index(plan.key))}
+            merged |= {VARIED: varied, COLOUR: colour(points.study, list(tags).index(plan.key))}
             self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
 
-    def outcomes(self, status_of: Callable[[PlannedPoint], PointStatus]) -> list[Outcome]:
+    def outcomes(self, status_of: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:
         """One outcome per point, in order."""
-        outcomes = []
-        for index, point in enumerate(self.points):
-            if index in self.errors:
-                outcomes.append(Outcome(point, "failed", self.errors[index]))
-                continue
-            plan = self.plans[index]
-            status = status_of(plan)
-            keys = tuple(run.key for run in plan.runs)
-            outcome = Outcome(plan.point, status.state, status.reason, status.results, keys)
-            outcomes.append(outcome)
-        return outcomes
+        return [
+            Outcome(point, "failed", self.errors[index])
+            if index in self.errors
+            else status_of(self.plans[index])
+            for index, point in enumerate(self.points)
+        ]
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:

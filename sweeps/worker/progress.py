@@ -9,8 +9,8 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from statistics import median
-from types import TracebackType
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -30,26 +30,26 @@ SHORT_S = 5.0
 """A trial that took less was not trained: its runs were finished before."""
 
 
+@dataclass
 class ProgressView:
     """The progress of a driver; use as a context manager.
 
-    Args:
+    Attributes:
         title: e.g. the table.
         total: number of points; None for a search that ends by time.
         workers: processes at a time.
         count: returns the number of points done by all drivers; called every few seconds.
     """
 
-    def __init__(
-        self, title: str, total: int | None, workers: int, count: Callable[[], int]
-    ) -> None:
-        self._title = title
-        self._total = total
-        self._workers = workers
-        self._count = count
+    title: str
+    total: int | None
+    workers: int
+    count: Callable[[], int]
+
+    def __post_init__(self) -> None:
         self._ended: Counter[str] = Counter()
         self._seconds: list[float] = []
-        self._done = count()
+        self._done = self.count()
         self._counted = time.monotonic()
         self._live = Live(console=CONSOLE, refresh_per_second=4) if CONSOLE.is_terminal else None
 
@@ -58,12 +58,7 @@ class ProgressView:
             self._live.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._live is not None:
             self._live.stop()
 
@@ -95,52 +90,41 @@ class ProgressView:
             return
         now = time.monotonic()
         if now - self._counted > 5:
-            self._counted, self._done = now, self._count()
+            self._counted, self._done = now, self.count()
         rows = Table.grid(padding=(0, 2))
         room = max(SHORTEST, min(LABEL_WIDTH, CONSOLE.width - OTHER_WIDTH))
         labels = shortened([trial.plan.point.label for trial in trials], [room] * len(trials))
         for trial, label in zip(trials, labels, strict=True):
             score = "" if math.isnan(trial.score) else f"val mIoU {100 * trial.score:.2f}"
             bar = ProgressBar(total=1.0, completed=trial.done_share, width=24)
-            rows.add_row(
-                "  ",
-                Text(label),
-                bar,
-                f"{100 * trial.done_share:3.0f} %",
-                Text(trial.status),
-                score,
-            )
+            share = f"{100 * trial.done_share:3.0f} %"
+            rows.add_row("  ", Text(label), bar, share, Text(trial.status), score)
         self._live.update(Group(Text(self._headline(trials)), rows))
 
     def _headline(self, trials: Sequence[RunningTrial]) -> str:
-        of = "" if self._total is None else f" of {self._total}"
-        failed = f", {self._ended['failed']} failed" if self._ended["failed"] else ""
-        pruned = f", {self._ended['pruned']} pruned" if self._ended["pruned"] else ""
-        left = self._left(trials)
-        return f"{self._title}: {self._done}{of} done{failed}{pruned}, {len(trials)} running{left}"
+        of = "" if self.total is None else f" of {self.total}"
+        ends = ((how, self._ended[how]) for how in ("failed", "pruned"))
+        ended = "".join(f", {count} {how}" for how, count in ends if count)
+        running = f"{len(trials)} running{self._left(trials)}"
+        return f"{self.title}: {self._done}{of} done{ended}, {running}"
 
     def _left(self, trials: Sequence[RunningTrial]) -> str:
         """Estimated time left, from the trials finished so far."""
-        if self._total is None:
+        if self.total is None:
             return ""
-        shares = [trial.done_share for trial in trials]
-        each = median(self._seconds) if self._seconds else _projected(trials)
-        if each is None:
+        begun = [trial for trial in trials if trial.done_share > 0.05]
+        known = self._seconds or [trial.seconds / trial.done_share for trial in begun]
+        if not known:
             return ""
-        points = max(0, self._total - self._done - len(trials)) + sum(1 - share for share in shares)
-        return f", about {duration(points * each / self._workers)} left"
+        waiting = max(0, self.total - self._done - len(trials))
+        points = waiting + sum(1 - trial.done_share for trial in trials)
+        return f", about {duration(points * median(known) / self.workers)} left"
 
     def _say(self, text: str) -> None:
         if self._live is not None:
             self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
         else:
             CONSOLE.print(f"{time.strftime('%H:%M:%S')} {text}", markup=False, soft_wrap=True)
-
-
-def _projected(trials: Sequence[RunningTrial]) -> float | None:
-    """Estimated seconds of a point, from the progress of the running trials."""
-    shares = [(trial.seconds, trial.done_share) for trial in trials if trial.done_share > 0.05]
-    return median(seconds / share for seconds, share in shares) if shares else None
 
 
 def duration(seconds: float) -> str:

@@ -9,13 +9,10 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 
-from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import MetricLine, metric_line
 
 FULL = 1_000_000
 """Bytes; a disk with less is full."""
-
-OUT_OF_MEMORY = "the system kills what takes too much memory"
 
 
 class MetricsReader:
@@ -64,32 +61,23 @@ def failure_reason(code: int, log: Path, start: int) -> str:
         log: file with its output.
         start: where its output begins in that file, bytes.
     """
-    message = _last_message(log, start)
-    if code >= 0:
-        # Its output went to a file on the disk that may be the reason.
-        is_full = log.parent.exists() and shutil.disk_usage(log.parent).free < FULL
-        where = f"see {log}" if log.exists() else "its error is in the terminal of this command"
-        hint = f"the disk of {log.parent} is full" if is_full else where
-        return message or f"it ended with exit code {code} and no output; {hint}"
-    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    hint = f" ({OUT_OF_MEMORY})" if name == "SIGKILL" else ""
-    return f"stopped by {name}{hint}"
-
-
-def _last_message(log: Path, start: int) -> str:
-    """The last message of rgbt, or the last line of a traceback."""
-    if not log.exists():
-        return ""
-    with log.open("rb") as file:
-        file.seek(start)
-        text = file.read().decode(errors="replace")
+    if code < 0:
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+        hint = " (the system kills what takes too much memory)" if name == "SIGKILL" else ""
+        return f"stopped by {name}{hint}"
+    text = log.read_bytes()[start:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     # Libraries log tracebacks of errors that they handle: the last message counts.
     traced = "Traceback (most recent call last):" in lines
     error = r"[\w.]+(Error|Exception|Interrupt)\b" if traced else r"(?!)"
     messages = [line for line in lines if line.startswith("rgbt: ") or re.match(error, line)]
-    last = (messages or lines or [""])[-1]
-    return last.removeprefix("rgbt: ")[:300]
+    if messages or lines:
+        return (messages or lines)[-1].removeprefix("rgbt: ")[:300]
+    # Its output went to a file on the disk that may be the reason.
+    is_full = log.parent.exists() and shutil.disk_usage(log.parent).free < FULL
+    where = f"see {log}" if log.exists() else "its error is in the terminal of this command"
+    hint = f"the disk of {log.parent} is full" if is_full else where
+    return f"it ended with exit code {code} and no output; {hint}"
 
 
 def signal_lock_holder(folder: Path, number: signal.Signals) -> None:
@@ -100,9 +88,3 @@ def signal_lock_holder(folder: Path, number: signal.Signals) -> None:
     if holder and holder.group(2) == os.uname().nodename:
         with suppress(ProcessLookupError):  # it has ended meanwhile
             os.kill(int(holder.group(1)), number)
-
-
-def training_seconds(folder: Path) -> float | None:
-    """Duration of the last process of the finished run in `folder`."""
-    seconds = (read_result(folder) or {}).get("seconds_of_last_process")
-    return None if seconds is None else float(seconds)

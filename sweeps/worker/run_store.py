@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
+from omegaconf import DictConfig
+
 from rgbt.checks import InputError, RunError
+from rgbt.config.component import build
 from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
@@ -24,20 +27,19 @@ FETCHED = ".fetched"
 Answer = TypeVar("Answer")
 
 
+@dataclass
 class RunStore:
     """All finished runs that this machine can reach.
 
-    Args:
-        runs_dir: the folder of runs.
+    Attributes:
         tracking: as the configuration builds it; MLflow is searched for runs without a result here.
         fresh: ignore finished runs that other code made, so that they are trained again.
     """
 
-    def __init__(self, runs_dir: Path, tracking: Tracking, *, fresh: bool = False) -> None:
-        self.runs_dir = runs_dir
-        self.tracking = tracking
-        self.fresh = fresh
-        self._is_unreachable = False
+    runs_dir: Path
+    tracking: Tracking
+    fresh: bool = False
+    _is_unreachable: bool = field(default=False, init=False)
 
     def find(self, key: str, dataset: str) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.
@@ -45,8 +47,20 @@ class RunStore:
         Raises:
             RunError: the run folder is finished, but on other files of the data set.
         """
-        result = self._find_any(key, dataset)
-        return None if result is not None and self._is_outdated(result) else result
+        local = RunResult(self.runs_dir / key)
+        result = local if local.is_finished else self._find_remote(key, dataset)
+        if result is None:
+            return None
+        try:
+            trained_on = result.dataset
+        except InputError as error:
+            raise RunError(str(error)) from error
+        if trained_on != dataset:
+            raise RunError(
+                f"{result.folder} was made on other files of the data set ({trained_on[:8]}, now "
+                f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
+            )
+        return None if self._is_outdated(result) else result
 
     def replace_outdated(self, key: str) -> None:
         """Move a finished run that `find` ignores out of the way of a new training."""
@@ -57,26 +71,15 @@ class RunStore:
     def _is_outdated(self, result: RunResult) -> bool:
         return self.fresh and result.other_code is not None
 
-    def _find_any(self, key: str, dataset: str) -> RunResult | None:
-        """See `find`; whatever code made it."""
-        result = RunResult(self.runs_dir / key)
-        if not result.is_finished:
-            return self._find_remote(key, dataset)
-        try:
-            trained_on = result.dataset
-        except InputError as error:
-            raise RunError(str(error)) from error
-        if trained_on != dataset:
-            raise RunError(
-                f"{result.folder} was made on other files of the data set ({trained_on[:8]}, now "
-                f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
-            )
-        return result
-
     def tag(self, result: RunResult, tags: Mapping[str, str]) -> None:
         """Add MLflow tags to a finished run that lacks them."""
+
+        def set_tags(tracking: MlflowTracking) -> None:
+            for name, value in tags.items():
+                tracking.store().client.set_tag(result.run_id, name, value)
+
         if result.run_id:
-            self._with_mlflow(lambda tracking: _set_tags(tracking, result.run_id, tags))
+            self._with_mlflow(set_tags)
         elif not tags.items() <= result.tags.items():
             self._describe(RunFolder(result.folder), tags, "FINISHED")
 
@@ -167,6 +170,7 @@ def _download(tracking: MlflowTracking, result: RunResult, names: Sequence[str])
             client.download_artifacts(result.run_id, name, str(result.folder))
 
 
-def _set_tags(tracking: MlflowTracking, run_id: str, tags: Mapping[str, str]) -> None:
-    for name, value in tags.items():
-        tracking.store().client.set_tag(run_id, name, value)
+def open_run_store(config: DictConfig) -> RunStore:
+    """Finished runs in the folder of runs and in the tracker of a composed configuration."""
+    runs_dir = Path(config.runs_dir).expanduser().resolve()
+    return RunStore(runs_dir, build(config.tracking), fresh=config.fresh)

@@ -6,7 +6,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 
@@ -15,9 +15,8 @@ from rgbt.files.atomic import is_held
 from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.run_specs import PlannedRun
 from sweeps.worker.executors import GRACE_S, Job
-from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.planner import PlannedPoint, PlannedRun
 from sweeps.worker.run_monitor import MetricsReader, failure_reason, signal_lock_holder
 from sweeps.worker.run_store import RunStore
 
@@ -39,51 +38,30 @@ class TrialPruned(Exception):  # noqa: N818 - not an error, Optuna's name for it
     """The trial was pruned; the message names the step."""
 
 
-@dataclass(frozen=True)
-class ExecutionContext:
-    """What a trial needs of its driver.
+@dataclass(eq=False)
+class RunningTrial:
+    """Executes one trial; never blocks.
 
     Attributes:
         runs: finished runs.
         start: starts processes.
         timeout_s: of a run; None for no limit.
+        report: called with every validation of the first run, or None.
+        status: its present activity, in a few words.
+        score: last mIoU on the selection split, a fraction.
     """
 
+    plan: PlannedPoint
+    number: int
     runs: RunStore
     start: Start
-    timeout_s: float | None
+    timeout_s: float | None = None
+    report: PruningCallback | None = None
+    status: str = field(default="starting", init=False)
+    score: float = field(default=math.nan, init=False)
 
-
-class RunningTrial:
-    """Executes one trial; never blocks.
-
-    Args:
-        plan: its point.
-        number: of the trial.
-        context: see `ExecutionContext`.
-        report: called with every validation of the first run, or None.
-    """
-
-    def __init__(
-        self,
-        plan: PlannedPoint,
-        number: int,
-        context: ExecutionContext,
-        report: PruningCallback | None = None,
-    ) -> None:
-        self.plan = plan
-        self.number = number
-        self.began = time.monotonic()
-        self.status = "starting"
-        """Its present activity, in a few words."""
-
-        self.score = math.nan
-        """Last mIoU on the selection split, a fraction."""
-
-        self._runs = context.runs
-        self._start = context.start
-        self._timeout_s = context.timeout_s
-        self._report = report
+    def __post_init__(self) -> None:
+        self._began = time.monotonic()
         self._job: Job | None = None
         self._adopted: Path | None = None
         self._index = 0
@@ -104,7 +82,7 @@ class RunningTrial:
     @property
     def seconds(self) -> float:
         """Since it began."""
-        return time.monotonic() - self.began
+        return time.monotonic() - self._began
 
     def advance(self) -> tuple[RunResult, ...] | None:
         """Poll the processes; the finished runs when all is done, None before.
@@ -124,18 +102,18 @@ class RunningTrial:
             return self._results
         except (TrialError, TrialPruned) as end:
             self._end = end
+            raise
         except RunError as error:
             self._end = TrialError(str(error))
-        if self._end is not None:
-            raise self._end
+            raise self._end from error
         self._report_lines()
         return None
 
     def _report_lines(self) -> None:
         """Report new lines; not in the generator, which an error of the storage would end."""
         while self._unreported and not self._prune_reason:
-            assert self._report is not None, "lines are kept for a callback alone"
-            self._prune_reason = self._report(self._unreported[0])
+            assert self.report is not None, "lines are kept for a callback alone"
+            self._prune_reason = self.report(self._unreported[0])
             del self._unreported[0]
 
     def stop(self) -> None:
@@ -151,25 +129,25 @@ class RunningTrial:
     def _execute(self) -> Iterator[None]:
         for index, run in enumerate(self.plan.runs):
             self._index = index
-            result = self._runs.find(run.key, run.dataset)
+            result = self.runs.find(run.key, run.dataset)
             if result is None:
                 yield from self._train(run)
-                result = self._runs.find(run.key, run.dataset)
+                result = self.runs.find(run.key, run.dataset)
             if result is None:
                 raise TrialError(
                     f"the run ended, but not as {run.key}: its configuration, its data set or your "
                     "own code was changed during the sweep; rerun the command"
                 )
-            self._runs.tag(result, self.plan.point.tags)
+            self.runs.tag(result, self.plan.point.tags)
             for evaluation in self.plan.point.evaluations:
                 yield from self._evaluate(run, result, evaluation)
             self._results = (*self._results, result)
         self._index = len(self.plan.runs)
 
     def _train(self, run: PlannedRun) -> Iterator[None]:
-        folder = self._runs.runs_dir / run.key
+        folder = self.runs.runs_dir / run.key
         self._metrics = MetricsReader(folder)
-        self._runs.replace_outdated(run.key)
+        self.runs.replace_outdated(run.key)
         while not (folder / "result.json").exists():
             if is_held(folder / "lock"):
                 # A killed driver left it running, or it was started by hand. Its result is used
@@ -193,7 +171,7 @@ class RunningTrial:
         if result.has_counts(evaluation.path):
             return
         if result.run_id:
-            if self._runs.fetch_counts(result, evaluation.path):
+            if self.runs.fetch_counts(result, evaluation.path):
                 return
             raise TrialError(
                 f"run {result.key} was made on another machine: its further evaluations "
@@ -213,16 +191,16 @@ class RunningTrial:
         code, reason = yield from self._run(command, result.key)
         if code != 0 or not result.has_counts(evaluation.path):
             raise TrialError(reason())
-        self._runs.sync(result)
+        self.runs.sync(result)
 
     def _run(
         self, command: Sequence[str], key: str
     ) -> Generator[None, None, tuple[int, Callable[[], str]]]:
         """Run a command to its exit code, and a function that reads from its log why it failed."""
-        log = self._runs.runs_dir / LOGS / f"{key}.log"
+        log = self.runs.runs_dir / LOGS / f"{key}.log"
         begin = log.stat().st_size if log.exists() else 0
         try:
-            self._job = self._start(command, log)
+            self._job = self.start(command, log)
         except OSError as error:
             raise TrialError(f"its process could not be started ({error})") from error
         code = yield from self._wait(self._job.poll)
@@ -230,11 +208,15 @@ class RunningTrial:
 
     def _wait(self, poll: Callable[[], int | None]) -> Generator[None, None, int]:
         """Wait for an exit code, and read the metrics of the run meanwhile."""
-        limit = self._timeout_s
+        limit = self.timeout_s
         began = time.monotonic()
         while True:
             code = poll()
-            self._read_metrics()
+            lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
+            if lines:
+                self.score = lines[-1].values.get("mIoU", math.nan)
+            if self.report is not None and self._index == 0:
+                self._unreported += lines
             if code is not None:
                 return code
             if self._prune_reason:
@@ -254,14 +236,6 @@ class RunningTrial:
             if self._adopted is not None and time.monotonic() > kill_at:
                 signal_lock_holder(self._adopted, signal.SIGKILL)
             yield
-
-    def _read_metrics(self) -> None:
-        """Read new metric lines; `advance` reports those of the first run."""
-        lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
-        if lines:
-            self.score = lines[-1].values.get("mIoU", math.nan)
-        if self._report is not None and self._index == 0:
-            self._unreported += lines
 
 
 def mean_scores(results: Sequence[RunResult]) -> Mapping[str, float]:

@@ -25,6 +25,7 @@ NAME = r"[\w\-. :/]+"
 
 SCHEMES = ("sqlite", "postgresql", "postgres")
 ATTEMPTS = 8
+PAUSE_S = 0.7
 FIXED = {
     names.METRICS: "other objectives",
     names.KIND: "points of another kind",
@@ -32,7 +33,8 @@ FIXED = {
 }
 """Attributes of a study that must not change, and how messages name a change."""
 
-PAUSE_S = 0.7
+UNREACHABLE = ("connection refused", "could not translate", "authentication", "does not exist")
+"""Words of errors of a connection that no later attempt cures."""
 
 
 def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseStorage:
@@ -48,20 +50,14 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
         InputError: the storage cannot be opened, or a package for it is missing.
     """
     import optuna
+    from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     url = _checked(storage, runs_dir)
-    if url.endswith(".journal"):
-        path = Path(url).expanduser().resolve()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return _journal(path)
-    return _retry(lambda: _database(_with_driver(url)), url)
-
-
-def _journal(path: Path) -> optuna.storages.JournalStorage:
-    import optuna
-    from optuna.storages.journal import JournalFileBackend
-
+    if not url.endswith(".journal"):
+        return _retry(lambda: _database(url), url)
+    path = Path(url).expanduser().resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
     except (OSError, MemoryError):
@@ -74,11 +70,7 @@ def _journal(path: Path) -> optuna.storages.JournalStorage:
 
 
 def _checked(storage: str | None, runs_dir: Path) -> str:
-    """The address of the storage.
-
-    Raises:
-        InputError: it is none of the forms of `open_storage`, or its folder does not exist.
-    """
+    """The address of the storage; refused if it has none of the forms, or no folder."""
     url = str(runs_dir / JOURNAL) if storage is None else storage
     scheme = url.partition("://")[0].partition("+")[0]
     if not url.endswith(".journal") and ("://" not in url or scheme not in SCHEMES):
@@ -100,15 +92,13 @@ def storage_file(url: str) -> Path | None:
 def _database(url: str, *, create: bool = True) -> optuna.storages.RDBStorage:
     import optuna
 
+    scheme, mark, rest = url.partition("://")
+    if scheme in ("postgresql", "postgres"):
+        # SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install.
+        url = f"postgresql+psycopg{mark}{rest}"
     # A firewall may cut a connection that is idle while a run trains for hours.
     options = {"pool_pre_ping": True}
     return optuna.storages.RDBStorage(url, engine_kwargs=options, skip_table_creation=not create)
-
-
-def _with_driver(url: str) -> str:
-    """SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install."""
-    scheme, mark, rest = url.partition("://")
-    return f"postgresql+psycopg{mark}{rest}" if scheme in ("postgresql", "postgres") else url
 
 
 def _retry(opening: Callable[[], Opened], url: str) -> Opened:
@@ -126,16 +116,13 @@ def _retry(opening: Callable[[], Opened], url: str) -> Opened:
         except sqlalchemy.exc.ArgumentError as error:
             raise InputError(f"storage={shown}: {error}.") from error
         except Exception as error:  # Any error of the driver: a later try finds the tables.
-            if attempt == ATTEMPTS - 1 or _is_unreachable(error):
+            text = str(error).lower()
+            is_final = "connection" in text and any(word in text for word in UNREACHABLE)
+            if attempt == ATTEMPTS - 1 or is_final:
                 reason = str(error).splitlines()[0]
                 raise InputError(f"storage={shown} cannot be opened: {reason}") from error
             time.sleep(PAUSE_S * (1 + attempt))
     raise AssertionError("the last attempt returns or raises")
-
-
-def _is_unreachable(error: Exception) -> bool:
-    words = ("connection refused", "could not translate", "authentication", "does not exist")
-    return "connection" in str(error).lower() and any(w in str(error).lower() for w in words)
 
 
 def study_names(storage: optuna.storages.BaseStorage) -> list[str]:
@@ -159,7 +146,7 @@ def open_study(
         name: of the study.
         storage: its storage.
         objectives: of its trials.
-        attributes: of the study; `attributes.SIGNATURE` must not have changed.
+        attributes: of the study; those of `FIXED` must not have changed.
         sampler: of a search.
         pruner: of a search.
 
@@ -213,12 +200,10 @@ def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study |
     file = storage_file(url)
     if file is not None and not file.exists():
         return None
-    if url.endswith(".journal"):
-        opened = open_storage(storage, runs_dir)
-        return load_study(name, opened) if name in study_names(opened) else None
     try:
-        database = _database(_with_driver(url), create=False)
-        return load_study(name, database) if name in study_names(database) else None
+        is_journal = url.endswith(".journal")
+        found = open_storage(storage, runs_dir) if is_journal else _database(url, create=False)
+        return load_study(name, found) if name in study_names(found) else None
     except optuna.exceptions.StorageInternalError as error:
         if "connection" in str(error.__cause__).lower():
             raise InputError(

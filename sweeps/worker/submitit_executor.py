@@ -11,27 +11,34 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.shadowing import check_not_shadowed
-from sweeps.worker.submitit_command import Command
+from sweeps.worker.executors import GPUS, GRACE_S
 
 if TYPE_CHECKING:
     import submitit
 
 CLUSTERS = ("slurm", "local", "debug")
-
 LOCAL_OPTIONS = ("timeout_min", "setup", "max_num_timeout")
 YEAR_MIN = 365 * 24 * 60
 """Time limit of a local job: submitit's own is two minutes."""
 
-NOT_OURS = ("time", "job_name", "nodes", "ntasks_per_node", "tasks_per_node", "array_parallelism")
+NOT_OURS = {"time", "job_name", "nodes", "ntasks_per_node", "tasks_per_node", "array_parallelism"}
 """Options with a second name (timeout_min, name), or for jobs that are not one process each."""
+
+KILL_S = 600.0
+"""How long a pre-empted job waits for SLURM to end it."""
 
 PATIENCE_S = 60.0
 """How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
@@ -41,6 +48,88 @@ ASK_S = 5.0
 
 FAILED = 1
 """Exit code of a job that ended without one; its log holds the reason."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Runs ``python -m <words>`` inside a job; its exit code is the result.
+
+    Attributes:
+        environment: variables set beside those of the job; None: unset.
+        log: file that takes stdout and stderr, appended to.
+        folder: working directory.
+    """
+
+    words: tuple[str, ...]
+    environment: Mapping[str, str | None]
+    log: str
+    folder: str
+
+    def __call__(self) -> int:
+        """The exit code, negative for a signal."""
+        with Path(self.log).open("ab") as log:
+            process = self._start(log)
+        signals: list[int] = []
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            del frame
+            if not signals:
+                signals.append(number)
+                _signal(process, signal.SIGTERM)
+                killer.start()
+
+        killer = threading.Timer(GRACE_S, _signal, (process, signal.SIGKILL))
+        killer.daemon = True
+        before = signal.signal(signal.SIGTERM, stop)
+        try:
+            code = process.wait()
+        finally:
+            # An exception here is Ctrl-C, or submitit that queues the job again: the command has
+            # to be gone before it is started anew.
+            signal.signal(signal.SIGTERM, before)
+            killer.cancel()
+            _signal(process, signal.SIGTERM)
+            # submitit kills what is not gone a second after its own Ctrl-C.
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(0.4)
+            _signal(process, signal.SIGKILL)
+        if signals and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
+            # SLURM takes the node away. A job that ends before it is ended counts as done and
+            # is not queued again.
+            time.sleep(KILL_S)
+        return code
+
+    def checkpoint(self) -> submitit.helpers.DelayedSubmission:
+        """What submitit queues when the time limit is near: the same command."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+    def _start(self, log: BinaryIO) -> subprocess.Popen[bytes]:
+        wanted = {**os.environ, **self.environment}
+        # SLURM sends submitit's signal to all processes of a job, and it ends those that do not
+        # expect it; a process starts with the blocked signals of its parent.
+        signals = {signal.SIGUSR1, signal.SIGUSR2}
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+        try:
+            return subprocess.Popen(
+                [sys.executable, "-m", *self.words],
+                env={name: value for name, value in wanted.items() if value is not None},
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _signal(process: subprocess.Popen[bytes], number: int) -> None:
+    """Signal a process that leads its group, and with it the workers it has started."""
+    if process.returncode is None:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
 
 
 class SubmititExecutor:
@@ -59,7 +148,14 @@ class SubmititExecutor:
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
-        self._submitit = _submitit()
+        try:
+            import submitit
+        except ImportError as error:
+            raise InputError(
+                "executor=submitit needs a package that is not installed: "
+                "pip install 'rgbt[cluster]'."
+            ) from error
+        self._submitit = submitit
         check_not_shadowed("sweeps", in_jobs=True)
         self._cluster = str(options.get("cluster", "slurm"))
         check_choice("submitit.cluster", self._cluster, CLUSTERS)
@@ -90,15 +186,14 @@ class SubmititExecutor:
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         wanted: dict[str, str | None] = dict(environment)
-        gpus = "CUDA_VISIBLE_DEVICES"
-        if self._cluster == "slurm" and gpus in wanted:
+        if self._cluster == "slurm" and GPUS in wanted:
             raise InputError(
                 "gpus=[...] are GPUs of this machine; with executor=submitit the cluster gives "
                 "each run its own: submitit.gpus_per_node=1."
             )
         if self._cluster == "local":
             # submitit hides all GPUs from a local job that did not ask for a number of them.
-            wanted.setdefault(gpus, os.environ.get(gpus))
+            wanted.setdefault(GPUS, os.environ.get(GPUS))
         task = Command(tuple(command), wanted, str(log.resolve()), str(Path.cwd()))
         errors = self._submitit.core.utils
         try:
@@ -110,7 +205,12 @@ class SubmititExecutor:
 
     def _checked(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """Options by submitit's name without prefix."""
-        known = _known(self._submitit, self._cluster)
+        if self._cluster == "slurm":  # as submitit itself lists them
+            shared = self._submitit.AutoExecutor._valid_parameters()
+            names = shared | self._submitit.SlurmExecutor._valid_parameters()
+            known = sorted({*names, "max_num_timeout"} - NOT_OURS)
+        else:
+            known = list(LOCAL_OPTIONS) if self._cluster == "local" else []
         values = {key.removeprefix(f"{self._cluster}_"): value for key, value in options.items()}
         for key in values:
             if key not in known:
@@ -210,24 +310,6 @@ class SubmititJob:
     def _lost(self, job: submitit.Job[int], reason: str) -> int:
         _note(self._log, f"job {job.job_id} ended ({reason}); see {job.paths.stderr}.")
         return FAILED if self._ask_at is None else -signal.SIGTERM
-
-
-def _submitit() -> Any:
-    try:
-        import submitit
-    except ImportError as error:
-        raise InputError(
-            "executor=submitit needs a package that is not installed: pip install 'rgbt[cluster]'."
-        ) from error
-    return submitit
-
-
-def _known(module: Any, cluster: str) -> list[str]:
-    """Options of a cluster, as submitit itself lists them."""
-    if cluster != "slurm":
-        return list(LOCAL_OPTIONS) if cluster == "local" else []
-    names = module.AutoExecutor._valid_parameters() | module.SlurmExecutor._valid_parameters()
-    return sorted({*names, "max_num_timeout"} - set(NOT_OURS))
 
 
 def _note(log: Path, sentence: str) -> None:

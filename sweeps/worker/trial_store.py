@@ -8,15 +8,16 @@ left are enqueued in the study.
 
 from __future__ import annotations
 
+import os
 import time
 import uuid
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sweeps import attributes as names
-from sweeps.worker.owner import Owner
 
 if TYPE_CHECKING:
     import optuna
@@ -24,28 +25,61 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial, Trial
 
+HEARTBEAT_S = 20.0
+"""Seconds between two heartbeats of a driver."""
+
+STALE_S = 180.0
+"""A driver on another machine is dead after so many seconds without a heartbeat."""
+
 CLAIMING_STATES = ("RUNNING", "COMPLETE", "PRUNED")
 """States of a trial that keep a later one from claiming the same point."""
 
 
 @dataclass(frozen=True)
-class TrialClaim:
-    """A point that a driver claims.
+class Owner:
+    """The driver of a trial: one process on one machine; written as "host:pid:started".
 
     Attributes:
-        key: of the point.
-        attributes: user attributes of the trial.
-        params: of a grid, by name.
-        distributions: of the parameters.
-        replaced: numbers of earlier trials of the point that the new one replaces (failed ones, and
-            those whose runs were deleted).
+        started: when the process began, in ticks since the machine did; distinguishes it from a
+            later process with the same number.
     """
 
-    key: str
-    attributes: Mapping[str, Any]
-    params: Mapping[str, Any] = field(default_factory=dict)
-    distributions: Mapping[str, BaseDistribution] = field(default_factory=dict)
-    replaced: Collection[int] = ()
+    host: str
+    pid: int
+    started: str
+
+    @classmethod
+    def this_process(cls) -> Owner:
+        """This process."""
+        return cls(os.uname().nodename, os.getpid(), _started(os.getpid()))
+
+    @classmethod
+    def parse(cls, text: str) -> Owner:
+        """The inverse of `str`."""
+        host, pid, started = text.rsplit(":", 2)
+        return cls(host, int(pid), started)
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.pid}:{self.started}"
+
+    def is_alive(self, heartbeat: float) -> bool:
+        """Whether the driver is still running.
+
+        Args:
+            heartbeat: time of its last one, seconds since 1970; all that counts on another machine.
+        """
+        if self.host == os.uname().nodename:
+            return _started(self.pid) == self.started
+        return time.time() - heartbeat < STALE_S
+
+
+def _started(pid: int) -> str:
+    """Start of a process according to the kernel; "" if it does not exist or is a zombie."""
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return ""
+    return "" if after_name[0] in "ZX" else after_name[19]
 
 
 def counted_trials(study: optuna.Study) -> list[FrozenTrial]:
@@ -63,13 +97,7 @@ def trials_by_key(trials: Iterable[FrozenTrial]) -> dict[str, list[FrozenTrial]]
 
 
 class TrialStore:
-    """One study.
-
-    Args:
-        study: the study.
-        storage: of the study.
-        owner: this driver.
-    """
+    """One study and the driver that works on it."""
 
     def __init__(self, study: optuna.Study, storage: BaseStorage, owner: Owner) -> None:
         self.study = study
@@ -85,32 +113,42 @@ class TrialStore:
         """All trials that count by the key of their point, earlier ones first."""
         return trials_by_key(self.trials())
 
-    def claim(self, claim: TrialClaim) -> int | None:
-        """The number of a new running trial of ours; None if an earlier trial has the point."""
+    def claim(
+        self,
+        attributes: Mapping[str, Any],
+        params: Mapping[str, Any] | None = None,
+        distributions: Mapping[str, BaseDistribution] | None = None,
+        replaced: Collection[int] = (),
+    ) -> int | None:
+        """The number of a new running trial of ours; None if an earlier trial has the point.
+
+        Args:
+            attributes: user attributes of the trial, among them `attributes.KEY`.
+            params: of a grid, by name.
+            distributions: of the parameters.
+            replaced: numbers of earlier trials of the point that the new one replaces (failed ones,
+                and those whose runs were deleted).
+        """
         from optuna.trial import TrialState, create_trial
 
         token = uuid.uuid4().hex
-        attributes = {
-            **claim.attributes,
-            names.KEY: claim.key,
-            names.TOKEN: token,
-            **self._heartbeat(),
-        }
-        running = partial(create_trial, state=TrialState.RUNNING, user_attrs=attributes)
-        params, distributions = dict(claim.params), dict(claim.distributions)
+        own = {**attributes, names.TOKEN: token, **self._heartbeat()}
+        running = partial(create_trial, state=TrialState.RUNNING, user_attrs=own)
         try:
-            self.study.add_trial(running(params=params, distributions=distributions))
+            self.study.add_trial(
+                running(params=dict(params or {}), distributions=dict(distributions or {}))
+            )
         except ValueError:
             # A grid that is resumed with other values: a database keeps the first choices of a
             # parameter. The point is run all the same; only figures over parameters lack it.
             self.study.add_trial(running())
-        same = self.by_key()[claim.key]
+        same = self.by_key()[attributes[names.KEY]]
         (number,) = [trial.number for trial in same if trial.user_attrs.get(names.TOKEN) == token]
         earlier = [
             trial.number
             for trial in same
             if trial.number < number
-            and trial.number not in claim.replaced
+            and trial.number not in replaced
             and trial.state.name in CLAIMING_STATES
         ]
         if not earlier:
@@ -125,32 +163,25 @@ class TrialStore:
         trial = self.study.ask()
         self.set_attributes(trial.number, self._heartbeat())
         if names.KEY in trial.user_attrs:
-            return trial if self._is_only_trial(trial) else None
+            # Two drivers may enqueue the trial of a dead one at the same time.
+            others = [
+                other.number
+                for other in self.by_key()[trial.user_attrs[names.KEY]]
+                if other.number != trial.number
+                and (
+                    other.state.name in CLAIMING_STATES
+                    or (other.state.name == "WAITING" and other.number < trial.number)
+                )
+            ]
+            if others:
+                self.drop(trial.number, f"the same point as trial {others[0]}")
+            return None if others else trial
         before = [other for other in self.trials() if other.number < trial.number]
         # Two drivers may ask for the last one at the same time: the lower number wins.
         if total is not None and len(before) >= total:
             self.drop(trial.number, f"{total} trials were requested")
             return None
         return trial
-
-    def _is_only_trial(self, trial: Trial) -> bool:
-        """Whether an enqueued trial is the only one of its point; it is dropped if not.
-
-        Two drivers may enqueue the trial of a dead one at the same time.
-        """
-        same = self.by_key()[trial.user_attrs[names.KEY]]
-        others = [
-            other.number
-            for other in same
-            if other.number != trial.number
-            and (
-                other.state.name in CLAIMING_STATES
-                or (other.state.name == "WAITING" and other.number < trial.number)
-            )
-        ]
-        if others:
-            self.drop(trial.number, f"the same point as trial {others[0]}")
-        return not others
 
     def set_attributes(self, number: int, attributes: Mapping[str, Any]) -> None:
         """Write user attributes of an unfinished trial."""
@@ -211,15 +242,12 @@ class TrialStore:
             if trial.state.name != "RUNNING" or trial.number in executing:
                 continue
             owner = trial.user_attrs.get(names.OWNER)
-            if owner == str(self.owner):
-                yield trial
-                continue
             if owner is not None:
                 alive = Owner.parse(owner).is_alive(trial.user_attrs[names.HEARTBEAT])
             else:  # of a search: just created, or by a driver that died before its first heartbeat
                 assert trial.datetime_start is not None, "a running trial was started"
-                alive = Owner.unknown().is_alive(trial.datetime_start.timestamp())
-            if not alive:
+                alive = Owner("?", 0, "").is_alive(trial.datetime_start.timestamp())
+            if owner == str(self.owner) or not alive:
                 yield trial
 
     def _heartbeat(self) -> dict[str, Any]:

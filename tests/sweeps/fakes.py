@@ -22,20 +22,18 @@ from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.point import Point
-from sweeps.run_specs import PlannedRun
 from sweeps.settings import Objective, SweepSettings
+from sweeps.space.samplers import build_sampler
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
-from sweeps.worker import sampler_source
+from sweeps.worker import trial_sources
 from sweeps.worker.driver import Driver
-from sweeps.worker.list_source import ListSource
-from sweeps.worker.owner import STALE_S, Owner
-from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.planner import PlannedPoint, PlannedRun
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
-from sweeps.worker.sampler_source import SamplerSource
 from sweeps.worker.storage import open_study
-from sweeps.worker.trial_store import TrialStore
+from sweeps.worker.trial_sources import ListSource, SamplerSource
+from sweeps.worker.trial_store import STALE_S, Owner, TrialStore
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
@@ -50,27 +48,13 @@ GONE = Owner(Owner.this_process().host, 2**22 + 1, "1")
 
 def settings(**changes: Any) -> SweepSettings:
     """Settings of a sweep, as in study.yaml but for `changes`."""
+    none = ("storage", "gpus", "timeout_minutes", "max_failures", "study", "pruner", "trials")
     plain: dict[str, Any] = {
-        "storage": None,
-        "workers": 1,
-        "gpus": None,
-        "executor": "local",
-        "submitit": {},
-        "retries": 0,
-        "retry": "none",
-        "timeout_minutes": None,
-        "max_failures": None,
-        "wait": False,
-        "dry_run": False,
-        "study": None,
-        "params": {},
-        "points": (),
-        "space": {},
+        **dict.fromkeys((*none, "hours")),
+        **{"workers": 1, "executor": "local", "submitit": {}, "retries": 0, "retry": "none"},
+        **{"wait": False, "dry_run": False, "params": {}, "points": (), "space": {}},
         "objectives": (Objective("test/mIoU", "maximize"),),
         "sampler": {"kind": "random", "seed": 0},
-        "pruner": None,
-        "trials": None,
-        "hours": None,
         "replicates": 1,
     }
     return SweepSettings(**{**plain, **changes})
@@ -110,15 +94,9 @@ class PickyPlanner(FakePlanner):
 
 def counts(right: int = 3, dataset: str = DATASET) -> Counts:
     """One image of one region and two classes."""
-    return Counts(
-        counts=np.array([[[[right, 1], [0, 4]]]]),
-        names=("00001D",),
-        night=None,
-        classes=("road", "car"),
-        partition="ring1",
-        dataset=dataset,
-        split="test",
-    )
+    array = np.array([[[[right, 1], [0, 4]]]])
+    named = {"names": ("00001D",), "night": None, "classes": ("road", "car")}
+    return Counts(counts=array, **named, partition="ring1", dataset=dataset, split="test")
 
 
 def finish(
@@ -135,12 +113,8 @@ def finish(
     counts(dataset=dataset).save(run.path / counts_name("test"))
     run.finish(
         {
-            "name": f"fake {folder.name}",
-            "key": folder.name,
-            "dataset": dataset,
-            "steps": 4,
-            "best_step": 4,
-            "seconds_of_last_process": 2.5,
+            **{"name": f"fake {folder.name}", "key": folder.name, "dataset": dataset},
+            **{"steps": 4, "best_step": 4, "seconds_of_last_process": 2.5},
             "val": {"mIoU": 0.5} if val is None else dict(val),
             "test": {"mIoU": 0.25, "Var": 9.0} if test is None else dict(test),
         }
@@ -150,12 +124,7 @@ def finish(
 
 @dataclass
 class Call:
-    """A process that was asked for.
-
-    Attributes:
-        words: its overrides or arguments.
-        folder: of the run that it trains.
-    """
+    """A process that was asked for, and the folder of the run that it trains."""
 
     module: str
     words: tuple[str, ...]
@@ -178,20 +147,45 @@ Process = Generator[None, None, int]
 Behaviour = Callable[[Call], Process]
 
 
-def succeed(call: Call) -> Process:
-    """A run of two validations."""
-    run = RunFolder(call.folder)
-    for step in (2, 4):
+def scored(
+    *scores: float, val: float | None = None, end: Callable[[Call], Process] | None = None
+) -> Behaviour:
+    """A run with these validations that then ends, by default finished with score `val`."""
+
+    def process(call: Call) -> Process:
+        run = RunFolder(call.folder)
+        for index, score in enumerate(scores):
+            yield
+            run.append(2 * index + 2, "val", {"mIoU": score})
+        if end is not None:
+            return (yield from end(call))
+        finish(call.folder, val=None if val is None else {"mIoU": val})
+        return 0
+
+    return process
+
+
+succeed = scored(0.2, 0.4)
+"""A run of two validations."""
+
+
+def say(text: str, code: int) -> Behaviour:
+    """Says this and ends."""
+
+    def process(call: Call) -> Process:
         yield
-        run.append(step, "val", {"mIoU": step / 10})
-    finish(call.folder)
-    return 0
+        call.say(text) if text else None
+        return code
+
+    return process
 
 
-def fail(call: Call) -> Process:
-    yield
-    call.say("Traceback (most recent call last):\n  File x\nValueError: a bad day")
-    return 1
+def leave(code: int) -> Behaviour:
+    """Ends at once, says and writes nothing."""
+    return say("", code)
+
+
+fail = say("Traceback (most recent call last):\n  File x\nValueError: a bad day", 1)
 
 
 def hang(call: Call) -> Generator[None, None, NoReturn]:
@@ -199,23 +193,6 @@ def hang(call: Call) -> Generator[None, None, NoReturn]:
     RunFolder(call.folder)
     while True:
         yield
-
-
-def endless(call: Call) -> Process:
-    """A run that is validated at step 2 and gets no further until it is stopped."""
-    yield
-    RunFolder(call.folder).append(2, "val", {"mIoU": 0.2})
-    return (yield from hang(call))
-
-
-def leave(code: int) -> Behaviour:
-    """Ends at once, says and writes nothing."""
-
-    def process(call: Call) -> Process:
-        yield
-        return code
-
-    return process
 
 
 def first(*behaviours: Behaviour) -> Behaviour:
@@ -251,11 +228,7 @@ class FakeJob:
 
 
 class FakeExecutor:
-    """Makes fake processes.
-
-    Attributes:
-        calls: all that were asked for, in order.
-    """
+    """Makes fake processes; `calls` are all that were asked for, in order."""
 
     def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed) -> None:
         self.runs_dir = runs_dir
@@ -277,35 +250,26 @@ class FakeExecutor:
     def started(self) -> list[tuple[str, ...]]:
         return [call.words for call in self.calls]
 
-    def running(self) -> list[FakeJob]:
-        return [job for job in self.jobs if job.poll() is None]
+
+Look = Callable[[Sequence[RunningTrial]], None]
 
 
 class FakeView:
-    """Notes what it is told.
+    """Notes what it is told; `look` is called at every update with the works."""
 
-    Args:
-        look: called at every update with the works.
-    """
-
-    def __init__(self, look: Callable[[Sequence[RunningTrial]], None] | None = None) -> None:
-        self.begun: list[str] = []
+    def __init__(self, look: Look = lambda works: None) -> None:
         self.ends: list[tuple[str, str, str]] = []
         self.rejections: list[tuple[str, str]] = []
-        self._look = look
+        self.update = look
 
     def began(self, work: RunningTrial) -> None:
-        self.begun.append(work.plan.point.label)
+        del work
 
     def ended(self, work: RunningTrial, how: str, reason: str) -> None:
         self.ends.append((work.plan.point.label, how, reason))
 
     def rejected(self, label: str, reason: str) -> None:
         self.rejections.append((label, reason))
-
-    def update(self, works: Sequence[RunningTrial]) -> None:
-        if self._look is not None:
-            self._look(works)
 
 
 def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
@@ -320,19 +284,13 @@ def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeV
 
 @dataclass
 class Desk:
-    """A driver with all that it needs.
-
-    Attributes:
-        storage: of Optuna, opened by this driver.
-        plans: of a list; [] for a search.
-    """
+    """A driver with all that it needs; `plans` are those of a list."""
 
     driver: Driver
     store: TrialStore
     executor: FakeExecutor
     runs: RunStore
     view: FakeView
-    storage: Any
     plans: list[PlannedPoint] = field(default_factory=list)
 
     def run(self) -> Desk:
@@ -385,11 +343,12 @@ def list_desk(
 ) -> Desk:
     """A driver of a list of points."""
     wanted = settings(**changes)
-    storage = memory() if storage is None else storage
-    store = store_on(storage, owner, wanted)
+    store = store_on(memory() if storage is None else storage, owner, wanted)
     runs = RunStore(runs_dir, NoTracking())
     source = ListSource(points, store, runs, wanted, {})
-    return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
+    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
+    driver = Driver(store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
+    return Desk(driver, store, executor, runs, seen, list(source.plans.values()))
 
 
 def search_desk(
@@ -405,33 +364,17 @@ def search_desk(
     **changes: Any,
 ) -> Desk:
     """A driver of a search over x in 0..1, or over `space`."""
-    from sweeps.space.samplers import build_sampler
-
     wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
+    sampler = build_sampler({"kind": "random"}, len(wanted.objectives))
     storage = memory() if storage is None else storage
-    sampler = build_sampler("random", 0, {}, len(wanted.objectives))
     store = store_on(storage, owner, wanted, sampler=sampler, pruner=pruner)
     runs = RunStore(runs_dir, NoTracking())
     parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
-    view = view or FakeView()
-    source = SamplerSource((), parameters, store, planner or FakePlanner(), wanted, view.rejected)
-    return _desk(store, source, runs, FakeExecutor(runs_dir, behaviour), wanted, view, storage)
-
-
-def _desk(
-    store: TrialStore,
-    source: Any,
-    runs: RunStore,
-    executor: FakeExecutor,
-    wanted: SweepSettings,
-    view: FakeView | None,
-    storage: Any,
-) -> Desk:
-    view = view or FakeView()
-    seen: Any = view
-    driver = Driver(store, source, runs, executor, wanted, seen)
-    of_list = list(source.plans.values()) if isinstance(source, ListSource) else []
-    return Desk(driver, store, executor, runs, view, storage, of_list)
+    executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
+    planner = planner or FakePlanner()
+    source = SamplerSource((), parameters, store, planner, wanted, seen.rejected)
+    driver = Driver(store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
+    return Desk(driver, store, executor, runs, seen)
 
 
 @pytest.fixture
@@ -439,7 +382,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drivers that look again at once."""
     monkeypatch.setattr(drivers, "POLL_S", 0.001)
     monkeypatch.setattr(drivers, "CLAIM_S", 0.002)
-    monkeypatch.setattr(sampler_source, "PAUSE_S", 0.002)
+    monkeypatch.setattr(trial_sources, "PAUSE_S", 0.002)
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:
@@ -451,6 +394,14 @@ def until(condition: Callable[[], Any], what: str) -> Any:
             return found
         time.sleep(0.01)
     raise AssertionError(f"waited {DEADLINE_S:g} s in vain for {what}")
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process of this machine runs; a zombie does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
 
 
 HOLDER = """
@@ -468,12 +419,9 @@ with holding(Path(sys.argv[1])) as holder:
 def held_by_another(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A process of its own that trains in `folder`, as far as its lock tells; a line ends it."""
     folder.mkdir(parents=True, exist_ok=True)
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(folder / "lock")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-c", HOLDER, str(folder / "lock")]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
@@ -481,8 +429,3 @@ def held_by_another(folder: Path) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.kill()
         process.communicate()
-
-
-def let_go(process: subprocess.Popen[str]) -> None:
-    """End a process of `held_by_another` in order."""
-    process.communicate("\n")

@@ -15,7 +15,7 @@ from sweeps.point import Point
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]

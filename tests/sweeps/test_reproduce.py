@@ -7,17 +7,16 @@ from typing import Any
 
 import pytest
 
-from rgbt.checks import InputError
-from rgbt.config.options import parse, types_of
+from rgbt.config.options import types_of
 from rgbt.tracking.mlflow_store import NoTracking
-from sweeps.options import OF_THE_TABLE, Options, settings_of
 from sweeps.point import Point
 from sweeps.rendering import publish
-from sweeps.reproduce import entry
+from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
-from sweeps.worker.point_list import Outcome, PointList
+from sweeps.worker.point_list import PointList
+from sweeps.worker.trial_sources import Outcome
 from tests.commands import Call, assert_one_sentence
 from tests.sweeps.tabled import FakeResult, right
 
@@ -35,6 +34,7 @@ rows:
 """
 
 Asked = list[tuple[PointList, SweepSettings]]
+Driven = Callable[..., Asked]
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
+def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     """Put a driver in place that tells `states` in turn instead of running anything."""
 
     def drive(*states: str) -> Asked:
@@ -71,7 +71,7 @@ def _outcome(point: Point, state: str, index: int) -> Outcome:
     return Outcome(point, state, "it broke" if state == "failed" else "")  # type: ignore[arg-type]
 
 
-def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) -> None:
+def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     asked = driven("finished")
     words = ("table=my/small", "seeds=2", "workers=2", "tracking=none", "dataset.root=/x")
     code, out, err = call(entry, *words)
@@ -97,9 +97,7 @@ def test_a_whole_table(call: Call, place: Path, driven: Callable[..., Asked]) ->
     assert rows[2]["reason"] == "flow"
 
 
-def test_reproduce_table_file_is_named_by_paper(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_reproduce_table_file_is_named_by_paper(call: Call, place: Path, driven: Driven) -> None:
     asked = driven("finished")
     path = place / "elsewhere" / "mine.yaml"
     path.parent.mkdir()
@@ -109,9 +107,7 @@ def test_reproduce_table_file_is_named_by_paper(
     assert (place / "runs/tables/my/mine_demo/table.md").exists()
 
 
-def test_reproduce_failed_cell_prints_table(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_reproduce_failed_cell_prints_table(call: Call, place: Path, driven: Driven) -> None:
     driven("finished", "failed")
     code, out, err = call(entry, "table=my/small", "tracking=none", "out=here")
     assert code == 1
@@ -120,9 +116,7 @@ def test_reproduce_failed_cell_prints_table(
     assert "failed" in (place / "here" / "table.md").read_text()
 
 
-def test_cells_of_other_drivers_are_no_failure(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_cells_of_other_drivers_are_no_failure(call: Call, place: Path, driven: Driven) -> None:
     driven("finished", "running")
     code, out, err = call(entry, "table=my/small", "tracking=none")
     assert code == 0
@@ -131,7 +125,7 @@ def test_cells_of_other_drivers_are_no_failure(
 
 
 def test_reproduce_full_disk_prints_table_without_files(
-    call: Call, place: Path, driven: Callable[..., Asked], monkeypatch: pytest.MonkeyPatch
+    call: Call, place: Path, driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
@@ -144,19 +138,9 @@ def test_reproduce_full_disk_prints_table_without_files(
     assert_one_sentence(err, "No space left on device; the files were not written")
 
 
-def test_reproduce_unrunnable_table_shows_published_values(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
-    asked = driven("finished")
-    code, out, _ = call(entry, "table=spatialseg/fps", "tracking=none")
-    assert (code, asked) == (0, [])
-    assert "Cannot be run yet: " in out
-    assert (place / "runs/tables/spatialseg/fps_demo/table.md").exists()
-
-
 @pytest.mark.slow
 def test_a_table_of_sizes_runs_nothing_and_has_values(
-    call: Call, place: Path, driven: Callable[..., Asked]
+    call: Call, place: Path, driven: Driven
 ) -> None:
     """HeatNet 54,361,105 and the thesis' two heads 44,564,656 parameters at 14 classes."""
     asked = driven("finished")
@@ -175,19 +159,8 @@ def test_a_table_of_sizes_runs_nothing_and_has_values(
     assert "0 runs: none." in out
 
 
-def test_a_network_that_cannot_be_built_is_told(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
-    driven("finished")
-    words = ("table=multihead/table5", "tracking=none", "model.depths=[3]")
-    code, out, err = call(entry, *words)
-    assert code == 1
-    assert "depths" in out
-    assert_one_sentence(err, "no value although nothing is missing")
-
-
 def test_dry_run_lists_the_cells_and_writes_nothing(
-    call: Call, place: Path, driven: Callable[..., Asked]
+    call: Call, place: Path, driven: Driven
 ) -> None:
     driven("waiting", "failed")
     code, out, err = call(entry, "table=my/small", "seeds=1", "dry_run=true", "tracking=none")
@@ -202,9 +175,7 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
     assert not (place / "runs").exists()
 
 
-def test_all_tables_are_listed_and_only_listed(
-    call: Call, place: Path, driven: Callable[..., Asked]
-) -> None:
+def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: Driven) -> None:
     driven("waiting")
     code, out, _ = call(entry, "table=all", "dry_run=true", "tracking=none")
     assert code == 0
@@ -239,7 +210,7 @@ def test_all_tables_are_listed_and_only_listed(
     ],
 )
 def test_mistakes_cost_one_sentence(
-    call: Call, place: Path, driven: Callable[..., Asked], words: tuple[str, ...], sentence: str
+    call: Call, place: Path, driven: Driven, words: tuple[str, ...], sentence: str
 ) -> None:
     asked = driven("finished")
     code, _, err = call(entry, *words)
@@ -249,18 +220,3 @@ def test_mistakes_cost_one_sentence(
 
 def test_reproduce_options_are_sweep_settings() -> None:
     assert set(types_of(Options)) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
-
-
-def test_settings_of_command_have_sweeper_defaults() -> None:
-    def given(*words: str) -> SweepSettings:
-        return settings_of(parse(Options, ["table=a", *words])[0])
-
-    plain = given()
-    assert (plain.workers, plain.storage, plain.gpus, plain.submitit) == (1, None, None, {})
-    url = "postgresql://me@host/db?a=b"
-    options = (f"storage={url}", "gpus=[0,1]", "executor=submitit")
-    changed = given(*options, "submitit={cluster: slurm, timeout_min: 9}")
-    assert (changed.storage, changed.gpus) == (url, (0, 1))
-    assert changed.submitit == {"cluster": "slurm", "timeout_min": 9}
-    with pytest.raises(InputError, match="'gpus\\[0\\]' must be a whole number"):
-        given("gpus=[0")

@@ -14,7 +14,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from sweeps import attributes
-from sweeps.study import dashboard_command, entry, study_folder
+from sweeps.study import entry, study_folder
 from tests.commands import Call, assert_one_sentence
 
 
@@ -106,25 +106,6 @@ def test_the_study_is_recorded_with_its_files_and_numbers(
     assert "![" not in told["note"]
 
 
-@pytest.mark.slow
-def test_called_again_it_updates_one_run_in_mlflow(call: Call, tmp_path: Path) -> None:
-    from mlflow import MlflowClient
-
-    study = make_study(tmp_path)
-    assert call(entry, "name=search/grbm", f"runs_dir={tmp_path}")[0] == 0
-    study.tell(study.trials[-1].number, 60.0)
-    code, out, _ = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
-    assert (code, "study in MLflow" in out) == (0, True)
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
-    experiment = client.get_experiment_by_name("rgbt")
-    (run,) = client.search_runs([experiment.experiment_id])
-    assert run.data.tags["kind"] == "study"
-    assert run.data.tags["rgbt.study"] == "search/grbm"
-    assert run.data.metrics["best/val/mIoU"] == 60.0
-    files = {item.path for item in client.list_artifacts(run.info.run_id)}
-    assert {"study.md", "trials.csv", "history.png"} <= files
-
-
 def test_a_table_study_has_points_and_no_figures(
     call: Call, tmp_path: Path, recorded: list[dict[str, Any]]
 ) -> None:
@@ -156,16 +137,6 @@ def test_a_missing_storage_is_not_made(call: Call, tmp_path: Path, storage: str)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_override_is_refused_before_anything_is_drawn(
-    call: Call, tmp_path: Path
-) -> None:
-    make_study(tmp_path)
-    code, _, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}", "tracking=mlfow")
-    assert code == 2
-    assert_one_sentence(err, "there is no tracking 'mlfow'; did you mean 'mlflow'?")
-    assert not (tmp_path / "studies").exists()
-
-
 def test_folders_of_studies_are_safe_and_differ() -> None:
     runs = Path("runs")
     assert study_folder(runs, "grbm") == Path("runs/studies/grbm")
@@ -176,9 +147,3 @@ def test_folders_of_studies_are_safe_and_differ() -> None:
         assert folder.parent == Path("runs/studies")
         assert folder.name not in ("", ".", "..")
         assert len(folder.name) < 100
-
-
-def test_dashboard_command_hides_the_password() -> None:
-    assert dashboard_command(None, Path("runs")) == "optuna-dashboard runs/studies.journal"
-    command = dashboard_command("postgresql://me:secret@host/db", Path("runs"))
-    assert command == "optuna-dashboard postgresql://me:***@host/db"

@@ -13,10 +13,12 @@ from omegaconf import open_dict
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import conf_dir, register_resolvers
+from sweeps.point import Point
 from sweeps.search import Search
 from sweeps.settings import SweepSettings
 from sweeps.sweep import study_command, sweep
-from sweeps.worker.point_list import Outcome, PointList
+from sweeps.worker.point_list import PointList
+from sweeps.worker.trial_sources import Outcome
 
 
 class Asked:
@@ -110,28 +112,14 @@ def test_sweep_fresh_is_not_passed_to_runs(asked: Asked, tmp_path: Path) -> None
 
 
 def test_sweep_search_name_ignores_order(asked: Asked, tmp_path: Path) -> None:
-    interval = "masker.sigma_div=interval(1,4)"
-    budget = {"trials": 3}
-    call(tmp_path, "+experiment=grbm", interval, "seed=1", "trainer.max_steps=3", **budget)
-    call(tmp_path, "trainer.max_steps=3", "+experiment=grbm", "seed=1", interval, **budget)
-    call(
-        tmp_path,
-        "+experiment=grbm",
-        interval,
-        "seed=1",
-        "fresh=true",
-        "trainer.max_steps=3",
-        **budget,
-    )
-    objectives = [{"metric": "val/Var", "direction": "minimize"}]
-    same = ("+experiment=grbm", interval, "seed=1", "trainer.max_steps=3")
-    call(tmp_path, *same, objectives=objectives, **budget)
-    call(tmp_path, *same, replicates=2, **budget)
-    names = [wanted.study for wanted in asked.searches]
-    assert names[0] == names[1] == names[2]
-    assert len(set(names)) == 3
-    assert asked.searches[0].identity == asked.searches[2].identity
-    assert "trainer.max_steps=3" in asked.searches[0].identity
+    words = ("+experiment=grbm", "masker.sigma_div=interval(1,4)", "seed=1", "trainer.max_steps=3")
+    call(tmp_path, *words, trials=3)
+    call(tmp_path, *reversed(words), "fresh=true", trials=3)
+    call(tmp_path, *words, trials=3, replicates=2)
+    first, same, other = asked.searches
+    assert first.study == same.study != other.study
+    assert first.identity == same.identity
+    assert "trainer.max_steps=3" in first.identity
 
 
 def test_sweep_search_file_runs_are_single(asked: Asked, tmp_path: Path) -> None:
@@ -146,39 +134,19 @@ def test_sweep_search_file_runs_are_single(asked: Asked, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"trials": 3}, "hydra.sweeper.trials is for searches"),
-        ({"hours": 3}, "hydra.sweeper.hours is for searches"),
-        ({"replicates": 2}, "hydra.sweeper.replicates is for searches"),
-        ({"pruner": {"kind": "median"}}, "hydra.sweeper.pruner is for searches"),
-    ],
+    "settings",
+    [{"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": {"kind": "median"}}],
 )
-def test_what_a_grid_would_ignore_is_refused(
-    asked: Asked, tmp_path: Path, settings: dict[str, Any], said: str
+def test_sweep_search_settings_of_grid_are_refused(
+    asked: Asked, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
+    said = f"hydra.sweeper.{next(iter(settings))} is for searches"
     with pytest.raises(InputError, match=said):
         call(tmp_path, "+experiment=grbm", "seed=0,1", **settings)
     assert asked.lists == []
 
 
-def test_points_and_a_search_do_not_mix(asked: Asked, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="points and a search"):
-        call(tmp_path, "+search=grbm", points=[["seed=1"]])
-    assert asked.searches == []
-
-
-def test_one_point_is_said_to_be_one(
-    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    call(tmp_path, "+experiment=grbm")
-    assert "this is one point" in capsys.readouterr().err
-    assert len(asked.lists) == 1
-
-
 def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) -> None:
-    from sweeps.point import Point
-
     asked.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
     with pytest.raises(InputError, match="a: no such key"):
         call(tmp_path, "+experiment=grbm", "seed=0,1")
@@ -188,8 +156,6 @@ def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) 
 def test_failed_points_end_in_an_error_after_the_table(
     asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from sweeps.point import Point
-
     asked.outcomes = [
         Outcome(Point("a", ()), "finished", keys=("k1",)),
         Outcome(Point("b", ()), "failed", "out of memory", keys=("k2",)),

@@ -1,18 +1,21 @@
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import cv2
 import pytest
 
-from sweeps.evaluation import ExtraEvaluation
-from sweeps.rendering.figure import draw_table, figure_of, main_columns
-from sweeps.rendering.panel import OURS, PUBLISHED, are_far_apart
-from sweeps.table.cells import TableCell
+from sweeps.rendering.figure import (
+    OURS,
+    PUBLISHED,
+    are_far_apart,
+    draw_table,
+    figure_of,
+    main_columns,
+)
 from sweeps.table.scoring import score
 from sweeps.table.table import Column, Factor, Row
-from tests.sweeps.tabled import Made, counts_of, outcome, pairs_of, table
+from tests.sweeps.tabled import Made, counts_of, outcome, table
 
 MIOU = Column(name="mIoU", metric="mIoU")
 VAR = Column(name="Var", metric="Var", best="lowest")
@@ -78,26 +81,6 @@ def test_one_panel_per_row_for_tables_of_regions() -> None:
     assert [axes.get_title() for axes in figure.axes] == ["Car", "Bike"]
 
 
-def test_consistency_of_both_protocols_has_panels_beside_the_iou() -> None:
-    columns = (
-        Column(name="mAcc", metric="mAcc"),
-        MIOU,
-        Column(name="TC", metric="TC", frames="released"),
-        Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
-        Column(name="car", metric="class/car/TC", frames="aligned", printed=False),
-    )
-    made = {None: counts_of()} | {
-        ExtraEvaluation(frames=frames): pairs_of(6, 2, frames) for frames in ("released", "aligned")
-    }
-    rows = (Row(label="a", experiment="crm", values={"mIoU": 60.0, "TC": 34.0}),)
-    scored = score("t", table(rows, columns), {("a", 0): outcome("k", made)}, scale="demo")
-    assert main_columns(scored) == [columns[1], columns[2], columns[3]]
-    figure = figure_of(scored)
-    assert [axes.get_xlabel() for axes in figure.axes[:3]] == ["mIoU", "TC", "TC aligned"]
-    hollow = [line for line in figure.axes[2].lines if line.get_markerfacecolor() == "none"]
-    assert not hollow, "nothing is published of it"
-
-
 def test_png_holds_both_colours(tmp_path: Path) -> None:
     assert draw_table(factor_table(), tmp_path / "figure.png")
     image = cv2.imread(str(tmp_path / "figure.png"))[..., ::-1].reshape(-1, 3)
@@ -106,18 +89,15 @@ def test_png_holds_both_colours(tmp_path: Path) -> None:
         assert (image == rgb).all(1).sum() > 100
 
 
-def test_sizes_are_drawn_without_runs() -> None:
-    column = Column(name="size", parameters=True)
-    made = table((Row(label="a", values={"size": 54.4}), Row(label="b")), (column,))
-    sizes = {(label, "size"): TableCell(50.0, math.nan, 0) for label in "ab"}
-    figure = figure_of(score("own/t", made, {}, scale="demo", sizes=sizes))
-    assert figure is not None
-    assert figure.get_suptitle() == "own/t (ours: counted at scale=paper)"
-    assert [line.get_markerfacecolor() == "none" for line in figure.axes[0].lines].count(False)
-    assert figure_of(score("own/t", made, {}, scale="demo")).get_suptitle().endswith("(published)")
-
-
 def test_nothing_to_draw(tmp_path: Path) -> None:
     scored = score("t", table((Row(label="a", needs="flow"),)), {}, scale="demo")
     assert not draw_table(scored, tmp_path / "figure.png")
     assert not (tmp_path / "figure.png").exists()
+
+
+def test_main_columns_are_headlines_of_day_and_night() -> None:
+    metrics = ("mAcc", "mIoU", "night/Var", "class/car", "TC", "dawn/mIoU")
+    columns = tuple(Column(name=metric, metric=metric) for metric in metrics)
+    rows = (Row(label="a", values=dict.fromkeys(metrics, 3.0)),)
+    scored = score("t", table(rows, columns), {}, scale="demo")
+    assert [column.name for column in main_columns(scored)] == ["mIoU", "night/Var", "TC"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sweeps.rendering.preview import cells_grid, summary, tables_grid
+from sweeps.rendering.preview import cells_grid, summary
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 FRAMES = (
@@ -44,22 +44,6 @@ def test_preview_lists_each_evaluation_command_once() -> None:
         "rgbt consistency frames=next; "
         "rgbt evaluate modality=rgb 'regions=as trained'.",
     ]
-
-
-def test_preview_without_evaluations_omits_them() -> None:
-    assert len(summary(*asked((Column(name="mIoU", metric="mIoU"),)), 1)) == 2
-    wanted, _ = asked(FRAMES)
-    assert summary(wanted, [], 1) == ["0 runs: none."]
-
-
-def test_sizes_are_counted_without_a_run() -> None:
-    wanted, outcomes = asked((Column(name="size", parameters=True),))
-    assert outcomes == []
-    assert summary(wanted, [], 1) == [
-        "0 runs: none.",
-        "Column 'size' is counted at scale=paper, without any run.",
-    ]
-    assert tables_grid([(wanted, [])], 1).rows == (("own/t", "0 of 2", *"0000", "-"),)
 
 
 def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> None:

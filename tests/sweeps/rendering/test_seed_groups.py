@@ -8,7 +8,7 @@ from pathlib import Path
 from rgbt.tracking.run_result import RunResult
 from sweeps.point import Point
 from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.fakes import finish
 
 

@@ -1,4 +1,4 @@
-"""Grids and lists: Hydra's points in Hydra's order, and ranges told apart from values."""
+"""Grids and lists in Hydra's order, ranges, and a search file changed by the command line."""
 
 from __future__ import annotations
 
@@ -10,12 +10,22 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
-from sweeps.space.grid import distributions, grid_points, list_points, split
+from sweeps.space.grid import distributions, grid_points, list_points, merge_space, split
+from sweeps.space.space import parse_space
 
 LOADER = ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_dir())))
+SPATIAL = {"loss": "set_criterion_spatial"}
+SPACE = {
+    "masker.sigma_div": {"type": "float", "low": 0.5, "high": 32, "log": True},
+    "loss": {"type": "categorical", "choices": ["set_criterion", "set_criterion_spatial"]},
+    "alpha": {"type": "float", "low": 0, "high": 3, "when": SPATIAL},
+    "focus": {"type": "categorical", "choices": ["edge", "center"], "when": SPATIAL},
+    "deep": {"type": "int", "low": 0, "high": 1, "when": {"focus": "center"}},
+}
 
 
 def hydras_points(overrides: Sequence[str]) -> list[set[str]]:
@@ -43,20 +53,6 @@ def test_points_are_hydras_in_hydras_order(overrides: list[str]) -> None:
     points = grid_points(fixed, swept)
     assert [set(point.overrides) for point in points] == hydras_points(overrides)
     assert intervals == {}
-
-
-def test_a_point_has_what_differs_and_what_was_typed() -> None:
-    fixed, swept, _ = split(["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1", "~x"], LOADER)
-    assert fixed == ("+experiment=grbm", "~x")
-    assert swept == {"masker.sigma_div": ["1", "2"], "seed": ["0", "1"]}
-    first, second, third, _ = grid_points(fixed, swept)
-    assert first.overrides == ("+experiment=grbm", "~x", "masker.sigma_div=1", "seed=0")
-    assert first.params == {"masker.sigma_div": 1, "seed": 0}
-    assert (second.params["seed"], third.params) == (1, {"masker.sigma_div": 2, "seed": 0})
-
-
-def test_groups_are_globbed_from_the_configuration() -> None:
-    assert split(["metric=glob(ring*)"], LOADER)[1] == {"metric": ["ring5", "ring9"]}
 
 
 def test_intervals_are_entries_of_a_space() -> None:
@@ -131,3 +127,46 @@ def test_optuna_can_draw_a_grid() -> None:
             optuna.create_trial(params=dict(point.params), distributions=found, value=0)
         )
     assert [trial.params for trial in study.trials] == [point.params for point in points]
+
+
+def test_without_a_word_the_file_stands() -> None:
+    node = OmegaConf.create(SPACE)
+    assert merge_space(node, ["seed=1"], {}, {}) == parse_space(SPACE)
+
+
+def test_values_and_ranges_replace_an_entry_in_its_place() -> None:
+    found = merge_space(
+        SPACE,
+        [],
+        {"masker.sigma_div": ["1", "2.5"], "seed": ["0", "1"]},
+        {"alpha": {"type": "float", "low": 1.0, "high": 2.0, "log": False}},
+    )
+    assert [one.key for one in found] == [*SPACE, "seed"]
+    sigma, _, alpha, *_ = found
+    assert (sigma.type, sigma.choices) == ("categorical", (1, 2.5))
+    assert (alpha.low, alpha.high) == (1.0, 2.0)
+    assert alpha.when == (("loss", ("set_criterion_spatial",)),)
+
+
+def test_a_fixed_key_is_not_searched() -> None:
+    found = merge_space(SPACE, ["masker.sigma_div=4", "alpha=2"], {}, {})
+    assert [one.key for one in found] == ["loss", "focus", "deep"]
+
+
+@pytest.mark.parametrize(
+    ("fixed", "left"),
+    [
+        ("loss=set_criterion", ["masker.sigma_div"]),
+        ("loss=set_criterion_spatial", ["masker.sigma_div", "alpha", "focus", "deep"]),
+        ("focus=edge", ["masker.sigma_div", "loss", "alpha"]),
+        ("focus=center", ["masker.sigma_div", "loss", "alpha", "deep"]),
+    ],
+)
+def test_a_fixed_key_decides_the_conditions_on_it(fixed: str, left: list[str]) -> None:
+    assert [one.key for one in merge_space(SPACE, [fixed], {}, {})] == left
+
+
+def test_merge_space_invalid_file_raises_despite_override() -> None:
+    wrong = {**SPACE, "masker.sigma_div": {"type": "flaot"}}
+    with pytest.raises(InputError, match="did you mean 'float'"):
+        merge_space(wrong, ["masker.sigma_div=4"], {}, {})

@@ -43,11 +43,8 @@ def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None
     settings = read_settings(sweeper)
     assert settings.trials
     assert settings.space
-    sampler = dict(settings.sampler)
-    objectives = len(settings.objectives)
-    build_sampler(sampler.pop("kind"), sampler.pop("seed"), sampler, objectives)
-    pruner = {"kind": "none"} if settings.pruner is None else dict(settings.pruner)
-    build_pruner(pruner.pop("kind"), pruner, objectives)
+    build_sampler(settings.sampler, len(settings.objectives))
+    build_pruner(settings.pruner, len(settings.objectives))
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -78,9 +75,3 @@ def test_ranges_hold_the_published_values() -> None:
     released = flatten(compose("+experiment=crm"))
     for parameter in parse_space(space_of("loss")):
         assert parameter.low < released[parameter.key] < parameter.high
-
-
-def test_another_experiment_can_be_chosen() -> None:
-    config = compose("+search=grbm", "experiment=grbm_released")
-    assert (config.name, config.masker.sampler) == ("grbm_released", "gaussian_count")
-    assert compose("+search=grbm", "masker=crm").masker.sampler == "uniform"

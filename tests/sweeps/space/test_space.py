@@ -96,11 +96,6 @@ def test_a_key_is_the_key_of_an_override(key: str) -> None:
         parse_space({key: FLOAT})
 
 
-def test_a_key_may_add_to_the_configuration() -> None:
-    (parameter,) = parse_space({"+experiment": {"type": "categorical", "choices": ["grbm"]}})
-    assert as_overrides({parameter.key: "grbm"}) == ("+experiment=grbm",)
-
-
 def test_conditions_need_all_their_parameters() -> None:
     parameters = parse_space(
         {
@@ -122,24 +117,6 @@ def test_conditions_need_all_their_parameters() -> None:
         "n",
         "deep",
     ]
-
-
-def test_optuna_is_told_the_ranges() -> None:
-    space = {
-        "f": FLOAT,
-        "s": {"type": "float", "low": 0, "high": 1, "step": 0.25},
-        "i": {"type": "int", "low": 1, "high": 64, "log": True},
-        "c": {"type": "categorical", "choices": [None, 1.5, "a b"]},
-    }
-    study = optuna.create_study()
-    suggest(study.ask(), parse_space(space))
-    distributions = study.trials[0].distributions
-    assert distributions == {
-        "f": optuna.distributions.FloatDistribution(0.5, 32.0, log=True),
-        "s": optuna.distributions.FloatDistribution(0.0, 1.0, step=0.25),
-        "i": optuna.distributions.IntDistribution(1, 64, log=True),
-        "c": optuna.distributions.CategoricalDistribution((None, 1.5, "a b")),
-    }
 
 
 def test_lists_are_text_to_optuna_and_lists_to_hydra() -> None:
@@ -204,15 +181,6 @@ def test_patch_sizes_follow_the_scale() -> None:
     assert overrides == ("masker.patch_size=${px:64}",)
     assert compose("+experiment=grbm", *overrides).masker.patch_size == 32
     assert compose("+experiment=grbm", "scale=paper", *overrides).masker.patch_size == 64
-
-
-def test_a_group_is_a_parameter() -> None:
-    trial = optuna.trial.FixedTrial({"loss": "set_criterion_spatial", "loss.spatial.alpha": 1.25})
-    overrides = as_overrides(
-        suggest(trial, parse_space({"loss": LOSS, "loss.spatial.alpha": ALPHA}))
-    )
-    assert overrides == ("loss=set_criterion_spatial", "loss.spatial.alpha=1.25")
-    assert compose("+experiment=grbm", *overrides).loss.spatial.alpha == 1.25
 
 
 @dataclass

@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
 
 from rgbt.checks import InputError
 from sweeps.reproduce import entry
@@ -42,20 +41,6 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
     assert len(table.rows) == 4
     assert table.factor is None
     assert table.rows[0].x is None
-
-
-def test_new_table_text_values_and_equal_key_ends(tmp_path: Path) -> None:
-    path = write_new("groups", "grbm", ["masker=grbm_paper,grbm_released"], tmp_path)
-    assert [row["label"] for row in yaml.safe_load(path.read_text())["rows"]] == [
-        "masker=grbm_paper",
-        "masker=grbm_released",
-    ]
-    write_new("alike", "grbm", ["scale.lr=0.1,0.2", "recipe.lr=0.1,0.2"], tmp_path)
-    assert load_table("alike", tmp_path).rows[1].label == "scale.lr=0.1 recipe.lr=0.2"
-    write_new("near", "grbm", ["masker.sigma_div=2,3"], tmp_path)
-    factor = load_table("near", tmp_path).factor
-    assert factor is not None
-    assert factor.axis == "linear"
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from sweeps.run_specs import million_parameters
-from sweeps.table.parameter_counts import parameter_cells
-from sweeps.table.request import TableRequest
+from sweeps.table.request import TableRequest, million_parameters, parameter_cells
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import table
 

@@ -4,10 +4,10 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.options import Options, request_of
+from sweeps.reproduce import Options, request_of
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
-from sweeps.worker.point_list import Outcome
+from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -55,13 +55,6 @@ def test_points_at_paper_scale_use_user_overrides() -> None:
     )
 
 
-def test_regions_of_the_table_are_evaluated_for_every_modality() -> None:
-    assert wanted(regions="ring9").points()[0].evaluations == (
-        ExtraEvaluation("default", "ring9"),
-        ExtraEvaluation("thermal", "ring9"),
-    )
-
-
 def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
     columns = (
         Column(name="mIoU", metric="mIoU"),
@@ -78,24 +71,6 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         )
 
 
-def test_points_evaluate_columns_of_their_rows() -> None:
-    columns = (
-        Column(name="rgb", metric="mIoU"),
-        Column(name="thermal", metric="mIoU", modality="thermal"),
-        Column(name="ring", metric="TC", frames="aligned"),
-    )
-    rows = (
-        Row(label="a", experiment="crm", without=("thermal",)),
-        Row(label="b", experiment="grbm", without=("thermal",)),
-        Row(label="c", experiment="grbm", without=("ring",)),
-        Row(label="later", experiment="crm", needs="flow"),
-    )
-    asked = TableRequest("own/t", table(rows, columns), "demo", (0,))
-    thermal, frames = ExtraEvaluation("thermal"), ExtraEvaluation(frames="aligned")
-    assert [point.evaluations for point in asked.points()] == [(frames,), (thermal, frames)]
-    assert asked.evaluations() == (thermal, frames)
-
-
 def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
     columns = (
         Column(name="night", metric="night/mIoU"),
@@ -108,22 +83,6 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
     alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
     assert (alone.row_seeds(), alone.points(), alone.runs([])) == ([], [], {})
     assert alone.models() == set()
-
-
-def test_failing_images_are_evaluated_apart() -> None:
-    columns = (
-        Column(name="mIoU", metric="mIoU"),
-        Column(name="no thermal", metric="mIoU", corruption="removed:thermal"),
-        Column(name="noisy", metric="mIoU", corruption="noise", severity=16),
-        Column(name="noisier", metric="Var", corruption="noise", severity=32),
-        Column(name="loss", minus=("noisier", "noisy")),
-    )
-    asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
-    assert asked.points()[0].evaluations == (
-        ExtraEvaluation(corruption="removed:thermal"),
-        ExtraEvaluation(corruption="noise", severity=16),
-        ExtraEvaluation(corruption="noise", severity=32),
-    )
 
 
 def test_outcomes_go_back_to_their_cells() -> None:

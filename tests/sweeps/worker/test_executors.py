@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
@@ -21,7 +20,7 @@ from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker import executors
 from sweeps.worker.executors import Job, LocalExecutor, check_gpus
-from tests.sweeps.fakes import DEADLINE_S, until
+from tests.sweeps.fakes import DEADLINE_S, is_alive, until
 
 MODULE = """
 import json, os, signal, subprocess, sys, time
@@ -31,6 +30,11 @@ assert __name__ == "__main__"
 what, place = sys.argv[1], Path(sys.argv[2])
 print("said", what, flush=True)
 print("complained", file=sys.stderr, flush=True)
+
+def note(text):
+    place.with_suffix(".new").write_text(text)
+    place.with_suffix(".new").rename(place)
+
 if what == "tell":
     facts = {
         "argv": sys.argv[1:],
@@ -48,17 +52,13 @@ if what == "raise":
 if what == "kill":
     os.kill(os.getpid(), int(sys.argv[3]))
 if what in ("stay", "stubborn"):
-    quiet = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)"
-    code = quiet if what == "stubborn" else "import time; time.sleep(600)"
-    if what == "stubborn":
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    child = subprocess.Popen([sys.executable, "-c", code])
-    place.with_suffix(".new").write_text(f"{os.getpid()} {child.pid}")
-    place.with_suffix(".new").rename(place)
+    ignore = "signal.signal(signal.SIGTERM, signal.SIG_IGN);" if what == "stubborn" else ""
+    exec(ignore)
+    code = f"import signal, time; {ignore} time.sleep(600)"
+    note(f"{os.getpid()} {subprocess.Popen([sys.executable, '-c', code]).pid}")
     time.sleep(600)
 if what == "wait":
-    place.with_suffix(".new").write_text(str(os.getpid()))
-    place.with_suffix(".new").rename(place)
+    note(str(os.getpid()))
     while not place.with_suffix(".go").exists():
         time.sleep(0.01)
     place.with_suffix(".done").touch()
@@ -105,28 +105,9 @@ def start(executor: LocalExecutor, tmp_path: Path) -> Iterator[Start]:
             code(job)
 
 
-def code(job: Job) -> int:
-    found: list[int | None] = []
-
-    def ended() -> bool:
-        found.append(job.poll())
-        return found[-1] is not None
-
-    until(ended, "the end of a process")
-    assert found[-1] is not None
-    return found[-1]
-
-
-def log(tmp_path: Path) -> str:
-    return (tmp_path / "logs" / "log").read_text()
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state not in "ZX"
+def code(job: Job) -> int | None:
+    until(lambda: job.poll() is not None, "the end of a process")
+    return job.poll()
 
 
 def pids(place: Path) -> tuple[int, ...]:
@@ -137,8 +118,7 @@ def pids(place: Path) -> tuple[int, ...]:
 def test_local_executor_passes_arguments_and_environment(start: Start, tmp_path: Path) -> None:
     place = tmp_path / "facts"
     assert code(start("tell", str(place), "a b=[1,2]", environment={"GIVEN": "it"})) == 0
-    facts = json.loads(place.read_text())
-    assert facts == {
+    assert json.loads(place.read_text()) == {
         "argv": ["tell", str(place), "a b=[1,2]"],
         "command": ["-m", "tiny_run", "tell", str(place), "a b=[1,2]"],
         "given": "it",
@@ -149,6 +129,7 @@ def test_local_executor_passes_arguments_and_environment(start: Start, tmp_path:
     assert "GIVEN" not in os.environ
     assert code(start("tell", str(place))) == 0
     assert json.loads(place.read_text())["given"] is None, "nothing stays from run to run"
+    assert (tmp_path / "logs" / "log").read_text().count("said tell") == 2, "the log is appended to"
 
 
 @pytest.mark.parametrize(
@@ -162,32 +143,20 @@ def test_local_executor_passes_arguments_and_environment(start: Start, tmp_path:
     ],
     ids=["in order", "exit code", "exception", "killed", "crash"],
 )
-def test_how_a_process_ended_is_known(
+def test_local_job_returns_exit_code_and_logs(
     start: Start, tmp_path: Path, words: tuple[str, ...], expected: int
 ) -> None:
     job = start(*words)
     assert code(job) == expected
-    assert job.poll() == expected
     job.stop()  # too late, and no harm
     assert job.poll() == expected
-    said = log(tmp_path)
+    said = (tmp_path / "logs" / "log").read_text()
     assert said.startswith(f"said {words[0]}\n")
     assert "complained\n" in said
     assert ("ValueError: a bad day" in said) == (words[0] == "raise")
 
 
-def test_the_log_is_appended_to(start: Start, tmp_path: Path) -> None:
-    for number in "12":
-        code(start("leave", "x", number))
-    assert log(tmp_path).count("said leave") == 2
-
-
-def test_local_executor_missing_module_is_logged(executor: LocalExecutor, tmp_path: Path) -> None:
-    assert code(executor.start(("no_such_module",), {}, tmp_path / "log")) == 1
-    assert "No module named no_such_module" in (tmp_path / "log").read_text()
-
-
-def test_a_stop_ends_a_process_with_its_children(start: Start, tmp_path: Path) -> None:
+def test_stop_ends_process_with_its_children(start: Start, tmp_path: Path) -> None:
     job = start("stay", str(tmp_path / "pids"))
     mine, child = pids(tmp_path / "pids")
     assert job.poll() is None
@@ -196,7 +165,7 @@ def test_a_stop_ends_a_process_with_its_children(start: Start, tmp_path: Path) -
     until(lambda: not is_alive(mine) and not is_alive(child), "the end of both")
 
 
-def test_what_does_not_stop_is_killed_with_its_children(
+def test_stop_kills_after_grace_with_children(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = start("stubborn", str(tmp_path / "pids"))
@@ -209,47 +178,28 @@ def test_what_does_not_stop_is_killed_with_its_children(
     until(lambda: not is_alive(child), "the end of the child")
 
 
-def test_a_second_stop_gives_no_more_time(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    job = start("stubborn", str(tmp_path / "pids"))
-    pids(tmp_path / "pids")
-    monkeypatch.setattr(executors, "GRACE_S", 0.05)
-    job.stop()
-    monkeypatch.setattr(executors, "GRACE_S", 10 * DEADLINE_S)
-    job.stop()
-    assert code(job) == -signal.SIGKILL
+DRIVER = """
+import sys, time
+from pathlib import Path
+from sweeps.worker import executors
 
-
-def test_local_executor_process_ignores_terminal_ctrl_c(start: Start, tmp_path: Path) -> None:
-    start("stay", str(tmp_path / "pids"))
-    mine, _ = pids(tmp_path / "pids")
-    assert os.getsid(mine) == os.getpgid(mine) == mine
-    assert os.getpgid(mine) != os.getpgid(0)
-
-
-DRIVER = textwrap.dedent("""
-    import sys, time
-    from pathlib import Path
-    from sweeps.worker import executors
-
-    if __name__ == "__main__":
-        sys.path.insert(0, sys.argv[1])
-        executors.PRELOADED, executors.own_modules = (), list
-        folder = Path(sys.argv[2])
-        job = executors.LocalExecutor().start(("tiny_run", "wait", str(folder / "pid")), {},
-                                              folder / "log")
-        try:
-            while True:
-                job.poll()
-                time.sleep(0.01)
-        except KeyboardInterrupt:
-            print("interrupted", job.poll(), flush=True)
-            job.stop()
-            while job.poll() is None:
-                time.sleep(0.01)
-            print("stopped", job.poll(), flush=True)
-""")
+if __name__ == "__main__":
+    sys.path.insert(0, sys.argv[1])
+    executors.PRELOADED, executors.own_modules = (), list
+    folder = Path(sys.argv[2])
+    command = ("tiny_run", "wait", str(folder / "pid"))
+    job = executors.LocalExecutor().start(command, {}, folder / "log")
+    try:
+        while True:
+            job.poll()
+            time.sleep(0.01)
+    except KeyboardInterrupt:
+        print("interrupted", job.poll(), flush=True)
+        job.stop()
+        while job.poll() is None:
+            time.sleep(0.01)
+        print("stopped", job.poll(), flush=True)
+"""
 
 
 @pytest.fixture
@@ -271,7 +221,7 @@ def driver(module: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-def test_ctrl_c_reaches_the_driver_alone(driver: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_ctrl_c_reaches_driver_alone(driver: subprocess.Popen[str], tmp_path: Path) -> None:
     (pid,) = pids(tmp_path / "pid")
     os.killpg(driver.pid, signal.SIGINT)  # what a terminal does
     told, _ = driver.communicate(timeout=DEADLINE_S)
@@ -279,9 +229,7 @@ def test_ctrl_c_reaches_the_driver_alone(driver: subprocess.Popen[str], tmp_path
     assert not is_alive(pid)
 
 
-def test_a_run_goes_on_when_its_driver_is_killed(
-    driver: subprocess.Popen[str], tmp_path: Path
-) -> None:
+def test_run_continues_when_driver_is_killed(driver: subprocess.Popen[str], tmp_path: Path) -> None:
     (pid,) = pids(tmp_path / "pid")
     os.killpg(driver.pid, signal.SIGKILL)  # the fork server goes with it
     driver.wait()
@@ -292,20 +240,10 @@ def test_a_run_goes_on_when_its_driver_is_killed(
     until(lambda: not is_alive(pid), "its end")
 
 
-def test_what_is_loaded_beforehand_can_be_loaded() -> None:
+def test_preloaded_modules_exist_and_commands_are_not_among_them() -> None:
     """A misspelt name would be left out in silence, and every run would take seconds longer."""
-    import importlib.util
-
     assert all(importlib.util.find_spec(name) is not None for name in executors.PRELOADED)
-    assert "forkserver" in multiprocessing.get_all_start_methods()
-
-
-def test_commands_are_not_preloaded() -> None:
-    evaluations = (
-        ExtraEvaluation(),
-        ExtraEvaluation(frames="aligned"),
-        ExtraEvaluation(frames="next"),
-    )
+    evaluations = (ExtraEvaluation(), ExtraEvaluation(frames="aligned"))
     called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
     assert called == set(executors.COMMANDS)
     assert not called & set(executors.own_modules())
@@ -314,24 +252,25 @@ def test_commands_are_not_preloaded() -> None:
 @pytest.mark.parametrize(
     ("shown", "gpus", "sentence"),
     [
-        ("2,3", (3, 5), "gpus=[3, 5]: there is no GPU 5, CUDA_VISIBLE_DEVICES=2,3 shows the GPUs"),
+        ("2,3", (3, 5), "there is no GPU 5, CUDA_VISIBLE_DEVICES=2,3 shows the GPUs"),
         ("", (0,), "there is no GPU 0, CUDA_VISIBLE_DEVICES= shows no GPU; omit gpus."),
         (None, (0, 99), "there is no GPU "),
+        ("2,3", (3, 2), None),
+        ("2,3", None, None),
     ],
 )
-def test_gpus_that_are_not_there_are_refused(
-    monkeypatch: pytest.MonkeyPatch, shown: str | None, gpus: tuple[int, ...], sentence: str
+def test_check_gpus_refuses_hidden_ones(
+    monkeypatch: pytest.MonkeyPatch,
+    shown: str | None,
+    gpus: tuple[int, ...] | None,
+    sentence: str | None,
 ) -> None:
-    if shown is None:
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    else:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if shown is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    with pytest.raises(InputError) as told:
+    if sentence is None:
         check_gpus(gpus)
-    assert sentence in str(told.value)
-    check_gpus(None)
-
-
-def test_gpus_that_are_shown_may_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
-    check_gpus((3, 2))
+        return
+    with pytest.raises(InputError) as error:
+        check_gpus(gpus)
+    assert sentence in str(error.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,60 +35,50 @@ def planner(base: tuple[str, ...]) -> Planner:
 
 
 def test_plan_uses_run_key_of_command(planner: Planner, base: tuple[str, ...]) -> None:
-    plan = planner.plan(Point("p", ("seed=3",)))
+    label = "patch_size=${px:64}"
+    plan = planner.plan(Point(label, ("seed=3", f"masker.{label}")))
     (run,) = plan.runs
-    assert run.key == plan.key == specify(compose([*base, "seed=3"])).key
-    assert run.overrides == (*base, "seed=3")
-    assert run.steps == 6
-    assert plan.point.label == "p"
+    assert run.key == plan.key == specify(compose([*base, *plan.point.overrides])).key
+    assert run.overrides == (*base, *plan.point.overrides)
+    assert (run.steps, run.pixel_factor, plan.point.label) == (6, 0.5, "patch_size=32")
+    assert planner.plan(Point("p", plan.point.overrides[1:], seeds=(3,))).key == plan.key
 
 
-def test_plan_label_shows_scaled_pixels(planner: Planner) -> None:
-    point = Point("patch_size=${px:64}", ("masker.patch_size=${px:64}",))
-    plan = planner.plan(point)
-    assert (plan.point.label, plan.pixel_factor) == ("patch_size=32", 0.5)
+THERMAL = ExtraEvaluation("thermal", "ring9")
+AS_TRAINED = {"modality": "default", "regions": "as trained"}
 
 
-def test_plan_keys_depend_on_seeds_and_evaluations(planner: Planner) -> None:
-    single = planner.plan(Point("p", ("seed=1",)))
-    both = planner.plan(Point("p", (), seeds=(0, 1)))
-    assert [run.overrides[-1] for run in both.runs] == ["seed=0", "seed=1"]
-    assert both.runs[1].key == single.key
-    assert len({run.key for run in both.runs}) == 2
-    one = planner.plan(Point("p", (), seeds=(1,)))
-    assert one.key == single.key
-
-    ring, thermal = ExtraEvaluation(regions="ring9"), ExtraEvaluation("thermal")
-    evaluated = [
-        planner.plan(Point("p", ("seed=1",), evaluations=each))
-        for each in ((), (ring,), (thermal,), (ring, thermal))
-    ]
-    assert len({plan.key for plan in (*evaluated, both)}) == 5
-    assert {plan.runs[0].key for plan in evaluated} == {single.key}
-    assert all(len(plan.key) == 12 for plan in (*evaluated, both))
-
-
-def test_plan_keys_of_older_studies_are_unchanged(
+@pytest.mark.parametrize(
+    ("seeds", "evaluations", "identities"),
+    [
+        ((0, 1), (), []),
+        ((1,), (THERMAL,), [{"modality": "thermal", "regions": "ring9"}]),
+        ((1,), (ExtraEvaluation(frames="aligned"),), [{**AS_TRAINED, "frames": "aligned"}]),
+        (
+            (1,),
+            (ExtraEvaluation(corruption="removed:rgb"), ExtraEvaluation(head="own")),
+            [{**AS_TRAINED, "degradation": "rgb_removed"}, {**AS_TRAINED, "head": "own"}],
+        ),
+        (
+            (1,),
+            (ExtraEvaluation(corruption="noise", severity=8),),
+            [{**AS_TRAINED, "degradation": "noise", "severity": 8}],
+        ),
+    ],
+    ids=["seeds", "modality", "frames", "two", "severity"],
+)
+def test_plan_key_hashes_runs_and_evaluations(
     planner: Planner,
+    seeds: tuple[int, ...],
+    evaluations: tuple[ExtraEvaluation, ...],
+    identities: list[dict[str, Any]],
 ) -> None:
-    plan = planner.plan(Point("p", ("seed=1",), evaluations=(ExtraEvaluation("thermal", "ring9"),)))
-    parts = [[plan.runs[0].key], [{"modality": "thermal", "regions": "ring9"}]]
-    assert plan.key == hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
-    framed = [
-        planner.plan(Point("p", ("seed=1",), evaluations=(ExtraEvaluation(frames=frames),)))
-        for frames in (None, "aligned", "released")
-    ]
-    assert len({plan.key for plan in framed}) == 3
-    failing = [
-        planner.plan(Point("p", ("seed=1",), evaluations=(asked,)))
-        for asked in (
-            ExtraEvaluation(),
-            ExtraEvaluation(corruption="noise", severity=8),
-            ExtraEvaluation(corruption="noise", severity=16),
-        )
-    ]
-    assert len({plan.key for plan in failing}) == 3
-    assert failing[0].key == framed[0].key
+    """Keys of older studies stay what they were."""
+    plan = planner.plan(Point("p", (), seeds=seeds, evaluations=evaluations))
+    keys = [planner.plan(Point("p", (f"seed={seed}",))).key for seed in seeds]
+    assert [run.key for run in plan.runs] == keys
+    text = json.dumps([keys, identities])
+    assert plan.key == hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> None:
@@ -117,13 +108,6 @@ def test_what_does_not_fit_is_told_in_one_sentence(
         planner.plan(Point("p", (override,)))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_data_set_without_lists_is_told(planner: Planner, tmp_path: Path) -> None:
-    for name in ("images", "labels"):
-        (tmp_path / "empty" / name).mkdir(parents=True)
-    with pytest.raises(InputError, match="holds none of the lists"):
-        planner.plan(Point("p", (f"dataset.root={tmp_path / 'empty'}",)))
 
 
 def test_a_survey_writes_nothing_and_knows_what_is_there(

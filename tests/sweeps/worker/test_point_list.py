@@ -13,19 +13,13 @@ from rgbt.checks import InputError
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import code
 from rgbt.tracking.run_result import RunResult
-from sweeps.evaluation import ExtraEvaluation
-from sweeps.point import COLOUR, Point, colour, varied_keys
+from sweeps.point import COLOUR, Point, colour
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.point_list import (
-    Outcome,
-    PointList,
-    estimated_seconds,
-    other_code_line,
-    preview_points,
-)
+from sweeps.worker.point_list import PointList, estimated_seconds, other_code_line, preview_points
 from sweeps.worker.run_store import RunStore
-from tests.sweeps.fakes import counts, finish, plan_of, settings
+from sweeps.worker.trial_sources import Outcome
+from tests.sweeps.fakes import finish, plan_of, settings
 
 
 def made(folder: Path, seconds: float) -> Outcome:
@@ -34,39 +28,12 @@ def made(folder: Path, seconds: float) -> Outcome:
     return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
 
 
-def test_estimated_seconds_is_median_over_workers(
-    tmp_path: Path,
-) -> None:
+def test_estimated_seconds_is_median_over_workers(tmp_path: Path) -> None:
     known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
     left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
     assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
     assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
     assert estimated_seconds(left, 1) is None
-
-
-def test_estimated_seconds_ignores_trained_points(tmp_path: Path) -> None:
-    trained = replace(made(tmp_path / "a", 40), state="waiting")
-    failed = replace(made(tmp_path / "b", 20), state="failed")
-    waiting = Outcome(Point("q", ()), "waiting")
-    assert [each.is_trained for each in (trained, failed, waiting)] == [True, True, False]
-    assert not made(tmp_path / "c", 1).is_trained
-    assert estimated_seconds([trained, failed, waiting], 1) == 30.0
-    assert estimated_seconds([trained], 1) == 0.0
-
-
-def test_a_survey_tells_what_lacks_further_evaluations_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(point_list, "Planner", OneKey)
-    aligned = ExtraEvaluation(frames="aligned")
-    point = Point("a", ("x=1",), evaluations=(aligned,))
-    run = finish(tmp_path / plan_of(point).runs[0].key)
-    (outcome,) = preview_points(wanted(tmp_path, point), settings())
-    assert (outcome.state, outcome.is_trained, outcome.seconds) == ("waiting", True, 2.5)
-    (run.path / "evaluations").mkdir()
-    counts().save(run.path / aligned.path)
-    (outcome,) = preview_points(wanted(tmp_path, point), settings())
-    assert (outcome.state, outcome.is_trained) == ("finished", False)
 
 
 class OneKey:
@@ -95,13 +62,6 @@ def test_points_that_are_one_run_share_their_tags(
     prepared = point_list._PlannedPoints(wanted(tmp_path, *rows))
     first, second = (plan.point.tags for plan in prepared.plans.values())
     assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
-
-
-def test_varied_keys_are_those_not_shared() -> None:
-    words = [("+e=a", f"+y={y}", f"seed={seed}") for y in (1, 2) for seed in (0, 1)]
-    points = [Point(str(index), each) for index, each in enumerate(words)]
-    assert varied_keys(points) == ["y", "seed"]
-    assert varied_keys(points[:1]) == varied_keys([]) == []
 
 
 def test_colours_of_a_grid_are_distinct() -> None:
@@ -140,3 +100,11 @@ def test_point_list_all_points_wrong_raises(
     ]
     assert states == ["failed", "waiting"]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_estimated_seconds_ignores_trained_points(tmp_path: Path) -> None:
+    trained = replace(made(tmp_path / "a", 40), state="waiting")
+    waiting = Outcome(Point("q", ()), "waiting")
+    assert [each.is_trained for each in (trained, waiting)] == [True, False]
+    assert estimated_seconds([trained, waiting], 1) == 40.0
+    assert estimated_seconds([trained], 1) == 0.0

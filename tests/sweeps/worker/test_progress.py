@@ -73,7 +73,7 @@ def test_progress_in_terminal_prints_failures_only(console: Make) -> None:
     text = console(True)
     view = ProgressView("table", 4, 2, lambda: 1)
     with view:
-        one: Any = Shown(score=0.5)
+        one: Any = Shown("fresh=[decoder] files=[/data/a]", score=0.5)
         view.began(one)
         view.update(works(one))
         drawn = view._live.get_renderable()  # type: ignore[union-attr]
@@ -81,7 +81,7 @@ def test_progress_in_terminal_prints_failures_only(console: Make) -> None:
         probe.print(drawn)
         seen = probe.file.getvalue()  # type: ignore[attr-defined]
         assert "table: 1 of 4 done, 1 running, about" in seen
-        assert "Ny/4 seed=1" in seen
+        assert "fresh=[decoder] files=[/data/a]" in seen
         assert "50 %" in seen
         assert "training" in seen
         assert "val mIoU 50.00" in seen
@@ -91,7 +91,7 @@ def test_progress_in_terminal_prints_failures_only(console: Make) -> None:
         headline = view._headline([])
         assert headline.startswith("table: 4 of 4 done, 1 failed, 1 pruned, 0 running")
     assert "a bad day" in text.getvalue()
-    assert "finished Ny/4" not in text.getvalue()
+    assert "finished fresh" not in text.getvalue()
 
 
 def test_progress_time_left_uses_finished_trials(console: Make) -> None:
@@ -106,20 +106,6 @@ def test_progress_time_left_uses_finished_trials(console: Make) -> None:
     assert ProgressView("search", None, 2, lambda: 0)._left(works(Shown())) == ""
 
 
-def test_what_other_drivers_finished_is_counted_now_and_then(
-    console: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    console(True)
-    done = [1]
-    with ProgressView("table", 10, 2, lambda: done[0]) as view:
-        done[0] = 7
-        assert view._headline([]).startswith("table: 1 of 10")
-        later = progress.time.monotonic() + 60
-        monkeypatch.setattr(progress.time, "monotonic", lambda: later)
-        view.update([])
-        assert view._headline([]).startswith("table: 7 of 10")
-
-
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [(0, "0 s"), (89.4, "89 s"), (90, "2 min"), (3600, "60 min"), (5400, "1 h 30 min"),
@@ -127,13 +113,3 @@ def test_what_other_drivers_finished_is_counted_now_and_then(
 )  # fmt: skip
 def test_durations_are_read_by_people(seconds: float, text: str) -> None:
     assert duration(seconds) == text
-
-
-@pytest.mark.parametrize("label", ["fresh=[decoder]", "files=[/data/a]"])
-def test_a_label_with_brackets_is_shown_as_it_is(console: Make, label: str) -> None:
-    console(True)
-    with ProgressView("table", 4, 2, lambda: 1) as view:
-        view.update(works(Shown(label)))
-        probe = Console(file=io.StringIO(), width=160)
-        probe.print(view._live.get_renderable())  # type: ignore[union-attr]
-        assert label in probe.file.getvalue()  # type: ignore[attr-defined]

@@ -9,16 +9,13 @@ from typing import Any
 
 import pytest
 
-from rgbt.checks import InputError, RunError
-from rgbt.metrics import names, scores
-from rgbt.metrics.names import in_percent
+from rgbt.checks import RunError
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.run_files import read_result
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.run_specs import open_run_store
 from sweeps.worker.run_store import FETCHED, RunStore
 from tests.sweeps.fakes import DATASET, counts, finish
 
@@ -49,64 +46,6 @@ def test_find_run_on_other_data_raises(runs: RunStore) -> None:
         runs.find("a", DATASET)
 
 
-def test_scores_are_in_percent_except_var(
-    tmp_path: Path,
-) -> None:
-    val = {"mIoU": 0.512345678, "Var": 9.25, "day/mIoU": 0.5, "day/Var": 4.0, "class/car": None}
-    finish(tmp_path / "a", val=val, test={"region/1": 0.1, "class/car": 0.25, "mAcc": 1.0})
-    assert RunResult(tmp_path / "a").scores() == pytest.approx(
-        {
-            "val/mIoU": 51.2345678,
-            "val/Var": 9.25,
-            "val/day/mIoU": 50.0,
-            "val/day/Var": 4.0,
-            "test/region/1": 10.0,
-            "test/class/car": 25.0,
-            "test/mAcc": 100.0,
-        },
-        abs=1e-12,
-    )
-
-
-def test_in_percent_scales_every_score_except_var() -> None:
-    for name in scores.summary(counts(), "released"):
-        factor = 1 if name.split("/")[-1] == names.VAR else 100
-        assert in_percent(name, 0.123456) == pytest.approx(factor * 0.123456)
-
-
-def test_counts_of_evaluations_have_own_files(
-    tmp_path: Path,
-) -> None:
-    finish(tmp_path)
-    found = RunResult(tmp_path)
-    assert found.counts().counts[0, 0, 0, 0] == 3
-    ring = ExtraEvaluation("thermal", "ring9")
-    assert found.folder / ring.path == tmp_path / "evaluations" / "table_thermal_ring9.npz"
-    assert Path(ExtraEvaluation().path).name == "table_default_as-trained.npz"
-    with pytest.raises(InputError, match="no file of counts"):
-        found.counts(ring.path)
-    ring_file = found.folder / ring.path
-    ring_file.parent.mkdir()
-    counts(right=7).save(ring_file)
-    assert found.counts(ring.path).counts[0, 0, 0, 0] == 7
-
-
-def test_commit_is_of_first_process_with_change_mark(tmp_path: Path) -> None:
-    run = finish(tmp_path)
-    found = RunResult(tmp_path)
-    assert found.commit is None
-    run.add_provenance({"git_commit": "0123456789abcdef", "git_dirty": False})
-    assert found.commit == "0123456789"
-    run.add_provenance({"git_commit": "f" * 16, "git_dirty": True})
-    assert found.commit == "0123456789"
-    (tmp_path / "provenance.json").write_text(
-        json.dumps([{"git_commit": "0123456789abcdef", "git_dirty": True}])
-    )
-    assert found.commit == "0123456789+"
-    (tmp_path / "provenance.json").write_text(json.dumps([{"git_commit": None}]))
-    assert found.commit is None
-
-
 def tags_of(folder: Path) -> dict[str, str]:
     return dict(json.loads((folder / "run.json").read_text())["tags"])
 
@@ -132,12 +71,6 @@ def test_a_stopped_run_says_why(runs: RunStore) -> None:
     assert tags_of(runs.runs_dir / "a")["rgbt.stopped"] == "pruned at step 2"
     runs.mark_stopped("nothing began", "pruned at step 2")
     assert not (runs.runs_dir / "nothing began").exists()
-
-
-def test_mark_stopped_ignores_finished_run(runs: RunStore) -> None:
-    finish(runs.runs_dir / "a")
-    runs.mark_stopped("a", "pruned at step 2")
-    assert "rgbt.stopped" not in tags_of(runs.runs_dir / "a")
 
 
 def test_run_store_unreachable_mlflow_warns_once(
@@ -167,19 +100,6 @@ def test_run_store_unreachable_mlflow_warns_once(
     assert told[0].startswith("rgbt: MLflow cannot be used (no route to);")
     assert "rgbt sync" in told[0]
     assert asked == [DEAD_STORE], "asked once, then left alone"
-
-
-def test_runs_are_opened_where_a_configuration_says(tmp_path: Path) -> None:
-    from omegaconf import OmegaConf
-
-    node = {"_target_": "rgbt.tracking.mlflow_store.NoTracking"}
-    config: Any = OmegaConf.create(
-        {"runs_dir": f"{tmp_path}/x/../runs", "tracking": node, "fresh": True}
-    )
-    runs = open_run_store(config)
-    assert runs.runs_dir == tmp_path.resolve() / "runs"
-    assert isinstance(runs.tracking, NoTracking)
-    assert runs.fresh
 
 
 class Machines:
@@ -240,16 +160,6 @@ def test_find_fetches_remote_run_from_mlflow(machines: Machines) -> None:
     # What was fetched is kept: no store is needed any more.
     away = RunStore(here.runs_dir, NoTracking())
     assert away.find("a", DATASET) == found
-
-
-@pytest.mark.slow
-def test_tag_keeps_existing_tags_in_mlflow(machines: Machines) -> None:
-    made = machines.send("b")
-    there = machines.runs("there")
-    there.tag(RunResult(made.path), {"rgbt.table/two": "other row"})
-    tags = machines.tags(made)
-    assert (tags["rgbt.table/one"], tags["rgbt.table/two"]) == ("row", "other row")
-    assert tags["rgbt.dataset"] == DATASET
 
 
 @pytest.mark.slow

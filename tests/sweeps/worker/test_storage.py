@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,18 +17,10 @@ from sweeps.worker.storage import (
     load_study,
     open_storage,
     open_study,
-    study_names,
 )
 
 UP = (Objective("test/mIoU", "maximize"),)
 BOTH = (*UP, Objective("test/Var", "minimize"))
-
-
-def test_open_storage_default_is_journal_in_runs_dir(tmp_path: Path) -> None:
-    storage = open_storage(None, tmp_path / "runs")
-    open_study("study", storage, UP, {})
-    assert (tmp_path / "runs" / "studies.journal").is_file()
-    assert study_names(open_storage(None, tmp_path / "runs")) == ["study"]
 
 
 @pytest.mark.parametrize("named", ["{}/deep/one.journal", "sqlite:///{}/two.db"])
@@ -71,9 +62,7 @@ def test_open_storage_error_hides_password(tmp_path: Path, monkeypatch: pytest.M
     assert "secret" not in str(error.value)
 
 
-def test_open_storage_retries_while_tables_are_created(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_open_storage_retries_while_tables_are_created(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stores, "PAUSE_S", 0.0)
     tries: list[int] = []
 
@@ -143,13 +132,6 @@ def test_open_study_with_other_attributes_raises(tmp_path: Path) -> None:
         open_study("study", storage, UP, {names.KIND: "list"})
 
 
-def test_open_study_of_other_kind_raises(tmp_path: Path) -> None:
-    storage = open_storage(None, tmp_path)
-    open_study("study", storage, UP, {names.KIND: "list"})
-    with pytest.raises(InputError, match="study"):
-        open_study("study", storage, UP, {names.KIND: "search", names.SIGNATURE: "a"})
-
-
 def test_load_study_unknown_name_lists_studies(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
     with pytest.raises(InputError, match="no study 'x'; the storage holds none"):
@@ -166,14 +148,6 @@ def test_looking_for_a_study_makes_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_find_study_in_every_kind_of_storage(tmp_path: Path) -> None:
-    for named in (None, f"{tmp_path}/x/one.journal", f"sqlite:///{tmp_path}/two.db"):
-        open_study("study", open_storage(named, tmp_path), UP, {})
-        found: Any = find_study("study", named, tmp_path)
-        assert found.study_name == "study"
-        assert find_study("another", named, tmp_path) is None
-
-
 def test_a_journal_in_the_home_folder_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,10 +155,3 @@ def test_a_journal_in_the_home_folder_is_found(
     open_study("study", open_storage("~/one.journal", tmp_path), UP, {})
     assert (tmp_path / "one.journal").is_file()
     assert find_study("study", "~/one.journal", tmp_path) is not None
-
-
-def test_a_name_that_mlflow_cannot_show_is_refused(tmp_path: Path) -> None:
-    storage = open_storage(None, tmp_path)
-    with pytest.raises(InputError, match="MLflow takes names"):
-        open_study('a "b"', storage, UP, {})
-    open_study("table/my-1: x_2.0", storage, UP, {})

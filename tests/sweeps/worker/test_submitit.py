@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,9 +14,10 @@ import pytest
 pytest.importorskip("submitit")
 
 from rgbt.checks import InputError
-from sweeps.worker import submitit_command
+from sweeps.worker import submitit_executor
 from sweeps.worker.submitit_executor import FAILED, SubmititExecutor, SubmititJob
 from tests.sweeps import fake_slurm
+from tests.sweeps.fakes import is_alive, until
 
 WORK = """
 import os, signal, sys, time
@@ -37,7 +37,6 @@ Path(here, f"{word}.end").touch()
 code = int(rest[-1])
 os.kill(os.getpid(), -code) if code < 0 else sys.exit(code)
 """
-LIMIT_S = 60
 
 
 class Place:
@@ -70,27 +69,13 @@ def place(tmp_path: Path) -> Place:
     return Place(tmp_path, {"cluster": "local"})
 
 
-def until(condition: Callable[[], Any]) -> Any:
-    """What `condition` answers once it is true."""
-    end = time.monotonic() + LIMIT_S
-    while not (found := condition()):
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.02)
-    return found
+def code(job: SubmititJob) -> int | None:
+    until(lambda: job.poll() is not None, "the end of a job")
+    return job.poll()
 
 
-def code(job: SubmititJob) -> int:
-    until(lambda: job.poll() is not None)
-    result = job.poll()
-    assert result is not None
-    return result
-
-
-def is_gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
+def began(place: Place, word: str) -> tuple[int, int]:
+    return until(lambda: place.begun(word), f"the begin of {word}")[0]
 
 
 def test_submitit_job_returns_exit_code_and_logs(place: Place) -> None:
@@ -102,42 +87,13 @@ def test_submitit_job_returns_exit_code_and_logs(place: Place) -> None:
     assert [code(job) for job in jobs] == [0, 3, -9], "told again when asked again"
 
 
-def test_starting_and_asking_do_not_wait_for_the_command(place: Place) -> None:
-    job = place.start("slow", "wait", "0")
-    until(lambda: place.begun("slow"))
-    assert job.poll() is None
-    (place.folder / "slow.go").touch()
-    assert code(job) == 0
-
-
-@pytest.mark.slow
-def test_submitit_two_slots_limit_unfinished_jobs(place: Place) -> None:
-    left = [f"job{index}" for index in range(6)]
-    running: dict[str, SubmititJob] = {}
-    at_once, codes = [], []
-    while left or running:
-        while left and len(running) < 2:
-            word = left.pop(0)
-            running[word] = place.start(word, "wait", "0")
-        for word in running:
-            until(lambda word=word: place.begun(word))
-        begun = {path.stem for path in place.folder.glob("*.begun")}
-        ended = {path.stem for path in place.folder.glob("*.end")}
-        at_once.append(len(begun - ended))
-        oldest = next(iter(running))
-        (place.folder / f"{oldest}.go").touch()
-        codes.append(code(running.pop(oldest)))
-    assert codes == [0] * 6
-    assert max(at_once) == 2
-
-
 def test_stop_ends_the_command_and_no_other(place: Place) -> None:
     stopped, other = place.start("stopped", "wait", "0"), place.start("other", "wait", "0")
-    process, _ = until(lambda: place.begun("stopped"))[0]
-    until(lambda: place.begun("other"))
+    process, _ = began(place, "stopped")
+    began(place, "other")
     stopped.stop()
     assert code(stopped) == -signal.SIGTERM
-    assert is_gone(process)
+    assert not is_alive(process)
     assert other.poll() is None
     (place.folder / "other.go").touch()
     assert code(other) == 0
@@ -145,21 +101,14 @@ def test_stop_ends_the_command_and_no_other(place: Place) -> None:
     assert other.poll() == 0, "stopping what is finished changes nothing"
 
 
-def test_a_job_stopped_before_it_began_ends(place: Place) -> None:
-    job = place.start("early", "wait", "0")
-    job.stop()
-    assert code(job) != 0
-    assert all(is_gone(process) for process, _ in place.begun("early"))
-
-
 def test_submitit_killed_job_is_logged(place: Place) -> None:
     killed, other = place.start("killed", "wait", "0"), place.start("other", "wait", "0")
-    process, parent = until(lambda: place.begun("killed"))[0]
+    process, parent = began(place, "killed")
     os.kill(parent, signal.SIGKILL)
     os.kill(process, signal.SIGKILL)
     assert code(killed) == FAILED
     assert "ended (no result" in place.log("killed").read_text()
-    until(lambda: place.begun("other"))
+    began(place, "other")
     (place.folder / "other.go").touch()
     assert code(other) == 0
 
@@ -167,7 +116,7 @@ def test_submitit_killed_job_is_logged(place: Place) -> None:
 def signalled(place: Place) -> SubmititJob:
     """A job that got submitit's signal, which SLURM sends before it takes the node away."""
     job = place.start("long", "last", "0")
-    process, parent = until(lambda: place.begun("long"))[0]
+    process, parent = began(place, "long")
     status = Path(f"/proc/{process}/status").read_text()
     blocked = int(status.partition("SigBlk:")[2].split()[0], 16)
     assert blocked >> (signal.SIGUSR2 - 1) & 1, "SLURM signals every process of a job"
@@ -180,7 +129,7 @@ def test_submitit_preempted_command_is_requeued(tmp_path: Path, timeout_min: int
     place = Place(tmp_path, {"cluster": "local", "timeout_min": timeout_min})
     assert code(signalled(place)) == 0
     assert len(place.begun("long")) == 2
-    assert is_gone(place.begun("long")[0][0])
+    assert not is_alive(place.begun("long")[0][0])
 
 
 def test_a_job_that_reached_its_limit_too_often_fails(tmp_path: Path) -> None:
@@ -188,7 +137,7 @@ def test_a_job_that_reached_its_limit_too_often_fails(tmp_path: Path) -> None:
     place = Place(tmp_path, options)
     assert code(signalled(place)) == FAILED
     assert len(place.begun("long")) == 1
-    assert is_gone(place.begun("long")[0][0])
+    assert not is_alive(place.begun("long")[0][0])
     assert "timed-out too many times" in place.log("long").read_text()
 
 
@@ -226,14 +175,6 @@ def test_wrong_options_are_told_in_a_sentence(
     assert sentence in str(error.value)
 
 
-def test_without_submitit_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "submitit", None)
-    with pytest.raises(InputError, match=r"pip install 'rgbt\[cluster\]'"):
-        SubmititExecutor(tmp_path, {"cluster": "local"})
-
-
 def test_debug_runs_inside_the_driver(tmp_path: Path) -> None:
     place = Place(tmp_path, {"cluster": "debug"})
     before = signal.getsignal(signal.SIGTERM)
@@ -259,23 +200,21 @@ class Away(SimpleNamespace):
         return 5
 
 
-def test_a_result_that_is_late_is_waited_for(tmp_path: Path) -> None:
-    paths = SimpleNamespace(result_pickle=tmp_path / "result", stderr=tmp_path / "err")
-    job = SubmititJob(Away(paths=paths, job_id="8", state="COMPLETED"), tmp_path / "log", "slurm")
-    assert job.poll() is None
-    assert job.poll() is None
-    paths.result_pickle.touch()
-    assert job.poll() == 5
-    assert not (tmp_path / "log").exists()
-
-
-def test_a_result_that_never_comes_fails_with_the_state(tmp_path: Path) -> None:
+@pytest.mark.parametrize("comes", [True, False])
+def test_late_result_is_waited_for(tmp_path: Path, comes: bool) -> None:
     paths = SimpleNamespace(result_pickle=tmp_path / "result", stderr=tmp_path / "err")
     away = Away(paths=paths, job_id="8", state="OUT_OF_MEMORY")
     job = SubmititJob(away, tmp_path / "log", "slurm")
-    job._patience_s = 0.0
-    assert job.poll() == FAILED
-    assert "job 8 ended (no result, state OUT_OF_MEMORY)" in (tmp_path / "log").read_text()
+    assert job.poll() is None
+    assert job.poll() is None
+    if comes:
+        paths.result_pickle.touch()
+        assert job.poll() == 5
+        assert not (tmp_path / "log").exists()
+    else:
+        job._patience_s = 0.0
+        assert job.poll() == FAILED
+        assert "(no result, state OUT_OF_MEMORY)" in (tmp_path / "log").read_text()
 
 
 @pytest.fixture
@@ -325,23 +264,14 @@ def test_slurm_stop_cancels_and_waits_for_the_end(
     monkeypatch.setattr("sweeps.worker.submitit_executor.ASK_S", 0.2)
     job, other = slurm.start("one", "wait", "0"), slurm.start("two", "wait", "0")
     job._patience_s = 0.5
-    process, _ = until(lambda: slurm.begun("one"))[0]
+    process, _ = began(slurm, "one")
     job.stop()
     assert code(job) == -signal.SIGTERM
-    assert is_gone(process)
+    assert not is_alive(process)
     assert "state CANCELLED" in slurm.log("one").read_text()
-    until(lambda: slurm.begun("two"))
+    began(slurm, "two")
     (slurm.folder / "two.go").touch()
     assert code(other) == 0
-
-
-@pytest.mark.slow
-def test_a_node_that_fails_is_noticed(slurm: Place) -> None:
-    (state(slurm) / "silent").touch()
-    job = slurm.start("one", "0")
-    job._patience_s = 0.5
-    assert code(job) == FAILED
-    assert "state NODE_FAIL" in slurm.log("one").read_text()
 
 
 def test_a_job_that_slurm_takes_away_leaves_no_result(
@@ -350,12 +280,12 @@ def test_a_job_that_slurm_takes_away_leaves_no_result(
     """A result would end the job for submitit, and SLURM would queue it again in vain."""
     waited: list[float] = []
     monkeypatch.setenv("SUBMITIT_EXECUTOR", "slurm")
-    monkeypatch.setattr(submitit_command.time, "sleep", waited.append)
+    monkeypatch.setattr(submitit_executor.time, "sleep", waited.append)
     (tmp_path / "kill.py").write_text("import os, signal; os.kill(os.getppid(), signal.SIGTERM)")
     words = ("kill",)
-    task = submitit_command.Command(words, {}, str(tmp_path / "log"), str(tmp_path))
+    task = submitit_executor.Command(words, {}, str(tmp_path / "log"), str(tmp_path))
     task()
-    assert waited == [submitit_command.KILL_S]
+    assert waited == [submitit_executor.KILL_S]
     monkeypatch.setenv("SUBMITIT_EXECUTOR", "local")
     task()
-    assert waited == [submitit_command.KILL_S]
+    assert waited == [submitit_executor.KILL_S]

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import optuna
 import pytest
 from optuna.distributions import IntDistribution
 
 from sweeps import attributes as names
 from sweeps.space.samplers import build_sampler
-from sweeps.worker.owner import STALE_S, Owner
 from sweeps.worker.storage import open_storage
-from sweeps.worker.trial_store import TrialClaim, TrialStore
+from sweeps.worker.trial_store import STALE_S, Owner, TrialStore
 from tests.sweeps.fakes import DEAD, GONE, memory, silent, store_on
+
+HOST = os.uname().nodename
 
 
 @pytest.fixture
@@ -26,7 +29,7 @@ def store() -> TrialStore:
 
 
 def claim(store: TrialStore, key: str = "k", **more: Any) -> int | None:
-    return store.claim(TrialClaim(key, {names.LABEL: f"point {key}"}, **more))
+    return store.claim({names.KEY: key, names.LABEL: f"point {key}"}, **more)
 
 
 def trial(store: TrialStore, number: int) -> Any:
@@ -39,7 +42,7 @@ def states(store: TrialStore) -> list[str]:
 
 def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
     """The store of a search; every driver has a study object and a sampler of its own."""
-    return store_on(storage, owner, sampler=build_sampler("random", 0, {}, 1))
+    return store_on(storage, owner, sampler=build_sampler({"kind": "random"}))
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
@@ -55,21 +58,25 @@ def stale_trials(store: TrialStore, *mine: int) -> list[int]:
     return [each.number for each in store.stale_trials(mine)]
 
 
+def at_once(works: list[Callable[[], None]]) -> None:
+    threads = [threading.Thread(target=work) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
 def test_claim_adds_running_trial_with_attributes(store: TrialStore) -> None:
-    number = claim(store, params={"x": 3}, distributions={"x": IntDistribution(0, 9)})
-    assert number == 0
+    assert claim(store, params={"x": 3}, distributions={"x": IntDistribution(0, 9)}) == 0
     found = trial(store, 0)
-    assert found.state.name == "RUNNING"
-    assert found.params == {"x": 3}
+    assert (found.state.name, found.params) == ("RUNNING", {"x": 3})
     assert found.user_attrs[names.KEY] == "k"
     assert found.user_attrs[names.LABEL] == "point k"
     assert found.user_attrs[names.OWNER] == str(Owner.this_process())
     assert abs(found.user_attrs[names.HEARTBEAT] - time.time()) < 60
 
 
-def test_claim_of_running_point_is_dropped(
-    store: TrialStore,
-) -> None:
+def test_claim_of_running_point_is_dropped(store: TrialStore) -> None:
     assert claim(store) == 0
     assert claim(store) is None
     assert claim(store, "other") == 2
@@ -88,14 +95,6 @@ def test_claim_of_finished_point_requires_replaced(store: TrialStore, how: str) 
     assert claim(store, replaced=[0]) == 2
 
 
-def test_a_failed_trial_does_not_keep_its_point(store: TrialStore) -> None:
-    claim(store)
-    store.fail(0, "a bad day", {names.SECONDS: 3})
-    assert claim(store) == 1
-    assert trial(store, 0).user_attrs[names.REASON] == "a bad day"
-    assert trial(store, 0).user_attrs[names.SECONDS] == 3
-
-
 def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
     where = {"journal": str(tmp_path / "s.journal"), "sqlite": f"sqlite:///{tmp_path / 's.db'}"}
     return lambda: open_storage(where[kind], tmp_path)
@@ -105,21 +104,16 @@ def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
 def test_claim_by_two_drivers_succeeds_once_per_point(tmp_path: Path, kind: str, keys: str) -> None:
     opened = opener(tmp_path, kind)
     stores = [store_on(opened()) for _ in range(2)]
-    got: list[list[str]] = [[], []]
-    at_once = threading.Barrier(2)
+    got: list[str] = []
+    barrier = threading.Barrier(2)
 
-    def work(index: int) -> None:
+    def work(store: TrialStore) -> None:
         for key in keys:
-            at_once.wait()
-            if claim(stores[index], key) is not None:
-                got[index].append(key)
+            barrier.wait()
+            got.extend(key for _ in "k" if claim(store, key) is not None)
 
-    threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(got[0] + got[1]) == list(keys)
+    at_once([lambda store=store: work(store) for store in stores])  # type: ignore[misc]
+    assert sorted(got) == list(keys)
     assert states(stores[0]) == ["RUNNING"] * len(keys)
 
 
@@ -135,29 +129,12 @@ def test_ask_by_three_drivers_respects_total(tmp_path: Path, kind: str, total: i
             if asked is not None:
                 drawn.append(asked.suggest_float("x", 0, 1))
 
-    threads = [threading.Thread(target=work, args=(store,)) for store in stores]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert states(stores[0]) == ["RUNNING"] * total, "none was told: running ones count"
+    at_once([lambda store=store: work(store) for store in stores])  # type: ignore[misc]
+    assert states(stores[0]) == ["RUNNING"] * total
     assert len(set(drawn)) == len(drawn) == total
 
 
-def test_running_trials_of_other_drivers_count_in_the_total() -> None:
-    storage = memory()
-    mine, theirs = searching(storage), searching(storage, DEAD)
-    taken(theirs)
-    taken(mine)
-    assert mine.ask(2) is None
-    assert theirs.ask(2) is None
-    assert len(mine.study.trials) == 2, "none was made to be dropped"
-    assert mine.ask(3) is not None
-
-
-def test_ask_last_trial_goes_to_lower_number(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) -> None:
     storage = memory()
     mine, theirs = searching(storage), searching(storage, DEAD)
     ask = mine.study.ask
@@ -171,7 +148,7 @@ def test_ask_last_trial_goes_to_lower_number(
     assert [each.number for each in mine.trials()] == [0]
 
 
-def test_the_last_sign_of_a_driver_is_renewed() -> None:
+def test_heartbeat_renews_trial() -> None:
     storage = memory()
     store = store_on(storage, DEAD)
     claim(store)
@@ -180,39 +157,34 @@ def test_the_last_sign_of_a_driver_is_renewed() -> None:
     assert stale_trials(store_on(storage)) == []
 
 
-def test_heartbeat_of_finished_trial_is_ignored(store: TrialStore) -> None:
-    claim(store)
-    store.complete(0, [1.0], {})
-    store.send_heartbeat([0])
-    store.fail(0, "too late", {})
-    store.complete(0, [2.0], {})
-    assert trial(store, 0).state.name == "COMPLETE"
-    assert trial(store, 0).values == [1.0]
-    assert names.REASON not in trial(store, 0).user_attrs
-
-
-def test_update_unfinished_raises_other_errors(store: TrialStore) -> None:
+def test_finish_twice_keeps_first_end(store: TrialStore) -> None:
     claim(store)
     with pytest.raises(ValueError, match="did not match the number of the objectives"):
         store.complete(0, [1.0, 2.0], {})
+    store.complete(0, [1.0], {})
+    store.send_heartbeat([0])
+    store.fail(0, "too late", {})
+    store.release(0, "its driver was stopped", requeue=True)
+    assert (states(store), trial(store, 0).values) == (["COMPLETE"], [1.0])
+    assert names.REASON not in trial(store, 0).user_attrs
 
 
 @pytest.mark.parametrize(
     ("owner", "seconds", "is_gone"),
-    [
-        (GONE, 0.0, True),
-        (DEAD, STALE_S / 2, False),
-        (DEAD, 2 * STALE_S, True),
-    ],
+    [(GONE, 0.0, True), (DEAD, STALE_S / 2, False), (DEAD, 2 * STALE_S, True)],
     ids=["a process that ended", "another host, heard of", "another host, silent"],
 )
-def test_trials_of_a_driver_that_is_gone_are_orphans(
-    owner: Owner, seconds: float, is_gone: bool
-) -> None:
+def test_stale_trials_depend_on_owner(owner: Owner, seconds: float, is_gone: bool) -> None:
     storage = memory()
-    claim(store_on(storage, owner))
-    silent(storage, 0, seconds)
-    assert stale_trials(store_on(storage)) == ([0] if is_gone else [])
+    gone = store_on(storage, owner)
+    for key in "abcd":
+        claim(gone, key)
+    for number in range(4):
+        silent(storage, number, seconds)
+    gone.complete(0, [1.0], {})
+    gone.fail(1, "a bad day", {})
+    gone.drop(2, "not needed")
+    assert stale_trials(store_on(storage)) == ([3] if is_gone else [])
 
 
 def test_stale_trials_include_own_lost_trial(store: TrialStore) -> None:
@@ -222,20 +194,7 @@ def test_stale_trials_include_own_lost_trial(store: TrialStore) -> None:
     assert stale_trials(store, 1) == [0]
 
 
-def test_finished_and_dropped_trials_are_no_orphans() -> None:
-    storage = memory()
-    gone = store_on(storage, GONE)
-    for key in "abcd":
-        claim(gone, key)
-    gone.complete(0, [1.0], {})
-    gone.fail(1, "a bad day", {})
-    gone.drop(2, "not needed")
-    assert stale_trials(store_on(storage)) == [3]
-
-
-def test_stale_trials_exclude_fresh_unowned_trial(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stale_trials_exclude_fresh_unowned_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     store = searching(memory())
     store.study.ask()
     assert stale_trials(store) == []
@@ -244,14 +203,7 @@ def test_stale_trials_exclude_fresh_unowned_trial(
     assert stale_trials(store) == [0]
 
 
-def test_release_allows_new_claim(store: TrialStore) -> None:
-    claim(store)
-    store.release(0, "its driver was gone", requeue=False)
-    assert store.trials() == []
-    assert claim(store) == 1
-
-
-def test_a_released_search_trial_comes_back_with_its_parameters() -> None:
+def test_release_requeues_search_trial_with_parameters() -> None:
     storage = memory()
     number, x = taken(searching(storage, GONE), 1)
     mine = searching(storage)
@@ -267,21 +219,11 @@ def test_a_released_search_trial_comes_back_with_its_parameters() -> None:
 
 def test_release_trial_without_point_is_not_enqueued() -> None:
     storage = memory()
-    gone = searching(storage, GONE)
-    gone.ask(1)
+    searching(storage, GONE).ask(1)
     mine = searching(storage)
     mine.release(0, "its driver was gone", requeue=True)
     assert states(mine) == []
     assert mine.ask(1) is not None
-
-
-def test_release_twice_enqueues_once() -> None:
-    storage = memory()
-    number, _ = taken(searching(storage, GONE))
-    a, b = searching(storage), searching(storage)
-    a.release(number, "gone", requeue=True)
-    b.release(number, "gone", requeue=True)
-    assert states(a) == ["WAITING"]
 
 
 def test_release_after_crash_enqueues_once() -> None:
@@ -294,10 +236,20 @@ def test_release_after_crash_enqueues_once() -> None:
     assert states(b) == ["WAITING"]
 
 
+def test_ask_drops_second_requeued_trial() -> None:
+    """Two drivers may enqueue the trial of a dead one at the same time."""
+    storage = memory()
+    number, x = taken(searching(storage, GONE))
+    store = searching(storage)
+    store.release(number, "gone", requeue=True)
+    store.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
+    assert store.ask(2) is not None
+    assert store.ask(2) is None
+    assert states(store) == ["RUNNING"]
+
+
 @pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
-def test_release_of_resumed_trial_enqueues_nothing(
-    finished: bool,
-) -> None:
+def test_release_of_resumed_trial_enqueues_nothing(finished: bool) -> None:
     storage = memory()
     number, _ = taken(searching(storage, GONE))
     a, b = searching(storage), searching(storage)
@@ -311,30 +263,37 @@ def test_release_of_resumed_trial_enqueues_nothing(
     assert states(b) == ["COMPLETE" if finished else "RUNNING"]
 
 
-def test_release_finished_trial_has_no_effect() -> None:
-    storage = memory()
-    mine, other = searching(storage, DEAD), searching(storage)
-    number, _ = taken(mine)
-    other.complete(number, [1.0], {})
-    mine.release(number, "its driver was stopped", requeue=True)
-    assert states(mine) == ["COMPLETE"]
+@pytest.fixture
+def child() -> Iterator[subprocess.Popen[str]]:
+    """Another process on this machine that prints its owner, and waits."""
+    code = (
+        "from sweeps.worker.trial_store import Owner;"
+        "print(Owner.this_process(), flush=True); input()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    yield process
+    process.kill()
+    process.communicate()
 
 
-def test_by_key_orders_trials_by_number(store: TrialStore) -> None:
-    claim(store, "a")
-    store.fail(0, "a bad day", {})
-    claim(store, "b")
-    claim(store, "a")
-    found = {key: [each.number for each in trials] for key, trials in store.by_key().items()}
-    assert found == {"a": [0, 2], "b": [1]}
+def test_owner_local_process_alive_until_exit(child: subprocess.Popen[str]) -> None:
+    assert child.stdout is not None
+    owner = Owner.parse(child.stdout.readline().strip())
+    assert (owner.host, owner.pid) == (HOST, child.pid)
+    assert owner.is_alive(heartbeat=0.0)
+    child.kill()
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    assert Path(f"/proc/{child.pid}").exists(), "still a zombie"
+    assert not owner.is_alive(heartbeat=time.time())
 
 
-def test_prune_keeps_last_reported_value() -> None:
-    store = searching(memory())
-    asked = store.ask(None)
-    assert isinstance(asked, optuna.Trial)
-    asked.report(40.0, 2)
-    store.prune(asked.number, "pruned at step 2", {})
-    found = trial(store, 0)
-    assert (found.state.name, found.value) == ("PRUNED", 40.0)
-    assert found.user_attrs[names.REASON] == "pruned at step 2"
+def test_owner_parse_reused_pid_and_other_host() -> None:
+    me = Owner.this_process()
+    assert Owner.parse(str(me)) == me
+    assert Owner.parse("node:7:12:345") == Owner("node:7", 12, "345")
+    assert not Owner(HOST, os.getpid(), "12").is_alive(heartbeat=time.time())
+    other = Owner(f"not-{HOST}", os.getpid(), me.started)
+    assert other.is_alive(time.time() - STALE_S / 2)
+    assert not other.is_alive(time.time() - 2 * STALE_S)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from optuna.distributions import CategoricalDistribution
-from optuna.trial import TrialState
 
-from rgbt.metrics.counts import Counts
 from rgbt.spec.naming import VARIED
 from rgbt.tracking.run_folder import MetricLine
 from rgbt.tracking.run_result import RunResult
@@ -21,12 +17,15 @@ from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour
 from sweeps.settings import Objective
-from sweeps.worker.list_source import ListSource, finished_runs, is_evaluated, reason_of
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.sampler_source import short_override
-from sweeps.worker.trial_source import ClaimedTrial
-from sweeps.worker.trial_store import TrialClaim
+from sweeps.worker.trial_sources import (
+    ClaimedTrial,
+    ListSource,
+    finished_runs,
+    is_evaluated,
+    reason_of,
+)
 from tests.sweeps.fakes import (
     DEAD,
     Desk,
@@ -38,7 +37,6 @@ from tests.sweeps.fakes import (
     plans,
     quick,
     search_desk,
-    store_on,
     until,
 )
 
@@ -75,13 +73,8 @@ def is_exhausted(desk: Desk, *, wait: bool = False) -> bool:
 
 def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(2))
-    source = ListSource(
-        desk.plans,
-        desk.store,
-        desk.runs,
-        desk.driver.settings,
-        {"x": CategoricalDistribution((0, 1))},
-    )
+    known = {"x": CategoricalDistribution((0, 1))}
+    source = ListSource(desk.plans, desk.store, desk.runs, desk.driver.settings, known)
     tasks = [source.next(), source.next()]
     assert [task.plan.point.label for task in tasks if task] == ["x=0", "x=1"]
     assert source.next() is None
@@ -90,42 +83,6 @@ def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
     assert trial.user_attrs[names.LABEL] == "x=1"
     assert trial.user_attrs[names.OVERRIDES] == ["x=1"]
     assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
-
-
-def test_list_source_exhausted_depends_on_wait(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, plans(1))
-    assert not is_exhausted(desk)
-    task = taken(desk)
-    assert status(desk).state == "running"
-    assert is_exhausted(desk)
-    assert not is_exhausted(desk, wait=True)
-    done(desk, task)
-    assert is_exhausted(desk, wait=True)
-    assert status(desk).state == "finished"
-    assert status(desk).results[0].key == desk.plans[0].key
-
-
-def test_list_source_duplicate_point_is_one_trial(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, [*plans(1), *plans(1)])
-    taken(desk)
-    assert desk.driver.source.next() is None
-
-
-def test_list_source_failed_point_waits_for_retry(tmp_path: Path) -> None:
-    storage = memory()
-    first = list_desk(tmp_path, plans(1), storage=storage)
-    first.store.fail(taken(first).number, "a bad day", {})
-    assert status(first).state == "failed"
-    assert status(first).reason == "a bad day"
-    assert first.driver.source.next() is None
-
-    plain = list_desk(tmp_path, plans(1), storage=storage)
-    assert plain.driver.source.next() is None
-    again = list_desk(tmp_path, plans(1), storage=storage, retry="failed")
-    assert status(again).state == "waiting"
-    again.store.fail(taken(again).number, "another bad day", {})
-    assert status(again).reason == "another bad day"
-    assert again.driver.source.next() is None, "forgiven once, not for ever"
 
 
 def test_list_source_retries_are_shared_by_drivers(tmp_path: Path) -> None:
@@ -149,23 +106,6 @@ def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
     desk = list_desk(tmp_path, plans(1), storage=storage)
     assert status(desk).state == "waiting"
     assert taken(desk).number == 1
-
-
-def test_other_points_in_the_study_are_left_alone(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, plans(1))
-    desk.store.claim(TrialClaim("of another list", {}))
-    taken(desk)
-    assert desk.driver.source.next() is None
-    assert is_exhausted(desk)
-
-
-def test_list_source_failed_point_finished_by_hand(tmp_path: Path) -> None:
-    storage = memory()
-    before = list_desk(tmp_path, plans(1), storage=storage)
-    before.store.fail(taken(before).number, "a bad day", {})
-    finish(tmp_path / before.plans[0].key)
-    desk = list_desk(tmp_path, plans(1), storage=storage)
-    assert status(desk).state in ("finished", "waiting")
 
 
 def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
@@ -206,12 +146,6 @@ def test_a_search_asks_the_sampler_and_notes_the_point(tmp_path: Path) -> None:
     assert task.plan.point.seeds == ()
 
 
-def test_replicates_are_seeds_of_one_trial(tmp_path: Path) -> None:
-    plan = taken(search_desk(tmp_path, trials=1, replicates=3)).plan
-    assert plan.point.seeds == (0, 1, 2)
-    assert len({run.key for run in plan.runs}) == 3
-
-
 def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, trials=1)
     assert not is_exhausted(desk)
@@ -231,18 +165,6 @@ def test_a_search_is_over_when_its_trials_are_made(tmp_path: Path) -> None:
 SMALL = {"x": {"type": "categorical", "choices": [7]}}
 
 
-def test_sampler_source_copies_finished_duplicate(tmp_path: Path) -> None:
-    desk = search_desk(tmp_path, space=SMALL, trials=2)
-    done(desk, taken(desk), 31.0)
-    assert desk.driver.source.next() is None
-    first, second = desk.store.trials()
-    assert second.state.name == "COMPLETE"
-    assert second.values == first.values == [31.0]
-    assert second.user_attrs[names.RESULTS] == {"test/mIoU": 31.0}
-    assert second.user_attrs[names.REASON] == "the same point as trial 0"
-    assert is_exhausted(desk)
-
-
 def test_sampler_source_drops_running_duplicate(tmp_path: Path, quick: None) -> None:
     desk = search_desk(tmp_path, space=SMALL, trials=2)
     task = taken(desk)
@@ -252,12 +174,6 @@ def test_sampler_source_drops_running_duplicate(tmp_path: Path, quick: None) -> 
     done(desk, task)
     until(lambda: desk.driver.source.next() is None and is_exhausted(desk), "the second trial")
     assert desk.numbers("COMPLETE") == [0, desk.store.trials()[1].number]
-
-
-def test_sampler_source_may_repeat_failed_point(tmp_path: Path) -> None:
-    desk = search_desk(tmp_path, space=SMALL, trials=2)
-    desk.store.fail(taken(desk).number, "a bad day", {})
-    assert taken(desk).number == 1
 
 
 def test_sampler_source_wrong_point_fails_and_is_reported(tmp_path: Path) -> None:
@@ -300,61 +216,3 @@ def test_pruning_callback_keeps_var_and_skips_two_objectives(tmp_path: Path) -> 
     assert desk.store.trials()[0].intermediate_values == {2: 9.0}
     both = search_desk(tmp_path, objectives=(Objective("val/mIoU", "maximize"), var), trials=1)
     assert taken(both).report is None
-
-
-def test_a_hopeless_trial_is_told_by_the_pruner(tmp_path: Path) -> None:
-    import optuna
-
-    pruner = optuna.pruners.ThresholdPruner(lower=20.0)
-    objectives = (Objective("val/mIoU", "maximize"),)
-    desk = search_desk(tmp_path, pruner=pruner, objectives=objectives, trials=1)
-    report = taken(desk).report
-    assert report is not None
-    assert report(line(2, mIoU=0.5)) == ""
-    assert report(line(4, mIoU=0.1)) == "pruned at step 4"
-
-
-@pytest.mark.parametrize(
-    ("override", "shown"),
-    [
-        ("masker.sigma_div=4.123456", "sigma_div=4.123"),
-        ("+loss=cross_entropy", "loss=cross_entropy"),
-        ("a.b.c=[1,2]", "c=[1,2]"),
-        ("lr=0.00001", "lr=1e-05"),
-    ],
-)
-def test_overrides_are_short_for_people(override: str, shown: str) -> None:
-    assert short_override(override) == shown
-
-
-def test_reason_of_trial_without_reason() -> None:
-    store = store_on(memory())
-    number = store.claim(TrialClaim("k", {}))
-    assert number == 0
-    store.study.tell(0, state=TrialState.FAIL)
-    assert reason_of(store.trials()[0]) == "no reason was noted"
-
-
-def test_has_counts_ignores_outdated_evaluation(tmp_path: Path) -> None:
-    ring = ExtraEvaluation(regions="ring9")
-    plan = plan_of(Point("p", (), evaluations=(ring,)))
-    runs = list_desk(tmp_path, []).runs
-    (run,) = plan.runs
-    finish(tmp_path / run.key)
-    found = runs.find(run.key, run.dataset)
-    assert found is not None
-    file = found.folder / ring.path
-    file.parent.mkdir()
-    shutil.copyfile(found.folder / "counts_test.npz", file)
-    assert found.has_counts(ring.path)
-    os.utime(file, (0, 0))
-    assert found.has_counts(ring.path), "of a run made elsewhere there is no checkpoint"
-    (found.folder / "best.pt").touch()  # the run was trained again since
-    assert not found.has_counts(ring.path)
-    assert known(plan, runs) is None
-    replace(Counts.load(found.folder / "counts_test.npz"), dataset="other").save(file)
-    assert not found.has_counts(ring.path)
-    replace(Counts.load(found.folder / "counts_test.npz"), split="val").save(file)
-    assert not found.has_counts(ring.path)
-    file.write_bytes(b"half")
-    assert not found.has_counts(ring.path)

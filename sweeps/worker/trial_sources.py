@@ -1,0 +1,334 @@
+"""What a driver executes next: a point of a list, or one that the sampler of a search chooses."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import InitVar, dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from rgbt.checks import InputError, RunError
+from rgbt.metrics.names import in_percent
+from rgbt.spec.naming import VARIED
+from rgbt.tracking.provenance import without_passwords
+from rgbt.tracking.run_files import read_result
+from rgbt.tracking.run_folder import MetricLine
+from rgbt.tracking.run_result import RunResult
+from sweeps import attributes as names
+from sweeps.point import COLOUR, Point, colour
+from sweeps.settings import SweepSettings
+from sweeps.worker.planner import PlannedPoint, Planner
+from sweeps.worker.run_store import RunStore
+from sweeps.worker.running_trial import PruningCallback
+from sweeps.worker.trial_store import TrialStore
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial, Trial
+
+    from sweeps.space.space import Parameter
+
+PAUSE_S = 5.0
+"""How long a search waits after a point that is being run already."""
+
+State = Literal["finished", "failed", "running", "waiting"]
+UNFINISHED: tuple[State, ...] = ("waiting", "failed")
+"""States of points that a command runs."""
+
+
+@dataclass(frozen=True)
+class ClaimedTrial:
+    """A trial that this driver executes; for `report` see `running_trial.RunningTrial`."""
+
+    plan: PlannedPoint
+    number: int
+    report: PruningCallback | None = None
+
+
+class TrialSource(Protocol):
+    """Gives a driver its trials."""
+
+    requeues: bool
+    """Whether a trial that is given up is enqueued in the study."""
+
+    rejected: int
+    """Points whose configuration is wrong."""
+
+    def next(self) -> ClaimedTrial | None:
+        """The next trial, claimed for this driver; None when there is none at the moment."""
+
+    def is_exhausted(self, *, wait: bool) -> bool:
+        """Whether no trial is left; with `wait`, whether other drivers have finished too."""
+
+
+def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
+    """User attributes of a trial of a point."""
+    return {
+        names.KEY: plan.key,
+        names.LABEL: plan.point.label,
+        names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],
+        names.RUNS: [run.key for run in plan.runs],
+        names.PIXELS: plan.runs[0].pixel_factor,
+    }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A point with its state and its finished runs.
+
+    Attributes:
+        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
+        reason: why it failed, or "".
+        results: its finished runs; of a waiting point, runs that lack further evaluations only.
+        keys: of its runs; () where its configuration is wrong.
+    """
+
+    point: Point
+    state: State
+    reason: str = ""
+    results: tuple[RunResult, ...] = ()
+    keys: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        plan: PlannedPoint,
+        state: State,
+        reason: str = "",
+        results: tuple[RunResult, ...] = (),
+    ) -> Outcome:
+        """Of a planned point."""
+        return cls(plan.point, state, reason, results, tuple(run.key for run in plan.runs))
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether it lacks further evaluations of its runs only."""
+        return self.state in UNFINISHED and bool(self.results)
+
+    @property
+    def seconds(self) -> float | None:
+        """Duration of its runs; None where one of them is unknown."""
+        found = [read_result(result.folder) or {} for result in self.results]
+        each = [result.get("seconds_of_last_process") for result in found]
+        known = [float(seconds) for seconds in each if seconds is not None]
+        return sum(known) if known and len(known) == len(each) else None
+
+
+@dataclass
+class ListSource:
+    """Claims the points of a list in their order.
+
+    Attributes:
+        points: planned; of equal keys the last one counts.
+        settings: `retries` and `retry` count here.
+        distributions: of the parameters of a grid, by name.
+    """
+
+    points: InitVar[Sequence[PlannedPoint]]
+    store: TrialStore
+    runs: RunStore
+    settings: SweepSettings
+    distributions: Mapping[str, Any]
+    requeues: bool = field(default=False, init=False)
+    rejected: int = field(default=0, init=False)
+
+    def __post_init__(self, points: Sequence[PlannedPoint]) -> None:
+        self.plans = {plan.key: plan for plan in points}
+        before = self.store.trials() if self.settings.retry == "failed" else []
+        self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
+        self._finished: dict[str, tuple[RunResult, ...]] = {}
+        self._rechecked: set[tuple[str, int]] = set()
+
+    def next(self) -> ClaimedTrial | None:
+        """See `TrialSource.next`."""
+        by_key = self.store.by_key()
+        for plan in self.plans.values():
+            if self.status(plan, by_key).state != "waiting":
+                continue
+            params = {k: v for k, v in plan.point.params.items() if k in self.distributions}
+            known = {name: self.distributions[name] for name in params}
+            # Failed trials of the point, and those whose runs were deleted.
+            replaced = [trial.number for trial in by_key.get(plan.key, ())]
+            number = self.store.claim(trial_attributes(plan), params, known, replaced)
+            if number is not None:
+                return ClaimedTrial(plan, number)
+        return None
+
+    def is_exhausted(self, *, wait: bool) -> bool:
+        """See `TrialSource.is_exhausted`."""
+        states = {status.state for status in self.statuses()}
+        return not states & ({"running", "waiting"} if wait else {"waiting"})
+
+    def statuses(self) -> list[Outcome]:
+        """The states of all points."""
+        by_key = self.store.by_key()
+        return [self.status(plan, by_key) for plan in self.plans.values()]
+
+    def status(self, plan: PlannedPoint, by_key: Mapping[str, Sequence[FrozenTrial]]) -> Outcome:
+        """The state of a point by the study and the finished runs."""
+        trials = by_key.get(plan.key, ())
+        states = {trial.state.name for trial in trials}
+        is_known = plan.key in self._finished
+        if "RUNNING" in states and not is_known:
+            return Outcome.of(plan, "running")
+        if (is_known or "COMPLETE" in states) and self._is_finished(plan):
+            return Outcome.of(plan, "finished", results=self._finished[plan.key])
+        failed = [trial for trial in trials if trial.state.name == "FAIL"]
+        counted = [trial for trial in failed if trial.number not in self._forgiven]
+        if len(counted) <= self.settings.retries:
+            return Outcome.of(plan, "waiting")
+        # Its runs may have been finished by hand since.
+        last = (plan.key, counted[-1].number)
+        if last not in self._rechecked:
+            self._rechecked.add(last)
+            if self._is_finished(plan):
+                return Outcome.of(plan, "finished", results=self._finished[plan.key])
+        return Outcome.of(plan, "failed", reason_of(counted[-1]))
+
+    def _is_finished(self, plan: PlannedPoint) -> bool:
+        if plan.key not in self._finished:
+            results = finished_runs(plan, self.runs)
+            if results is None or not is_evaluated(plan, results):
+                return False
+            self._finished[plan.key] = results
+        return True
+
+
+def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...] | None:
+    """The runs of a point if all are finished, evaluated or not; None otherwise."""
+    results = []
+    for run in plan.runs:
+        try:
+            result = runs.find(run.key, run.dataset)
+        except RunError:  # raised again when the point is executed
+            return None
+        if result is None:
+            return None
+        results.append(result)
+    return tuple(results)
+
+
+def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
+    """Whether all further evaluations of a point's runs exist."""
+    paths = [evaluation.path for evaluation in plan.point.evaluations]
+    return all(result.has_counts(path) for result in results for path in paths)
+
+
+def reason_of(trial: FrozenTrial) -> str:
+    """Why a trial failed."""
+    return str(trial.user_attrs.get(names.REASON, "no reason was noted"))
+
+
+@dataclass
+class SamplerSource:
+    """Asks the sampler of a study for trials.
+
+    Attributes:
+        fixed: overrides that all trials share.
+        settings: `trials`, `replicates`, `pruner` and `objectives` count here.
+        on_reject: called with (label, reason) for a point whose configuration is wrong.
+    """
+
+    fixed: Sequence[str]
+    parameters: tuple[Parameter, ...]
+    store: TrialStore
+    planner: Planner
+    settings: SweepSettings
+    on_reject: Callable[[str, str], None]
+    requeues: bool = field(default=True, init=False)
+    rejected: int = field(default=0, init=False)
+    _not_before: float = field(default=0.0, init=False)
+
+    def next(self) -> ClaimedTrial | None:
+        """See `TrialSource.next`."""
+        if time.monotonic() < self._not_before:
+            return None
+        trial = self.store.ask(self.settings.trials)
+        if trial is None:
+            return None
+        point = self._point(trial)
+        try:
+            plan = self.planner.plan(point)
+        except InputError as error:
+            self.store.fail(trial.number, str(error), {names.LABEL: point.label})
+            self.rejected += 1
+            self.on_reject(point.label, str(error))
+            return None
+        if self._resolve_duplicate(trial, self.store.by_key().get(plan.key, [])):
+            return None
+        self.store.set_attributes(trial.number, trial_attributes(plan))
+        return ClaimedTrial(plan, trial.number, self._pruning_callback(trial))
+
+    def is_exhausted(self, *, wait: bool) -> bool:
+        """See `TrialSource.is_exhausted`."""
+        states = [trial.state.name for trial in self.store.trials()]
+        total = self.settings.trials
+        unfinished = {"RUNNING", "WAITING"} if wait else {"WAITING"}
+        return total is not None and len(states) >= total and not unfinished & set(states)
+
+    def _point(self, trial: Trial) -> Point:
+        from sweeps.space.space import as_overrides, suggest
+
+        params = suggest(trial, self.parameters)
+        chosen = as_overrides(params)
+        study = self.store.study.study_name
+        replicates = self.settings.replicates
+        return Point(
+            label=f"#{trial.number} " + " ".join(map(short_override, chosen)),
+            overrides=(*self.fixed, *chosen),
+            params=dict(trial.params),
+            tags={
+                f"rgbt.study/{study}": str(trial.number),
+                VARIED: " ".join(params),
+                COLOUR: colour(study, trial.number),
+            },
+            seeds=tuple(range(replicates)) if replicates > 1 else (),
+        )
+
+    def _resolve_duplicate(self, trial: Trial, same: Sequence[FrozenTrial]) -> bool:
+        """Copy a complete trial of the same point, or drop this one for a running trial of it."""
+        for other in same:
+            reason = f"the same point as trial {other.number}"
+            if other.number == trial.number:
+                continue
+            if other.state.name == "COMPLETE":
+                notes = {
+                    **{key: other.user_attrs[key] for key in (names.KEY, names.RUNS)},
+                    names.RESULTS: other.user_attrs[names.RESULTS],
+                    names.REASON: reason,
+                    names.LABEL: f"#{trial.number} = #{other.number}",
+                }
+                self.store.complete(trial.number, other.values, notes)
+                return True
+            if other.state.name == "RUNNING":
+                self.store.drop(trial.number, reason)
+                self._not_before = time.monotonic() + PAUSE_S
+                return True
+        return False
+
+    def _pruning_callback(self, trial: Trial) -> PruningCallback | None:
+        if self.settings.pruner is None and len(self.settings.objectives) > 1:
+            return None
+        metric = self.settings.objectives[0].metric.removeprefix("val/")
+        reported: set[int] = set()
+
+        def report(line: MetricLine) -> str:
+            value = line.values.get(metric)
+            if value is None or line.step in reported:
+                return ""
+            percent = in_percent(metric, value)
+            self.store.update_unfinished(trial.number, lambda: trial.report(percent, line.step))
+            reported.add(line.step)
+            if self.settings.pruner is not None and trial.should_prune():
+                return f"pruned at step {line.step}"
+            return ""
+
+        return report
+
+
+def short_override(override: str) -> str:
+    """An override as shown: "masker.sigma_div=4.123456" as "sigma_div=4.123"."""
+    key, _, value = override.lstrip("+").partition("=")
+    with suppress(ValueError):
+        value = f"{float(value):.4g}"
+    return f"{key.rpartition('.')[2]}={value}"

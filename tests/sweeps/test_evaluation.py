@@ -1,0 +1,69 @@
+"""Further evaluations of a run: what makes them and where their counts lie."""
+
+from __future__ import annotations
+
+import pytest
+
+from rgbt.config.options import types_of
+from rgbt.consistency import Options as OfConsistency
+from rgbt.evaluate import Options as OfEvaluate
+from sweeps.evaluation import ExtraEvaluation
+
+OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "command", "file", "label"),
+    [
+        (
+            ExtraEvaluation("thermal", "ring9"),
+            "rgbt.evaluate modality=thermal regions=ring9",
+            "table_thermal_ring9.npz",
+            "thermal, ring9",
+        ),
+        (
+            ExtraEvaluation("rgb", "ring9", head="source"),
+            "rgbt.evaluate modality=rgb regions=ring9 head=source",
+            "table_rgb_ring9_source-head.npz",
+            "rgb, ring9, source head",
+        ),
+        (
+            ExtraEvaluation("rgbt", "ring9", corruption="noise", severity=16.0),
+            "rgbt.evaluate modality=rgbt regions=ring9 corruption=noise severity=16",
+            "table_rgbt_ring9_noise-16.npz",
+            "rgbt, ring9, noise-16",
+        ),
+        (
+            ExtraEvaluation("rgb", "ring5", head="own", corruption="removed:rgb"),
+            "rgbt.evaluate modality=rgb regions=ring5 head=own corruption=removed:rgb",
+            "table_rgb_ring5_own-head_rgb_removed.npz",
+            "rgb, ring5, own head, rgb_removed",
+        ),
+        (
+            ExtraEvaluation(frames="aligned"),
+            "rgbt.consistency frames=virtual",
+            "consistency_aligned_test.npz",
+            "consistency, aligned",
+        ),
+        (
+            ExtraEvaluation(frames="released"),
+            "rgbt.consistency frames=virtual",
+            "consistency_released_test.npz",
+            "consistency, released",
+        ),
+        (
+            ExtraEvaluation(frames="next"),
+            "rgbt.consistency frames=next",
+            "consistency_next_test.npz",
+            "consistency, next",
+        ),
+    ],
+    ids=str,
+)
+def test_evaluation_has_command_file_and_label(
+    evaluation: ExtraEvaluation, command: str, file: str, label: str
+) -> None:
+    module, *words = command.split(" ")
+    assert evaluation.command == (module, *words)
+    assert (evaluation.path, evaluation.label) == (f"evaluations/{file}", label)
+    assert {word.partition("=")[0] for word in words} <= set(types_of(OPTIONS[module]))
