@@ -24,9 +24,6 @@ ARCHIVE = Archive(
     optional=("unscored",),
 )
 
-BYTES_HOLD = 255
-"""Images that are added up in bytes before the sums are moved to wider integers."""
-
 Bytes = NDArray[np.uint8]
 Heat = NDArray[np.float64]
 
@@ -38,7 +35,6 @@ class PixelMaps:
     Attributes:
         intersection: (K, H, W) int32, images in which label and prediction are the class there.
         union: (K, H, W) int32, images in which one of them is; unlabelled pixels do not count.
-        classes: K names.
         palette: K (red, green, blue) colours.
         dataset: fingerprint of the data set.
         unscored: names of the classes that are left out of means over classes.
@@ -99,41 +95,32 @@ class PixelMaps:
 
 
 class MapSum:
-    """Adds images to pixel maps, from several threads at once.
+    """Adds images to pixel maps, from several threads at once; all of the size of the first.
 
-    The sums of up to 255 images are kept in bytes, which takes a quarter of the time of wider ones.
-
-    Args:
-        num_classes: K.
-        image_hw: (H, W) of every image.
+    Attributes:
+        sums: (2, K, H, W) intersection and union; None before the first image.
+        is_one_size: no image had another size, and was so left out.
     """
 
-    def __init__(self, num_classes: int, image_hw: tuple[int, int]) -> None:
-        shape = (num_classes, *image_hw)
-        self.intersection = np.zeros(shape, np.int32)
-        self.union = np.zeros(shape, np.int32)
-        self._bytes = np.zeros((2, *shape), np.uint8)
-        self._held = 0
+    def __init__(self, num_classes: int) -> None:
+        self.num_classes = num_classes
+        self.sums: NDArray[np.int32] | None = None
+        self.is_one_size = True
         self._lock = threading.Lock()
 
     def add(self, label: Bytes, prediction: Bytes) -> None:
         """Count one image: (H, W) each; pixels whose label is no class are left out."""
         with self._lock:
-            if self._held == BYTES_HOLD:
-                self.flush()
-            counted = label < len(self.union)
-            for index, (both, either) in enumerate(zip(*self._bytes, strict=True)):
+            if self.sums is None:
+                self.sums = np.zeros((2, self.num_classes, *label.shape), np.int32)
+            if self.sums.shape[2:] != label.shape:
+                self.is_one_size = False
+                return
+            counted = label < self.num_classes
+            for index, (both, either) in enumerate(zip(*self.sums, strict=True)):
                 labelled, predicted = label == index, (prediction == index) & counted
-                both += (labelled & predicted).view(np.uint8)
-                either += (labelled | predicted).view(np.uint8)
-            self._held += 1
-
-    def flush(self) -> None:
-        """Move what the bytes hold to `intersection` and `union`; call it after the last image."""
-        self.intersection += self._bytes[0]
-        self.union += self._bytes[1]
-        self._bytes[:] = 0
-        self._held = 0
+                both += labelled & predicted
+                either += labelled | predicted
 
 
 def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
@@ -147,7 +134,7 @@ def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
     of that region, which adds up pixels before it divides; only the latter is ever printed.
 
     Args:
-        maps: see `PixelMaps`.
+        maps: of any number of images.
         absent: "exclude": C are the scored classes with U > 0 at the pixel; "released": all scored
             classes, 0 without.
 

@@ -31,7 +31,7 @@ def test_sums_are_those_of_a_loop_over_pixels() -> None:
     labels[labels == 3] = 255
     predictions = rng.integers(0, 3, (images, 3, 5), np.uint8)
     labels[:, 0, 0] = predictions[:, 0, 0] = 1  # always right: counts beyond 255
-    summed = MapSum(3, (3, 5))
+    summed = MapSum(3)
     intersection, union = np.zeros((2, 3, 3, 5), int)
     for label, prediction in zip(labels, predictions, strict=True):
         summed.add(label, prediction)
@@ -42,10 +42,9 @@ def test_sums_are_those_of_a_loop_over_pixels() -> None:
                 intersection[label[y, x], y, x] += 1
             for index in {label[y, x], prediction[y, x]}:
                 union[index, y, x] += 1
-    summed.flush()
-    np.testing.assert_array_equal(summed.intersection, intersection)
-    np.testing.assert_array_equal(summed.union, union)
-    assert summed.union[1, 0, 0] == images
+    np.testing.assert_array_equal(summed.sums, [intersection, union])
+    assert summed.sums[1, 1, 0, 0] == images
+    assert summed.is_one_size
 
 
 def test_mean_over_classes_by_hand_under_both_conventions() -> None:

@@ -75,14 +75,6 @@ def test_length_is_that_of_the_paper(keeps: float, count: int):
         assert block_length(series, [np.arange(count)]) == politis_white(series)
 
 
-def test_length_of_correlated_neighbours_is_longer():
-    rngs = [np.random.default_rng(seed) for seed in range(20)]
-    noise = [block_length(rng.normal(size=300), [np.arange(300)]) for rng in rngs]
-    alike = [block_length(autoregressive(rng, 300, 0.8), [np.arange(300)]) for rng in rngs]
-    assert np.median(noise) <= 2
-    assert np.median(alike) >= 8
-
-
 def test_length_does_not_see_over_the_end_of_a_sequence():
     """The same values, in sequences of one image each: no neighbours, nothing correlated."""
     series = autoregressive(np.random.default_rng(0), 300, 0.9)
@@ -98,12 +90,6 @@ def test_length_reads_the_order_of_the_frames():
     assert block_length(shuffled, [order]) == block_length(series, [np.arange(300)])
 
 
-def test_length_of_little():
-    assert block_length(np.full(50, 3.0), [np.arange(50)]) == 1
-    assert block_length(np.array([1.0]), [np.arange(1)]) == 1
-    assert block_length(np.arange(6.0), [np.arange(6)]) <= 2
-
-
 # Blocks by names.
 
 
@@ -112,10 +98,6 @@ def test_single_images():
     assert blocks.said == "12 single images"
     assert members(blocks, mfnet(12)) == {frozenset([name]) for name in mfnet(12)}
     assert make_blocks(mfnet(12), 1, NOTHING).said == "12 single images"
-
-
-def test_few_single_images_are_left_to_the_caller():
-    assert make_blocks(mfnet(3), "none", NOTHING).count == 3
 
 
 def test_neighbours_by_number_whatever_the_order_of_names():
@@ -127,38 +109,6 @@ def test_neighbours_by_number_whatever_the_order_of_names():
     assert blocks.said == "10 blocks of up to 4 neighbouring frames"
 
 
-def test_numbers_are_compared_as_numbers():
-    names = [f"frame{number}" for number in range(1, 25)]  # frame10 sorts before frame2 as text
-    blocks = make_blocks(sorted(names), 2, NOTHING)
-    expected = {frozenset(names[start : start + 2]) for start in range(0, 24, 2)}
-    assert members(blocks, sorted(names)) == expected
-
-
-def test_day_and_night_are_two_sequences():
-    names = mfnet(30, "D") + mfnet(30, "N")
-    blocks = make_blocks(names, 5, NOTHING)
-    assert blocks.count == 12
-    for block in members(blocks, names):
-        assert len({name[-1] for name in block}) == 1
-
-
-def test_sequences_of_kp():
-    names = [
-        f"set{s:02d}_V{v:03d}_I{frame:05d}"
-        for s in (0, 6)
-        for v in range(6)
-        for frame in range(1, 40, 19)
-    ]
-    blocks = make_blocks(names, "sequence", NOTHING)
-    assert blocks.said == "12 sequences"
-    expected = {
-        frozenset(name for name in names if name.startswith(f"set{s:02d}_V{v:03d}_"))
-        for s in (0, 6)
-        for v in range(6)
-    }
-    assert members(blocks, names) == expected
-
-
 def test_pieces_do_not_cross_sequences_and_are_nearly_equal():
     names = [f"V{v}_I{frame:03d}" for v in range(4) for frame in range(11)]
     blocks = make_blocks(names, 4, NOTHING)
@@ -166,18 +116,6 @@ def test_pieces_do_not_cross_sequences_and_are_nearly_equal():
     assert sizes == [3] * 4 + [4] * 8
     for block in members(blocks, names):
         assert len({name[:2] for name in block}) == 1
-
-
-def test_blocks_longer_than_a_sequence_are_the_sequences():
-    names = [f"V{v:02d}_I{frame}" for v in range(12) for frame in range(3)]
-    longer, whole = (make_blocks(names, choice, NOTHING) for choice in (500, "sequence"))
-    assert members(longer, names) == members(whole, names)
-    assert "500" not in longer.said  # no block holds so many
-
-
-def test_auto_without_numbers_draws_single_images():
-    names = ["a", "b", "c3"]
-    assert make_blocks(names, "auto", NOTHING).said.startswith("3 single images (")
 
 
 def test_auto_takes_the_longest_of_the_scores():
