@@ -92,58 +92,17 @@ def main(options: Options, overrides: list[str]) -> int:
     """Compare two methods on the same images."""
     from rich.markup import escape
 
-    from analysis.results import groups_in, open_counts
-    from analysis.robustness import under
-    from analysis.uncertainty import compare
+    from analysis.uncertainty import Resampling, compare
     from analysis.uncertainty.sentence import sentence
     from rgbt.files.atomic import write_atomic
+    from rgbt.metrics.named import parse
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     del overrides  # none is heeded
-    frames, corruption, severity = options.frames, options.corruption, options.severity
-    if severity and not corruption:
-        raise InputError("'severity' has no effect without corruption=..., for example noise.")
-    if corruption and frames:
-        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
     check_out(options.out)
-    for key in ("a", "b"):
-        if not getattr(options, key):
-            groups = ", ".join(groups_in(options.runs_dir)) or "none"
-            raise InputError(
-                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
-                f"in {options.runs_dir}: {groups}."
-            )
-    opened = [
-        open_counts(side, options.runs_dir, options.split, frames)
-        for side in (options.a, options.b)
-    ]
-    if corruption:
-        opened = [under(each, corruption, severity) for each in opened]
+    opened = _opened(options)
     a, b = _counts(opened, options.missing)
-    settings = settings_of(options)
-    comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
-    shown = " ".join(word for word in (corruption, severity) if word)
-    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
-    notes = absent_classes([*a, *b], settings.absent)
-    grid = replace(comparison_grid(comparison, labels), notes=notes)
-    said = sentence(comparison, *labels)
-    print_rich(rich_table(grid))
-    below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
-    print_rich(escape("\n".join(filter(None, below))))
-    out = options.out
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
-        write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
-        print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
-    return 0
-
-
-def settings_of(options: Options) -> Resampling:
-    """The settings of the resampling; InputError where a value is out of range."""
-    from analysis.uncertainty.settings import Resampling
-
-    return Resampling(
+    settings = Resampling(
         resamples=options.resamples,
         level=options.level,
         method=options.method,
@@ -151,6 +110,30 @@ def settings_of(options: Options) -> Resampling:
         seed=options.seed,
         absent=None if options.absent == "as counted" else options.absent,
     )
+    comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
+    shown = " ".join(word for word in (options.corruption, options.severity) if word)
+    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
+    notes = absent_classes([*a, *b], settings.absent)
+    grid = replace(comparison_grid(comparison, labels), notes=notes)
+    said = sentence(comparison, *labels)
+    print_rich(rich_table(grid))
+    # Scores by day and by night are over other images.
+    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
+    parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
+    method = "percentile" if settings.method == "auto" else settings.method
+    remark = (
+        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
+        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
+        "Holm: corrected for the number of lines."
+    )
+    print_rich(escape("\n".join(filter(None, [said, *parts, comparison.reason, remark]))))
+    out = options.out
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
+        write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
+        print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
+    return 0
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
@@ -208,14 +191,6 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     return TextTable(title, header, tuple(rows))
 
 
-def part_lines(comparison: Comparison) -> list[str]:
-    """What was drawn for the scores by day and by night, which are over other images."""
-    from rgbt.metrics.named import parse
-
-    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
-    return [f"{part}: {said}." for part, said in drawn.items() if part is not None]
-
-
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
     """Footnotes about classes that are absent from the counts of both methods.
 
@@ -237,14 +212,27 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return absent_notes(summed, first.classes, first.scored, first.split, used)
 
 
-def remark(settings: Resampling) -> str:
-    """How the numbers of the table were made, in one line."""
-    method = "percentile" if settings.method == "auto" else settings.method
-    return (
-        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
-        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
-        "Holm: corrected for the number of lines."
-    )
+def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
+    """The trainings of both methods."""
+    from analysis.results import groups_in, open_counts
+    from analysis.robustness import under
+
+    frames, corruption, severity = options.frames, options.corruption, options.severity
+    if severity and not corruption:
+        raise InputError("'severity' has no effect without corruption=..., for example noise.")
+    if corruption and frames:
+        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
+    opened = []
+    for key, side in (("a", options.a), ("b", options.b)):
+        if not side:
+            groups = ", ".join(groups_in(options.runs_dir)) or "none"
+            raise InputError(
+                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
+                f"in {options.runs_dir}: {groups}."
+            )
+        found = open_counts(side, options.runs_dir, options.split, frames)
+        opened.append(under(found, corruption, severity) if corruption else found)
+    return opened
 
 
 def _counts(

@@ -164,10 +164,10 @@ def draw_borders(axes: Axes, region_map: NDArray[np.integer]) -> None:
         axes.contour(region_map, levels, colors=line, linewidths=width)
 
 
-def number(axes: Axes, place: tuple[int, int], text: str, size: float = SMALL) -> None:
+def number(axes: Axes, place: tuple[int, int], text: str) -> None:
     """A number on a picture at (row, column), on a white ground."""
     box = {"boxstyle": "round,pad=0.06", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
-    at = {"ha": "center", "va": "center", "fontsize": size, "bbox": box}
+    at = {"ha": "center", "va": "center", "fontsize": SMALL, "bbox": box}
     axes.text(place[1], place[0], text, **at)  # type: ignore[arg-type]
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import scored_classes
-from rgbt.metrics.metric import Absent
 
 ARCHIVE = Archive(
     "rgbt pixel maps 1",
@@ -123,27 +122,23 @@ class MapSum:
                 either += labelled | predicted
 
 
-def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
+def iou_map(maps: PixelMaps) -> Heat:
     """Mean IoU over classes at every pixel, over the images: the map of SpatialSeg, Fig. 1(a).
 
         (1 / |C|) sum_{c in C} I_c(y, x) / U_c(y, x)
 
-    Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there. At a single pixel
-    most classes never occur, so that "released", which counts them as 0, mostly shows how many
-    classes occur; the default leaves them out. The mean of the map over a region is not the mIoU
-    of that region, which adds up pixels before it divides; only the latter is ever printed.
+    C are the scored classes with U > 0 at the pixel: at a single pixel most classes never occur, so
+    that absent ones as 0 would mostly show how many do. The mean of the map over a region is not
+    the mIoU of that region, which adds up pixels before it divides; only the latter is printed.
 
-    Args:
-        maps: of any number of images.
-        absent: "exclude": C are the scored classes with U > 0 at the pixel; "released": all scored
-            classes, 0 without.
+    Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there.
 
     Returns:
-        (H, W) fractions 0..1; NaN where there is nothing to score (under "exclude").
+        (H, W) fractions 0..1; NaN where there is nothing to score.
     """
     union = maps.union[maps.scored]
     ratio = maps.intersection[maps.scored] / np.maximum(union, 1)
-    there = (union > 0).sum(0) if absent == "exclude" else np.full(ratio.shape[1:], len(ratio))
-    heat: Heat = np.full(ratio.shape[1:], np.nan)
+    there = (union > 0).sum(0)
+    heat: Heat = np.full(there.shape, np.nan)
     np.divide(ratio.sum(0), there, out=heat, where=there > 0)
     return heat

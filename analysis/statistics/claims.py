@@ -137,7 +137,7 @@ def _classes(judge: Judge, occupancy: Floats) -> list[Claim]:
     Evenness: mean over regions of the occupancy as Fig. 3 normalises it, 1 where all equal.
     """
     labels, classes = judge.stats.labels, judge.stats.classes
-    present = labels.any(1)
+    present = np.asarray(labels.any(1))
     occurs = [index for index in range(1, len(classes)) if present[:, index].any()]
     by_class: dict[str, Finding] = {}
     for index in occurs:

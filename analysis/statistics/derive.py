@@ -41,12 +41,6 @@ def occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Floats:
     return _ratio(occupied[1:].sum(0), occupied.sum(0))
 
 
-def class_occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Floats:
-    """The same for every class: (K, H, W), 0..1, sums to 1 over the classes."""
-    occupied = stats.select(part).occupied.sum(0)
-    return _ratio(occupied, occupied.sum(0))
-
-
 def region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
     """Sample occupancy rate of every region (SpatialSeg, Eq. 2).
 

@@ -145,8 +145,8 @@ def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64])
     runs = []
     for frames, places in sequences:
         steps = np.diff(frames)
-        gaps = np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else []
-        runs += np.split(places, gaps)
+        far = steps > GAP * np.median(steps) if len(steps) else steps
+        runs += np.split(places, np.flatnonzero(far) + 1)
     sizes = [len(run) for run in runs]
     count, longest = sum(sizes), max(sizes)
     said = f"{len(runs)} run{'s' * (len(runs) > 1)} of consecutive numbers ({_range(sizes)} images)"

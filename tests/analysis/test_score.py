@@ -21,9 +21,8 @@ from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.run_files import Description, counts_name
-from rgbt.tracking.run_folder import RunFolder
 from tests.analysis.counts import counts_of
+from tests.analysis.test_results import make_run
 from tests.commands import SPLITS, Call, assert_one_sentence
 from tests.conftest import pair
 
@@ -204,14 +203,8 @@ def test_a_part_that_is_too_small_stops_nothing_else() -> None:
 
 
 def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
     for seed in (0, 1):
-        run = RunFolder(tmp_path / "runs" / f"aaa{seed}")
-        run.write_config("name: x")
-        run.describe(Description("m", {"rgbt.group": "m", "rgbt.seed": str(seed)}, {}))
-        array = rng.integers(0, 50, (12, 2, 3, 3))
-        counts_of(array, names=tuple(map(str, range(12)))).save(run.path / counts_name("test"))
-        run.finish({})
+        make_run(tmp_path / "runs", f"aaa{seed}", "m", seed)
     out = tmp_path / "out"
     words = (f"runs_dir={tmp_path / 'runs'}", "resamples=0")
     code, shown, err = call(entry, "counts=m", f"out={out}", *words)

@@ -51,6 +51,8 @@ def test_a_sample_as_the_paper_says() -> None:
         *("laplacian/centre", "laplacian/modality", "laplacian/day_rgb", "laplacian/day_thermal"),
         *("entropy/with_background", "entropy/without_background"),
     }
+    (even,) = plain["classes/even"].findings  # curve 0.75; car 0.667 and bump 0.741
+    assert even.interval.value == pytest.approx(0.75 - (0.667 + 0.741) / 2, abs=0.01)
     plain.pop("entropy/without_background")
     assert {key: claim.verdict for key, claim in plain.items()} == dict.fromkeys(plain, HOLDS)
     for average in ("pooled", "images"):

@@ -88,7 +88,6 @@ def test_day_and_night_are_the_images_of_each() -> None:
         assert chosen.subsets() == ("all",)
         for function in (
             derive.occupancy_map,
-            derive.class_occupancy_map,
             derive.region_occupancy,
             derive.class_region_occupancy,
             derive.label_entropy,
