@@ -81,38 +81,26 @@ def claims(
     found: list[Claim] = []
     if judge.has_centre:
         difference = judge.centre(occupancy) - judge.edge(occupancy)
-        found.append(
-            _claim(
-                *("occupancy/falls", "III-B.1"),
-                "sample occupancy falls from the inner to the outer regions",
-                judge.finding("centre - edge, points", difference, ABOVE_0),
-                judge.largest_step("largest step outwards, points", occupancy),
-            )
-        )
+        statement = "sample occupancy falls from the inner to the outer regions"
+        finding = judge.finding("centre - edge, points", difference, ABOVE_0)
+        steps = judge.largest_step("largest step outwards, points", occupancy)
+        found.append(_claim("occupancy/falls", "III-B.1", statement, finding, steps))
         found += _classes(judge, class_occupancy_of(labels))
     if stats.partition.startswith("horizontal") and stats.num_regions > 2:
         ends = (occupancy[:, 0] + occupancy[:, -1]) / 2
         above = occupancy[:, stats.num_regions // 2] - ends
-        found.append(
-            _claim(
-                *("occupancy/middle", "III-B.1"),
-                "of horizontal strips the middle has the highest occupancy",
-                judge.finding("middle - mean of the ends, points", above, ABOVE_0),
-            )
-        )
+        statement = "of horizontal strips the middle has the highest occupancy"
+        finding = judge.finding("middle - mean of the ends, points", above, ABOVE_0)
+        found.append(_claim("occupancy/middle", "III-B.1", statement, finding))
     found += _laplacian(judge)
     for estimator, average in product(stats.noise, AVERAGES):
         found += _snr(judge, estimator, average)
     for word in ("with", "without") if judge.has_centre else ():
         entropy = entropy_of(labels, background=word == "with")
         difference = judge.centre(entropy) - judge.edge(entropy)
-        found.append(
-            _claim(
-                *(f"entropy/{word}_background", "III-C.1"),
-                f"label entropy {word} background is higher in the centre",
-                judge.finding("centre - edge, bits", difference, ABOVE_0),
-            )
-        )
+        statement = f"label entropy {word} background is higher in the centre"
+        finding = judge.finding("centre - edge, bits", difference, ABOVE_0)
+        found.append(_claim(f"entropy/{word}_background", "III-C.1", statement, finding))
     return tuple(found)
 
 
