@@ -92,49 +92,17 @@ def main(options: Options, overrides: list[str]) -> int:
     """Compare two methods on the same images."""
     from rich.markup import escape
 
-    from analysis.results import open_counts
-    from analysis.robustness import under
-    from analysis.uncertainty import compare
+    from analysis.uncertainty import Resampling, compare
     from analysis.uncertainty.sentence import sentence
-    from rgbt.tracking.terminal import print_rich, rich_table
+    from rgbt.files.atomic import write_atomic
+    from rgbt.metrics.named import parse
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     del overrides  # none is heeded
-    frames, corruption, severity = options.frames, options.corruption, options.severity
-    _check_corruption(corruption, severity, frames)
     check_out(options.out)
-    _check_given(options)
-    opened = [
-        open_counts(side, options.runs_dir, options.split, frames)
-        for side in (options.a, options.b)
-    ]
-    if corruption:
-        opened = [under(each, corruption, severity) for each in opened]
+    opened = _opened(options)
     a, b = _counts(opened, options.missing)
-    settings = settings_of(options)
-    metrics = metrics_of(options.metrics, [*a, *b], settings)
-    comparison = compare(a, b, metrics, settings)
-    shown = " ".join(word for word in (corruption, severity) if word)
-    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
-    notes = absent_classes([*a, *b], settings.absent)
-    grid = replace(comparison_grid(comparison, labels), notes=notes)
-    said = sentence(comparison, *labels)
-    print_rich(rich_table(grid))
-    below = [said, *part_lines(comparison), comparison.reason, remark(settings)]
-    print_rich(escape("\n".join(filter(None, below))))
-    if options.out is not None:
-        _write(options.out, grid, said, comparison)
-    return 0
-
-
-def settings_of(options: Options) -> Resampling:
-    """The settings of the resampling.
-
-    Raises:
-        InputError: a value out of range.
-    """
-    from analysis.uncertainty.settings import Resampling
-
-    return Resampling(
+    settings = Resampling(
         resamples=options.resamples,
         level=options.level,
         method=options.method,
@@ -142,6 +110,30 @@ def settings_of(options: Options) -> Resampling:
         seed=options.seed,
         absent=None if options.absent == "as counted" else options.absent,
     )
+    comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
+    shown = " ".join(word for word in (options.corruption, options.severity) if word)
+    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
+    notes = absent_classes([*a, *b], settings.absent)
+    grid = replace(comparison_grid(comparison, labels), notes=notes)
+    said = sentence(comparison, *labels)
+    print_rich(rich_table(grid))
+    # Scores by day and by night are over other images.
+    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
+    parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
+    method = "percentile" if settings.method == "auto" else settings.method
+    remark = (
+        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
+        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
+        "Holm: corrected for the number of lines."
+    )
+    print_rich(escape("\n".join(filter(None, [said, *parts, comparison.reason, remark]))))
+    out = options.out
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
+        write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
+        print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
+    return 0
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
@@ -186,7 +178,8 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     for each in comparison.differences:
         both = [_shown(each.both), _p(each.p_both)] if with_seeds else []
         difference = number(each.value) if each.value != each.value else f"{each.value:+.2f}"
-        scores = [f"{number(side.value)}{_spread(side.sd)}" for side in (each.a, each.b)]
+        spreads = ["" if side.sd != side.sd else f" ± {side.sd:.2f}" for side in (each.a, each.b)]
+        scores = [number(each.a.value) + spreads[0], number(each.b.value) + spreads[1]]
         images = [_shown(each.images), _p(each.p_images)]
         rows.append((each.metric, *scores, difference, *images, *both, _p(each.p_corrected)))
     singles = f"{comparison.images} single images"
@@ -196,14 +189,6 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     title = f"{labels[1]} less {labels[0]}: {drawn}, {comparison.partition}"
     header = ("", *labels, "difference", *over, *more, "p (Holm)")
     return TextTable(title, header, tuple(rows))
-
-
-def part_lines(comparison: Comparison) -> list[str]:
-    """What was drawn for the scores by day and by night, which are over other images."""
-    from rgbt.metrics.named import parse
-
-    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
-    return [f"{part}: {said}." for part, said in drawn.items() if part is not None]
 
 
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
@@ -227,14 +212,27 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return absent_notes(summed, first.classes, first.scored, first.split, used)
 
 
-def remark(settings: Resampling) -> str:
-    """How the numbers of the table were made, in one line."""
-    method = "percentile" if settings.method == "auto" else settings.method
-    return (
-        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
-        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
-        "Holm: corrected for the number of lines."
-    )
+def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
+    """The trainings of both methods."""
+    from analysis.results import groups_in, open_counts
+    from analysis.robustness import under
+
+    frames, corruption, severity = options.frames, options.corruption, options.severity
+    if severity and not corruption:
+        raise InputError("'severity' has no effect without corruption=..., for example noise.")
+    if corruption and frames:
+        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
+    opened = []
+    for key, side in (("a", options.a), ("b", options.b)):
+        if not side:
+            groups = ", ".join(groups_in(options.runs_dir)) or "none"
+            raise InputError(
+                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
+                f"in {options.runs_dir}: {groups}."
+            )
+        found = open_counts(side, options.runs_dir, options.split, frames)
+        opened.append(under(found, corruption, severity) if corruption else found)
+    return opened
 
 
 def _counts(
@@ -256,64 +254,25 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _check_corruption(corruption: str, severity: str, frames: str) -> None:
-    if severity and not corruption:
-        raise InputError("'severity' has no effect without corruption=..., for example noise.")
-    if corruption and frames:
-        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
-
-
-def _check_given(options: Options) -> None:
-    from analysis.results import groups_in
-
-    for key, given in (("a", options.a), ("b", options.b)):
-        if not given:
-            groups = ", ".join(groups_in(options.runs_dir)) or "none"
-            raise InputError(
-                f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
-                f"in {options.runs_dir}: {groups}."
-            )
-
-
 def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
     """Labels that differ: what the methods are called, else with their seeds."""
     from analysis.results import label_of
 
-    labels = [label_of(each) for each in opened]
-    if labels[0] == labels[1]:
+    plain = labels = [label_of(each) for each in opened]
+    if plain[0] == plain[1]:
         seeds = [sorted(named.seed for named in each if named.seed is not None) for each in opened]
-        labels = [
-            f"{label} seed {', '.join(map(str, s))}"
-            for label, s in zip(labels, seeds, strict=True)
-            if s
-        ]
-    if len(set(labels)) < 2:
-        labels = [f"{key}: {label_of(each)}" for key, each in zip("ab", opened, strict=True)]
-    return labels
+        labels = [f"{plain[0]} seed {', '.join(map(str, each))}" for each in seeds if each]
+    return labels if len(set(labels)) == 2 else [f"a: {plain[0]}", f"b: {plain[1]}"]
 
 
 def _shown(interval: Interval | None) -> str:
     return "-" if interval is None else f"{interval.low:+.2f} to {interval.high:+.2f}"
 
 
-def _spread(sd: float) -> str:
-    return "" if sd != sd else f" ± {sd:.2f}"
-
-
 def _p(value: float) -> str:
     if value != value:
         return "-"
     return "<0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def _write(out: Path, grid: TextTable, said: str, comparison: Comparison) -> None:
-    from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import path_lines, print_rich
-
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
-    write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
-    print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
 
 
 def comparison_csv(comparison: Comparison) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import Protocol, file_name, protocol_of
+from rgbt.metrics.pairs import file_name, protocol_of
 from rgbt.spec.naming import GROUP, group_of
 from rgbt.tracking.run_files import Description
 from rgbt.tracking.run_folder import find_run, runs_in
@@ -34,9 +34,7 @@ class NamedCounts:
 
     Attributes:
         label: of the method.
-        path: of the counts.
-        counts: the counts.
-        run: the run that they are of; None for a file.
+        run: that they are of; None for a file.
         seed: of the run; None for a file.
     """
 
@@ -75,12 +73,18 @@ def open_counts(
     is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
     words = [text] if is_whole else split_list(text, RUNS)
     found = [each for word in words for each in _open(word, root, split, frames)]
-    for each in found:
-        _check_split_and_frames(each, split, frames)
-    paths = [each.path for each in found]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise InputError(f"'{text}' names {path} twice; one training counts once.")
+    for named in found:
+        counts = named.counts
+        if split and counts.split != split:
+            raise InputError(
+                f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
+                "or name counts of that split."
+            )
+        if frames and protocol_of(counts.partition) != frames:
+            raise InputError(
+                f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
+                "or name a run or what rgbt consistency run=... counted so."
+            )
     _check_trainings_differ(text, found)
     labels = dict.fromkeys(each.label for each in found)
     if len(labels) > 1:
@@ -88,23 +92,11 @@ def open_counts(
     return tuple(found)
 
 
-def _check_split_and_frames(named: NamedCounts, split: str, frames: Frames) -> None:
-    counts = named.counts
-    if split and counts.split != split:
-        raise InputError(
-            f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
-            "or name counts of that split."
-        )
-    if frames and protocol_of(counts.partition) != frames:
-        raise InputError(
-            f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
-            "or name a run or what rgbt consistency run=... counted so."
-        )
-
-
 def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
     """One seed twice, or equal counts, are no two trainings and would make a method look sure."""
     for first, second in combinations(found, 2):
+        if first.path == second.path:
+            raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
         is_again = (first.label, first.seed) == (second.label, second.seed)
         if is_again and first.seed is not None:
             raise InputError(
@@ -182,7 +174,7 @@ def _of_file(path: Path) -> NamedCounts:
 
 
 def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
-    runs = _runs(runs_dir)
+    runs = _runs(runs_dir) if word else []  # "" is no group, but that of runs without one
     return [run for run in runs if word in _groups(_description(run)) and run.is_finished]
 
 
@@ -192,7 +184,16 @@ def _runs(runs_dir: Path) -> list[RunResult]:
 
 def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
-    path = _pairs_of_frames(run, split, frames) if frames else _single_frames(run, split)
+    path = run.folder / file_name(frames, split) if frames else run.counts_path(split)
+    if not path.is_file():
+        there = [each.stem.removeprefix("counts_") for each in run.folder.glob("counts_*.npz")]
+        what = f"has counts of the splits {', '.join(sorted(there)) or 'none'}, not of '{split}'"
+        how = f"rgbt evaluate run={run.folder} split={split} out={path}"
+        if frames:
+            what = f"has no counts of pairs of frames {path.relative_to(run.folder)}"
+            views = "next" if frames == "next" else "virtual"
+            how = f"rgbt consistency run={run.folder} split={split} frames={views}"
+        raise InputError(f"{run.folder} {what}; {how} makes them once it is finished.")
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     description = _description(run)
@@ -204,30 +205,6 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
         run=run,
         seed=int(seed) if seed else None,
     )
-
-
-def _single_frames(run: RunResult, split: str) -> Path:
-    path = run.counts_path(split)
-    if not path.is_file():
-        there = [each.stem.removeprefix("counts_") for each in run.folder.glob("counts_*.npz")]
-        raise InputError(
-            f"{run.folder} has counts of the splits {', '.join(sorted(there)) or 'none'}, not of "
-            f"'{split}'; rgbt evaluate run={run.folder} split={split} out={path} makes "
-            "them once it is finished."
-        )
-    return path
-
-
-def _pairs_of_frames(run: RunResult, split: str, protocol: Protocol) -> Path:
-    path = run.folder / file_name(protocol, split)
-    if not path.is_file():
-        frames = "next" if protocol == "next" else "virtual"
-        raise InputError(
-            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
-            f"rgbt consistency run={run.folder} split={split} frames={frames} makes them "
-            "once it is finished."
-        )
-    return path
 
 
 def _groups(description: Description) -> tuple[str, str]:

@@ -44,7 +44,7 @@ class Training:
     """One training with its levels, the clean images first.
 
     Attributes:
-        label: what its method is called.
+        label: of its method.
         place: folder of the counts.
         levels: clean, then by row and rising severity.
     """
@@ -114,11 +114,11 @@ def levels_of(folder: Path) -> tuple[Level, ...]:
             f"{folder} holds no counts of clean images ({CLEAN}.json); rgbt robustness "
             "measures them first."
         )
-    return tuple(sorted(found, key=_place))
-
-
-def _place(level: Level) -> tuple[bool, bool, str, str, float]:
-    return (level.row != CLEAN, level.unit != "", level.title, level.row, level.severity)
+    return tuple(
+        sorted(
+            found, key=lambda at: (at.row != CLEAN, at.unit != "", at.title, at.row, at.severity)
+        )
+    )
 
 
 def under(
@@ -140,24 +140,22 @@ def under(
 def _under(named: NamedCounts, row: str, severity: str) -> NamedCounts:
     folder = folder_of(named)
     levels = levels_of(folder)
-    of_row = [level for level in levels if level.row == row]
+    of_row = {f"{level.severity:g}": level for level in levels if level.row == row}
     if not of_row:
         known = nearest(row, {level.row for level in levels})
         raise InputError(f"corruption={row} was not measured in {folder}; {known}.")
-    chosen = [each for each in of_row if f"{each.severity:g}" == severity]
-    chosen = of_row if not severity and len(of_row) == 1 else chosen
-    if len(chosen) != 1:
-        known = ", ".join(f"{each.severity:g}" for each in of_row)
+    level = of_row.get(severity) or (None if severity or len(of_row) > 1 else [*of_row.values()][0])
+    if level is None:
         raise InputError(
-            f"severity={severity}: {folder} holds {row} at {known}; give one of these."
+            f"severity={severity}: {folder} holds {row} at {', '.join(of_row)}; give one of these."
         )
-    (level,) = chosen
-    path = folder / f"{level.mark}.npz"
-    return replace(named, path=path, counts=level.counts)
+    return replace(named, path=folder / f"{level.mark}.npz", counts=level.counts)
 
 
 def _level(path: Path) -> Level:
-    made = _read(path)
+    made = read_json(path, dict[str, Any], "remove it, and rgbt robustness makes it again")
+    if made.get("format") != FORMAT:
+        raise InputError(f"{path} is not of rgbt robustness; name another folder.")
     try:
         of_level = {key: made[key] for key in ("row", "title", "unit")}
         severity = float(made["severity"])
@@ -167,10 +165,3 @@ def _level(path: Path) -> Level:
         ) from error
     counts = Counts.load(path.with_suffix(".npz"))
     return Level(path.stem, severity=severity, counts=counts, **of_level)
-
-
-def _read(path: Path) -> Any:
-    made = read_json(path, dict[str, Any], "remove it, and rgbt robustness makes it again")
-    if made.get("format") != FORMAT:
-        raise InputError(f"{path} is not of rgbt robustness; name another folder.")
-    return made

@@ -23,9 +23,8 @@ from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
 from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
-    from analysis.predictions.scoring import FolderScores, ScoringOptions
+    from analysis.predictions.scoring import FolderScores
     from analysis.predictions.table import ScoreKey, ScoreTable
-    from analysis.results import NamedCounts
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
 
@@ -121,6 +120,7 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """
     from analysis.predictions.text import remarks_on
+    from analysis.uncertainty import Resampling
     from rgbt.files.atomic import write_atomic
 
     given = [key for key in ("predictions", "counts") if getattr(options, key)]
@@ -132,7 +132,11 @@ def main(options: Options, overrides: list[str]) -> int:
     out = options.out
     check_out(out)
     _check_same_source(out, options.source)
-    settings = _resampling(options)
+    settings = None
+    if options.resamples:
+        settings = Resampling(
+            resamples=options.resamples, level=options.level, blocks=options.blocks
+        )
     if given == ["counts"]:
         counted, remarks = _stored(options, overrides), []
     else:
@@ -141,8 +145,7 @@ def main(options: Options, overrides: list[str]) -> int:
         remarks = remarks_on(scored)
         if out is not None:
             write_counts(scored, out)
-    tables = score_tables(counted, settings)
-    _show(tables, remarks, out)
+    _show(score_tables(counted, settings), remarks, out)
     if out is not None:
         write_atomic(out / SOURCE, f"{options.source}\n".encode())
     return 0
@@ -230,19 +233,10 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
-    from analysis.predictions.scoring import score_folder
+    from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
-    counting = replace(_counting(options), absent=absent)
-    folder, split = Path(options.predictions), options.split or "test"
-    with progress("counting", len(dataset.names(split))) as advance:
-        return score_folder(folder, dataset, split, counting, advance)
-
-
-def _counting(options: Options) -> ScoringOptions:
-    from analysis.predictions.scoring import PARTITIONS, ScoringOptions
-
-    return ScoringOptions(
+    counting = ScoringOptions(
         partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
         regions=options.regions,
         form=options.format,
@@ -251,7 +245,11 @@ def _counting(options: Options) -> ScoringOptions:
         suffix=options.suffix,
         name=options.name,
         threads=options.threads,
+        absent=absent,
     )
+    folder, split = Path(options.predictions), options.split or "test"
+    with progress("counting", len(dataset.names(split))) as advance:
+        return score_folder(folder, dataset, split, counting, advance)
 
 
 def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
@@ -272,23 +270,13 @@ def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
         "with rgbt predict run=... input=<split> out=folder, and score that folder."
     )
     labels = [each.label for each in found]
-    return [
-        (each.label if labels.count(each.label) == 1 else _distinct_label(each), each.counts)
-        for each in found
-    ]
-
-
-def _distinct_label(named: NamedCounts) -> str:
-    """A label of its own for one of several of one name."""
-    return str(named.path) if named.seed is None else f"{named.label} seed {named.seed}"
-
-
-def _resampling(options: Options) -> Resampling | None:
-    from analysis.uncertainty import Resampling
-
-    if options.resamples == 0:
-        return None
-    return Resampling(resamples=options.resamples, level=options.level, blocks=options.blocks)
+    named = []
+    for each in found:
+        label = each.label
+        if labels.count(label) > 1:
+            label = str(each.path) if each.seed is None else f"{label} seed {each.seed}"
+        named.append((label, each.counts))
+    return named
 
 
 def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> ScoreTable:

@@ -20,10 +20,8 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.regions import MAX_REGIONS
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
-    from analysis.statistics.collect import MeasurementSettings
     from analysis.statistics.data import SpatialStatistics
     from analysis.statistics.judging import Claim
-    from rgbt.dataset import LabelledDataset
     from rgbt.metrics.metric import Regions
 
 
@@ -76,40 +74,50 @@ def main(options: Options, overrides: list[str]) -> int:
 
     All estimators and averages are measured; the last table shows what depends on them.
     """
+    from rich.console import Group
+
+    from analysis.statistics import tables
     from analysis.statistics.claims import check_resampling, claims
-    from rgbt.tracking.terminal import path_lines, print_rich
+    from analysis.statistics.collect import MeasurementSettings, collect
+    from rgbt.tracking.terminal import info, path_lines, print_rich, rich_table
 
     check_out(options.out)
-    check_resampling(options.blocks, options.resamples, options.level)
-    settings, dataset = _settings(options, overrides)
-    dataset.names(options.split)  # a missing split is reported before anything is read
-    stats = _collect(dataset, options.split, settings)
-    found = claims(
-        stats,
-        level=options.level,
-        blocks=options.blocks,
-        resamples=options.resamples,
-        seed=options.seed,
-    )
-    _print(stats, found, (options.estimator, options.average), options.level)
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        print_rich(path_lines(_write(stats, found, options, options.out)))
-    return 0
-
-
-def _settings(
-    options: Options, overrides: list[str]
-) -> tuple[MeasurementSettings, LabelledDataset]:
-    from analysis.statistics.collect import MeasurementSettings
-
+    level, split = options.level, options.split
+    check_resampling(options.blocks, options.resamples, level)
     settings = MeasurementSettings(
         regions=_regions(options),
         kernel=options.kernel,
         workers=options.workers,
         skip_unreadable=built("data", overrides).on_error == "skip",
     )
-    return settings, dataset_of(overrides)
+    dataset = dataset_of(overrides)
+    left_out: list[str] = []
+    with progress("measuring", len(dataset.names(split))) as advance:
+        stats = collect(dataset, split, settings, advance, left_out.append)
+    for sentence in sorted(left_out):
+        info(f"left out: {sentence}")
+    found = claims(
+        stats,
+        level=level,
+        blocks=options.blocks,
+        resamples=options.resamples,
+        seed=options.seed,
+    )
+    # Of the claims about noise those of the chosen estimator and average.
+    way = options.estimator, options.average
+    shown = [claim for claim in found if not claim.estimator or _way(claim) == way]
+    grids = [
+        *tables.occupancy_grids(stats),
+        *tables.image_grids(stats, *way),
+        tables.entropy_grid(stats),
+        tables.claims_grid(shown, level),
+        tables.estimator_grid(found),
+    ]
+    print_rich(Group(tables.heading(stats), *map(rich_table, grids)))
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        print_rich(path_lines(_write(stats, found, options, options.out)))
+    return 0
 
 
 def _regions(options: Options) -> Regions:
@@ -126,40 +134,6 @@ def _regions(options: Options) -> Regions:
     )
 
 
-def _collect(
-    dataset: LabelledDataset, split: str, settings: MeasurementSettings
-) -> SpatialStatistics:
-    from analysis.statistics.collect import collect
-    from rgbt.tracking.terminal import info
-
-    left_out: list[str] = []
-    with progress("measuring", len(dataset.names(split))) as advance:
-        stats = collect(dataset, split, settings, advance, left_out.append)
-    for sentence in sorted(left_out):
-        info(f"left out: {sentence}")
-    return stats
-
-
-def _print(
-    stats: SpatialStatistics, found: tuple[Claim, ...], way: tuple[str, str], level: float
-) -> None:
-    """Tables on stdout; of the claims about noise those of the chosen estimator and average."""
-    from rich.console import Group
-
-    from analysis.statistics import tables
-    from rgbt.tracking.terminal import print_rich, rich_table
-
-    shown = [claim for claim in found if not claim.estimator or _way(claim) == way]
-    grids = [
-        *tables.occupancy_grids(stats),
-        *tables.image_grids(stats, *way),
-        tables.entropy_grid(stats),
-        tables.claims_grid(shown, level),
-        tables.estimator_grid(found),
-    ]
-    print_rich(Group(tables.heading(stats), *map(rich_table, grids)))
-
-
 def _write(
     stats: SpatialStatistics, found: tuple[Claim, ...], options: Options, folder: Path
 ) -> list[tuple[str, str]]:
@@ -167,11 +141,12 @@ def _write(
     from analysis.statistics import tables
     from rgbt.files.atomic import write_atomic
 
-    chosen = options.estimator, options.average
-    ways = sorted({_way(claim) for claim in found if claim.estimator}, key=lambda w: w != chosen)
-    text = tables.markdown(stats, found, ways, options.level)
+    # The chosen way first, the others in the order of the claims.
+    every = dict.fromkeys([(options.estimator, options.average), *map(_way, found)])
+    ways = [way for way in every if way[0]]
     stats.save(folder / "statistics.npz")
     write_atomic(folder / "regions.csv", tables.to_csv(stats).encode())
+    text = tables.markdown(stats, found, ways, options.level)
     write_atomic(folder / "statistics.md", text.encode())
     kinds = (("measurements", "statistics.npz"), ("values", "regions.csv"))
     return [(kind, str(folder / file)) for kind, file in (*kinds, ("tables", "statistics.md"))]

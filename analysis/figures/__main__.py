@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Interval
 
 from analysis.arguments import MOST, Blocks
-from rgbt.checks import InputError
+from rgbt.checks import InputError, check_choice
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
@@ -121,19 +121,19 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides choose data set and partition: dataset=mfnet dataset.root=/data/MFNet metric=ring9;
     stored statistics are of one partition, only heat maps can be cut anew
     """
+    from analysis.figures.catalogue import FIGURES, make
+
     figure, out, given = options.figure, options.out, options.given
     if figure == "list":
         idle = [*(["out"] if out else []), *given, *overrides]
         if idle:
             raise InputError(f"'{idle[0]}' needs the name of a figure: figure=...")
-        return _list()
-    return _draw(figure, out, given, overrides)
+        from rgbt.tracking.tables import TextTable
+        from rgbt.tracking.terminal import print_rich, rich_table
 
-
-def _draw(figure: str, out: str, given: dict[str, Any], overrides: list[str]) -> int:
-    from analysis.figures.catalogue import FIGURES, make
-    from rgbt.checks import check_choice
-
+        rows = tuple((name, spec.shows, spec.needs) for name, spec in FIGURES.items())
+        print_rich(rich_table(TextTable("figures", ("figure", "shows", "made from"), rows)))
+        return 0
     check_choice("figure", figure, FIGURES)
     if not out:
         raise InputError(
@@ -151,16 +151,6 @@ def _draw(figure: str, out: str, given: dict[str, Any], overrides: list[str]) ->
         beside = path.with_suffix(suffix)
         write_atomic(beside, text.encode())
         print(beside)
-    return 0
-
-
-def _list() -> int:
-    from analysis.figures.catalogue import FIGURES
-    from rgbt.tracking.tables import TextTable
-    from rgbt.tracking.terminal import print_rich, rich_table
-
-    rows = tuple((name, entry.shows, entry.needs) for name, entry in FIGURES.items())
-    print_rich(rich_table(TextTable("figures", ("figure", "shows", "made from"), rows)))
     return 0
 
 

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import (
-    APART,
-    PAGE,
-    new_figure,
-    readable,
-    region_axis,
-    say_splits,
-    series_style,
-    styled,
-)
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput, check_one_dataset
 from analysis.statistics.data import ALL, SpatialStatistics
 from analysis.statistics.derive import class_region_occupancy, normalised
 from rgbt.checks import InputError
@@ -25,9 +18,6 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import NIGHT
 from rgbt.metrics.scores import miou
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -38,9 +28,7 @@ class ClassRegions:
         classes: K - 1 names, without the background.
         shares: (K - 1, R) occupancy in percent of the region where the class is most frequent;
             NaN for a class that occurs nowhere.
-        part: of the images, "all", "day" or "night".
-        method: whose IoU `miou` is, or None.
-        miou: (R,) percent, or None.
+        miou: (R,) percent of `method`, or None.
     """
 
     classes: tuple[str, ...]
@@ -51,9 +39,27 @@ class ClassRegions:
     miou: NDArray[np.float64] | None
 
 
+def make(given: FigureInput) -> Figure:
+    """Occupancy of each class, and mIoU, by region."""
+    statistics = given.statistics(by_region=True)
+    method, split = None, ""
+    absent: Absent = "released"
+    if "methods" not in given.values:
+        given.refuse(["absent"], "methods=...")
+    else:
+        methods = given.counts("methods", statistics.partition)
+        if len(methods) != 1:
+            raise InputError(f"methods: {given.figure} shows one method, got {len(methods)}.")
+        method = next(iter(methods.items()))
+        check_one_dataset(statistics, method[1])
+        absent, split = given.absent([method[1]]), method[1].split
+    data = class_regions(statistics, given.get("part", ALL), method, absent)
+    return draw(data, splits=(statistics.split, split))
+
+
 def class_regions(
     statistics: SpatialStatistics,
-    part: str = "all",
+    part: str = ALL,
     method: tuple[str, Counts] | None = None,
     absent: Absent = "released",
 ) -> ClassRegions:
@@ -72,7 +78,7 @@ def class_regions(
         InputError: counts over other regions, or a part that the data set or the counts lack.
     """
     shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
-    scores = None
+    label, scores = None, None
     if method is not None:
         label, counts = method
         if counts.partition != statistics.partition:
@@ -80,54 +86,44 @@ def class_regions(
                 f"methods: '{label}' was counted over {counts.partition} but the statistics over "
                 f"{statistics.partition}; score or measure with one partition."
             )
-        by_region = _of_part(label, counts, part).by_region()
-        scores = 100 * miou(by_region, absent, counts.scored)
+        if part != ALL:
+            at_night = zip(counts.names, counts.night or (), strict=False)
+            counts = counts.select(name for name, dark in at_night if dark == (part == NIGHT))
+            if not counts.names:
+                raise InputError(
+                    f"part={part}: the counts of '{label}' hold no image of the {part}."
+                )
+        scores = 100 * miou(counts.by_region(), absent, counts.scored)
     return ClassRegions(
         classes=tuple(statistics.classes[1:]),
         partition=statistics.partition,
         shares=shares,
         part=part,
-        method=None if method is None else method[0],
+        method=label,
         miou=scores,
     )
 
 
-def _of_part(label: str, counts: Counts, part: str) -> Counts:
-    if part == ALL:
-        return counts
-    night = counts.night or [None] * len(counts.names)
-    of_part = [dark == (part == NIGHT) for dark in night]
-    chosen = [name for name, take in zip(counts.names, of_part, strict=True) if take]
-    if not chosen:
-        raise InputError(f"part={part}: the counts of '{label}' hold no image of the {part}.")
-    return counts.select(chosen)
-
-
-@styled
+@style.styled
 def draw(data: ClassRegions, splits: tuple[str, str]) -> Figure:
     """One line per class, and the mIoU as a thick black line, all in percent on one axis.
 
-    Args:
-        data: the series.
-        splits: that the occupancy and that the mIoU are of; shown where they differ.
+    `splits` are those of the occupancy and of the mIoU, shown where they differ.
     """
-    figure = new_figure(PAGE, 2.8)
+    figure = style.new_figure(style.PAGE, 2.8)
     axes = figure.subplots()
     places = np.arange(1, data.shares.shape[1] + 1)
     for index, (name, shares) in enumerate(zip(data.classes, data.shares, strict=True)):
         missing = " (none)" if np.isnan(shares).all() else ""
-        axes.plot(places, shares, label=readable(name) + missing, **series_style(index))
+        axes.plot(places, shares, label=style.readable(name) + missing, **style.series_style(index))
     if data.miou is not None:
-        line = {"color": APART, "linewidth": 2.2, "marker": "*", "markersize": 7}
-        axes.plot(places, data.miou, label=f"mIoU ({data.method})", **line)  # type: ignore[arg-type]
+        line: Any = {"color": style.APART, "linewidth": 2.2, "marker": "*", "markersize": 7}
+        axes.plot(places, data.miou, label=f"mIoU ({data.method})", **line)
     images = "" if data.part == ALL else f"; images of the {data.part}"
-    region_axis(axes, len(places), f"region ({data.partition}){images}")
+    style.region_axis(axes, len(places), f"region ({data.partition}){images}")
     axes.set(ylim=(0, 105))
-    axes.set_ylabel("SOR, percent of the class's\nlargest region" + _and_iou(data))
+    more = "" if data.miou is None else "; mIoU (%)"
+    axes.set_ylabel(f"SOR, percent of the class's\nlargest region{more}")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
-    say_splits(figure, splits)
+    style.say_splits(figure, splits)
     return figure
-
-
-def _and_iou(data: ClassRegions) -> str:
-    return "" if data.miou is None else "; mIoU (%)"

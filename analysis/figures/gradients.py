@@ -2,37 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import COLUMN, new_figure, series_style, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput
 
 POINTS = 999
 """An odd number of points: 0.5, where both gradients vanish, is one of them."""
 
 
-@dataclass(frozen=True)
-class GradientCurves:
-    """Magnitude of the derivative by the probability of one of two classes.
-
-    Attributes:
-        probability: (M,) in (0, 1).
-        entropy: (M,).
-        maximum_squares: (M,).
-    """
-
-    probability: NDArray[np.float64]
-    entropy: NDArray[np.float64]
-    maximum_squares: NDArray[np.float64]
-
-
-def gradient_curves(points: int = POINTS) -> GradientCurves:
+def gradient_curves(points: int = POINTS) -> tuple[NDArray[np.float64], ...]:
     """The two gradients of one pixel with two classes of probability p and 1 - p.
 
         entropy          E = -(p log p + (1 - p) log(1 - p)) / log 2,  |dE/dp| = |log2(p / (1 - p))|
@@ -42,23 +23,24 @@ def gradient_curves(points: int = POINTS) -> GradientCurves:
     paper that Fig. 3 is taken from (Chen et al., ICCV 2019) leaves out 1 / log 2 and 1 / 2, which
     multiplies the curves by 0.69 and by 2; the forms, linear against unbounded, are the same.
 
-    Args:
-        points: M, spaced evenly inside (0, 1); the ends are left out, where the entropy's gradient
-            is infinite.
+    Returns:
+        p, |dE/dp| and |dM/dp|, (points,) each; p is spaced evenly inside (0, 1), without the ends,
+        where the entropy's gradient is infinite.
     """
     p = np.arange(1, points + 1) / (points + 1)
-    return GradientCurves(p, np.abs(np.log2(p / (1 - p))), np.abs(2 * p - 1))
+    return p, np.abs(np.log2(p / (1 - p))), np.abs(2 * p - 1)
 
 
-@styled
-def draw(curves: GradientCurves) -> Figure:
-    """Both curves over the probability."""
-    figure = new_figure(COLUMN, 2.3)
+@style.styled
+def make(given: FigureInput) -> Figure:
+    """Both curves over the probability; analytic: nothing is `given`."""
+    del given
+    figure = style.new_figure(style.COLUMN, 2.3)
     axes = figure.subplots()
-    named = (("entropy minimisation", curves.entropy), ("maximum squares", curves.maximum_squares))
-    for index, (label, values) in enumerate(named):
-        style = series_style(index) | {"marker": ""}
-        axes.plot(curves.probability, values, label=label, **style)
+    probability, *curves = gradient_curves()
+    for index, label in enumerate(("entropy minimisation", "maximum squares")):
+        how = style.series_style(index) | {"marker": ""}
+        axes.plot(probability, curves[index], label=label, **how)
     axes.set(xlim=(0, 1), xlabel="predicted probability", ylabel="gradient magnitude")
     axes.set_ylim(bottom=0, top=6)
     axes.legend(loc="upper center")

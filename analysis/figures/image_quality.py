@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import product
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import COLOURS, COLUMN, SMALL, log_axis, new_figure, region_axis, styled
-from analysis.statistics.data import MODALITIES, SpatialStatistics
-from analysis.statistics.derive import AVERAGES, region_laplacian, region_snr, snr_of
-from analysis.statistics.resampling import ConsecutiveBlocks
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput
+from analysis.statistics.data import ALL, MODALITIES, SpatialStatistics
+from analysis.statistics.derive import AVERAGES, region_laplacian, region_snr
+from analysis.statistics.measure import ESTIMATORS
+from analysis.statistics.resampling import ConsecutiveBlocks, snr_samples
 from rgbt.checks import check_choice
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
@@ -44,6 +44,7 @@ class RegionSeries:
         values: series -> (R,).
         bands: series -> (2, R), ends of the 95 % interval over blocks of neighbouring images; NaN
             where there are too few.
+        images: part -> number of images.
     """
 
     measure: str
@@ -54,20 +55,30 @@ class RegionSeries:
     is_log: bool
 
 
+def make_laplacian(given: FigureInput) -> Figure:
+    """Laplacian variance by region."""
+    statistics = given.statistics(by_region=True)
+    return draw(laplacian_series(statistics, ConsecutiveBlocks(statistics)))
+
+
+def make_snr(given: FigureInput) -> Figure:
+    """Signal-to-noise ratio by region."""
+    way = given.get("estimator", ESTIMATORS[0]), given.get("average", AVERAGES[0])
+    statistics = given.statistics(by_region=True)
+    return draw(snr_series(statistics, ConsecutiveBlocks(statistics), *way))
+
+
 def laplacian_series(statistics: SpatialStatistics, blocks: ConsecutiveBlocks) -> RegionSeries:
     """Laplacian variance by region (SpatialSeg, Eq. 3 and Fig. 5), mean over images.
 
-    Args:
-        statistics: of a data set; the paper cuts it into nine rings.
-        blocks: resamples of its images, for the bands.
+    The paper cuts images into nine rings; `blocks` are resamples of them, for the bands.
     """
-    values, bands = {}, {}
-    for part in statistics.subsets():
-        drawn = blocks.mean(statistics.laplacian, part)
-        for index, modality in enumerate(MODALITIES):
-            values[modality, part] = region_laplacian(statistics, modality, part)
-            bands[modality, part] = _band(blocks, drawn[:, index], part)
-    return _made("Laplacian variance\n(squared grey levels)", statistics, values, bands)
+    return _series(
+        "Laplacian variance\n(squared grey levels)",
+        (statistics, blocks),
+        lambda modality, part: region_laplacian(statistics, modality, part),
+        lambda part: blocks.mean(statistics.laplacian, part),
+    )
 
 
 def snr_series(
@@ -76,42 +87,43 @@ def snr_series(
     """Signal-to-noise ratio by region (SpatialSeg, Eq. 4 and Fig. 6).
 
     Args:
-        statistics: of a data set; the paper cuts it into nine rings.
+        statistics: of a data set.
         blocks: resamples of its images, for the bands.
         estimator: of the noise, which the paper leaves open; a key of ``statistics.noise``.
-        average: "pooled" or "images", see `analysis.statistics.derive.AVERAGES`.
+        average: one of `analysis.statistics.derive.AVERAGES`.
 
     Raises:
         InputError: an estimator or average that there is not.
     """
     check_choice("estimator", estimator, statistics.noise)
-    check_choice("average", average, AVERAGES)
-    mean, noise = statistics.mean, statistics.noise[estimator]
+    way = estimator, average
+    return _series(
+        f"signal-to-noise ratio ({estimator})",
+        (statistics, blocks),
+        lambda modality, part: region_snr(statistics, modality, part, *way),
+        lambda part: snr_samples(statistics, blocks, part, *way),
+    )
+
+
+def _series(
+    measure: str,
+    sample: tuple[SpatialStatistics, ConsecutiveBlocks],
+    value: Callable[[str, str], Floats],
+    drawn: Callable[[str], Floats],
+) -> RegionSeries:
+    """Of `value` (R,) by modality and part, with bands from `drawn` (1 + B, 2, R) by part."""
+    statistics, blocks = sample
     values, bands = {}, {}
     for part in statistics.subsets():
-        if average == "pooled":
-            drawn = snr_of(blocks.mean(mean, part), blocks.mean(noise, part))
-        else:
-            drawn = blocks.mean(snr_of(mean, noise), part)
+        resampled = drawn(part)
         for index, modality in enumerate(MODALITIES):
-            values[modality, part] = region_snr(statistics, modality, part, estimator, average)
-            bands[modality, part] = _band(blocks, drawn[:, index], part)
-    return _made(f"signal-to-noise ratio ({estimator})", statistics, values, bands)
-
-
-def _band(blocks: ConsecutiveBlocks, drawn: Floats, part: str) -> Floats:
-    """(2, R) ends of the intervals of (1 + B, R) resampled values; NaN where there are none."""
-    found = [blocks.interval(each, part, level=LEVEL, scale="ratio") for each in drawn.T]
-    return np.array([[each.low for each in found], [each.high for each in found]])
-
-
-def _made(
-    measure: str,
-    statistics: SpatialStatistics,
-    values: Mapping[Key, Floats],
-    bands: Mapping[Key, Floats],
-) -> RegionSeries:
-    middles = [float(np.nanmedian(values[modality, "all"])) for modality in MODALITIES]
+            values[modality, part] = value(modality, part)
+            found = [
+                blocks.interval(each, part, level=LEVEL, scale="ratio")
+                for each in resampled[:, index].T
+            ]
+            bands[modality, part] = np.array([each[1:] for each in found]).T
+    middles = [float(np.nanmedian(values[modality, ALL])) for modality in MODALITIES]
     return RegionSeries(
         measure=measure,
         partition=statistics.partition,
@@ -122,42 +134,33 @@ def _made(
     )
 
 
-@styled
+@style.styled
 def draw(data: RegionSeries) -> Figure:
     """Six lines with intervals: modality by colour, part by marker and line."""
-    figure = new_figure(COLUMN, 3.1)
+    figure = style.new_figure(style.COLUMN, 3.1)
     axes = figure.subplots()
-    order = sorted(data.values, key=lambda key: MODALITIES.index(key[0]))
+    order = list(product(MODALITIES, data.images))
     for index, key in enumerate(order):
+        values, (low, high) = data.values[key], data.bands[key]
         shift = SPREAD * (index / max(1, len(order) - 1) - 0.5)
-        _draw_series(axes, data, key, shift)
-    region_axis(axes, len(data.values[order[0]]), f"region ({data.partition})")
+        # By a rounding error a value may lie outside its interval; no bar has a negative length.
+        lengths = np.maximum([values - low, high - values], 0)
+        modality, part = key
+        colour, (marker, line) = style.COLOURS[MODALITIES.index(modality)], MARKS[part]
+        how: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": line}
+        how |= {"markerfacecolor": colour if part == ALL else "white", "elinewidth": 0.6}
+        places = np.arange(1, len(values) + 1) + shift
+        axes.errorbar(places, values, lengths, label=f"{NAMES[modality]}, {part}", **how)
+    style.region_axis(axes, len(values), f"region ({data.partition})")
     if data.is_log:
-        log_axis(axes)
+        style.log_axis(axes)
     else:
         axes.set_ylim(bottom=0)
     axes.set_ylabel(data.measure)
     numbers = ", ".join(f"{part} {count}" for part, count in data.images.items())
-    axes.set_title(f"bars: 95 % over blocks of neighbouring images\n({numbers})", fontsize=SMALL)
+    axes.set_title(
+        f"bars: 95 % over blocks of neighbouring images\n({numbers})", fontsize=style.SMALL
+    )
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(NAMES))
     return figure
-
-
-def _draw_series(axes: Axes, data: RegionSeries, key: Key, shift: float) -> None:
-    modality, part = key
-    colour = COLOURS[MODALITIES.index(modality)]
-    marker, line = MARKS[part]
-    values = data.values[key]
-    places = np.arange(1, len(values) + 1) + shift
-    low, high = data.bands[key]
-    # A value may lie outside its interval by a rounding error, and no bar has a negative length.
-    lengths = np.maximum([values - low, high - values], 0)
-    style: dict[str, Any] = {
-        "color": colour,
-        "marker": marker,
-        "linestyle": line,
-        "elinewidth": 0.6,
-    }
-    style |= {"markerfacecolor": colour if part == "all" else "white"}
-    axes.errorbar(places, values, lengths, label=f"{NAMES[modality]}, {part}", **style)

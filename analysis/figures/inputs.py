@@ -12,7 +12,7 @@ from analysis.bar import progress
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.command import built
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the list of figures is there at once
     from analysis.predictions.maps import PixelMaps
     from analysis.results import Frames, NamedCounts
     from analysis.robustness import Training
@@ -30,7 +30,7 @@ class FigureInput:
     """The arguments of one figure.
 
     Attributes:
-        values: key -> value, only those that were given.
+        values: options that were given, by key.
         overrides: of the configuration: ``dataset=...``, ``metric=...``.
         metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
     """
@@ -41,11 +41,7 @@ class FigureInput:
     metric: str
 
     def need(self, key: str, what: str) -> Any:
-        """The value of a key.
-
-        Raises:
-            InputError: it was not given; `what` says what it would be.
-        """
+        """The value of a key; InputError, which says `what` it would be, where it was not given."""
         if key not in self.values:
             raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
         return self.values[key]
@@ -58,13 +54,13 @@ class FigureInput:
         """The convention for absent classes of ``absent=``; without it that of the counts.
 
         Raises:
-            InputError: no such convention, or counts made with both.
+            InputError: counts made with both.
         """
         from rgbt.metrics.counts import convention
 
-        if "absent" not in self.values:
-            return convention(every)
-        return cast("Absent", self.values["absent"])
+        return cast(
+            "Absent", self.values["absent"] if "absent" in self.values else convention(every)
+        )
 
     def named(self, key: str, what: str) -> dict[str, str]:
         """Label -> place, of ``label:place,label:place``; without a label the place's last name.
@@ -91,11 +87,7 @@ class FigureInput:
 
     @cached_property
     def dataset(self) -> LabelledDataset:
-        """The data set.
-
-        Raises:
-            InputError: none was chosen.
-        """
+        """The data set; InputError where none was chosen."""
         if not self.has_dataset:
             raise InputError(
                 f"figure={self.figure} needs dataset=..., for example dataset=mfnet "
@@ -133,6 +125,13 @@ class FigureInput:
                 raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
         return chosen
 
+    def name(self) -> str:
+        """The one image of ``names=``, or the first of the split; InputError for several."""
+        names = self.names(1)
+        if len(names) > 1:
+            raise InputError(f"names: figure={self.figure} shows one image, got {len(names)}.")
+        return names[0]
+
     def refuse(self, keys: Sequence[str], without: str) -> None:
         """Refuse keys that take effect only beside something that was not given.
 
@@ -148,15 +147,7 @@ class FigureInput:
                 )
 
     def check_split(self, stored: str, source: object) -> None:
-        """Refuse a ``split=`` that is not the one of an opened file.
-
-        Args:
-            stored: split that the file is of.
-            source: the file, for the sentence.
-
-        Raises:
-            InputError: they differ.
-        """
+        """Refuse a ``split=`` that is not the `stored` one of an opened file, `source`."""
         if self.get("split", stored) != stored:
             raise InputError(
                 f"split={self.values['split']}: {source} is of split '{stored}' already; leave "
@@ -181,6 +172,7 @@ class FigureInput:
             InputError: neither or both were given, or a stored file of another split or partition
                 than requested.
         """
+        from analysis.statistics.collect import MeasurementSettings, collect
         from analysis.statistics.data import SpatialStatistics
 
         if ("statistics" in self.values) == self.has_dataset:
@@ -189,7 +181,10 @@ class FigureInput:
                 "wrote, or dataset=... to measure one now (not both)."
             )
         if self.has_dataset:
-            return self._measured()
+            split = self.get("split", "train")
+            settings = MeasurementSettings(regions=self.regions)
+            with progress("measuring", len(self.dataset.names(split))) as advance:
+                return collect(self.dataset, split, settings, advance)
         path = _file(self.values["statistics"], "statistics.npz")
         stored = SpatialStatistics.load(path)
         self.check_split(stored.split, path)
@@ -201,14 +196,6 @@ class FigureInput:
                 "rgbt spatial partition=... regions=..."
             )
         return stored
-
-    def _measured(self) -> SpatialStatistics:
-        from analysis.statistics.collect import MeasurementSettings, collect
-
-        split = self.get("split", "train")
-        settings = MeasurementSettings(regions=self.regions)
-        with progress("measuring", len(self.dataset.names(split))) as advance:
-            return collect(self.dataset, split, settings, advance)
 
     def runs(self, frames: Frames = "") -> dict[str, list[Counts]]:
         """Label -> counts of its seeds, of ``runs=``; entries with one label are one method's.
@@ -240,10 +227,24 @@ class FigureInput:
         return found
 
     def counts(self, key: str, partition: str) -> dict[str, Counts]:
-        """Label -> counts over a partition, of the folders or files that `key` names."""
+        """Label -> counts over a partition, of the folders or files that `key` names.
+
+        Raises:
+            InputError: there are none, or of different images.
+        """
+        from rgbt.metrics.counts import Counts
+
+        found = {}
         what = "label:folder of what rgbt score wrote, with commas between methods"
-        named = self.named(key, what)
-        found = {label: open_counts_file(_path(place), partition) for label, place in named.items()}
+        for label, text in self.named(key, what).items():
+            place, path = _path(text), _file(text, f"counts_{partition}.npz")
+            if place.is_dir() and not path.is_file():
+                files = sorted(each.name for each in place.glob("counts*.npz"))
+                raise InputError(
+                    f"{place} lacks {path.name} (it holds {', '.join(files) or 'no counts'}); "
+                    "score the predictions over that partition with rgbt score."
+                )
+            found[label] = Counts.load(path)
         check_same_images({label: [counts] for label, counts in found.items()})
         return found
 
@@ -271,37 +272,13 @@ def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
 
 
 def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:
-    """Refuse statistics of one data set beside scores on another; splits may differ.
-
-    Raises:
-        InputError: they are of two data sets.
-    """
+    """Refuse statistics of one data set beside scores on another; splits may differ."""
     if statistics.fingerprint != counts.dataset:
         raise InputError(
             f"the statistics are of {statistics.dataset}, split '{statistics.split}', and the "
             f"scores of another data set (images such as '{counts.names[0]}'); measure the data "
             "set that was scored."
         )
-
-
-def open_counts_file(place: Path, partition: str) -> Counts:
-    """The counts over `partition` of a folder of `analysis.score`, or a file of counts.
-
-    Raises:
-        InputError: there are none.
-    """
-    from rgbt.metrics.counts import Counts
-
-    if not place.is_dir():
-        return Counts.load(place)
-    path = place / f"counts_{partition}.npz"
-    if not path.is_file():
-        there = ", ".join(sorted(each.name for each in place.glob("counts*.npz"))) or "no counts"
-        raise InputError(
-            f"{place} lacks {path.name} (it holds {there}); score the predictions over that "
-            "partition with rgbt score."
-        )
-    return Counts.load(path)
 
 
 def _file(text: str, name: str) -> Path:

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import PAGE, new_figure, pack, show_image, styled
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError
+from rgbt.config.command import built
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from rgbt.types import AnyMasker, Sample
 
 PATCHES = (8, 16, 32, 64)
@@ -30,13 +31,8 @@ HIDDEN = (150, 190, 230)
 
 @dataclass(frozen=True)
 class MaskExample:
-    """One mask on a pair of images.
-
-    Attributes:
-        rgb: (H, W, 3) uint8, hidden pixels in the colour `HIDDEN`.
-        thermal: the same, grey elsewhere.
-        rgb_hidden: (H, W) bool.
-        thermal_hidden: (H, W) bool.
+    """One mask on a pair of images: (H, W, 3) pictures with hidden pixels in the colour `HIDDEN`,
+    and (H, W) which pixels are hidden.
     """
 
     title: str
@@ -44,6 +40,15 @@ class MaskExample:
     thermal: NDArray[np.uint8]
     rgb_hidden: NDArray[np.bool_]
     thermal_hidden: NDArray[np.bool_]
+
+
+def make(given: FigureInput) -> Figure:
+    """Masks on a pair of images."""
+    patches = given.get("patches", PATCHES)
+    sample = given.dataset.read(given.name())
+    chosen = masker_overrides(patches).items()
+    maskers = {title: built("masker", overrides) for title, overrides in chosen}
+    return draw(mask_examples(sample, maskers, whole_cells(patches), given.get("seed", 0)))
 
 
 def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
@@ -66,7 +71,7 @@ def mask_examples(
 
     Args:
         sample: a pair of the data set.
-        maskers: title -> masker.
+        maskers: by title.
         multiple: number of pixels that every cell divides.
         seed: every mask is drawn from it and its place among the maskers.
 
@@ -83,8 +88,15 @@ def mask_examples(
     examples = []
     for index, (title, masker) in enumerate(maskers.items()):
         pair = masker((height, width), centre, torch_generator(seed, "figure masks", index))
-        hidden = [_pixels(cells[0].numpy(), (height, width)) for cells in (pair.rgb, pair.thermal)]
-        shown = [_hide(image, each) for image, each in zip((rgb, thermal), hidden, strict=True)]
+        hidden = [
+            np.kron(
+                cells[0].numpy(), np.ones((height // cells.shape[1], width // cells.shape[2]), bool)
+            )
+            for cells in (pair.rgb, pair.thermal)
+        ]
+        shown = [rgb.copy(), np.repeat(thermal[..., None], 3, axis=2)]
+        for image, each in zip(shown, hidden, strict=True):
+            image[each] = HIDDEN
         examples.append(MaskExample(title, shown[0], shown[1], hidden[0], hidden[1]))
     return tuple(examples)
 
@@ -112,28 +124,17 @@ def _cut(image: NDArray[np.uint8], multiple: int, name: str) -> NDArray[np.uint8
     return image[top : top + sides[0], left : left + sides[1]]
 
 
-def _pixels(cells: NDArray[np.bool_], image_hw: tuple[int, int]) -> NDArray[np.bool_]:
-    side = (image_hw[0] // cells.shape[0], image_hw[1] // cells.shape[1])
-    return np.kron(cells, np.ones(side, bool))
-
-
-def _hide(image: NDArray[np.uint8], hidden: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    shown = image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-    shown[hidden] = HIDDEN
-    return shown
-
-
-@styled
+@style.styled
 def draw(examples: Sequence[MaskExample]) -> Figure:
     """One column per mask; RGB above, thermal below."""
     height, width = examples[0].thermal_hidden.shape
-    cell = (PAGE - 0.2) / len(examples)
-    figure = new_figure(PAGE, 2 * (cell * height / width + 0.02) + 0.18)
-    pack(figure)
+    cell = (style.PAGE - 0.2) / len(examples)
+    figure = style.new_figure(style.PAGE, 2 * (cell * height / width + 0.02) + 0.18)
+    style.pack(figure)
     axes = figure.subplots(2, len(examples), squeeze=False)
     for column, example in enumerate(examples):
-        show_image(axes[0, column], example.rgb)
-        show_image(axes[1, column], example.thermal)
+        style.show_image(axes[0, column], example.rgb)
+        style.show_image(axes[1, column], example.thermal)
         axes[0, column].set_title(example.title)
     axes[0, 0].set_ylabel("RGB")
     axes[1, 0].set_ylabel("thermal")

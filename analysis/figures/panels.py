@@ -8,33 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import (
-    PAGE,
-    SMALL,
-    class_legend,
-    folded,
-    legend_height,
-    new_figure,
-    pack,
-    show_image,
-    styled,
-)
+from analysis.bar import progress
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput
+from analysis.predictions.images import PredictionReader
+from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import ring_rectangle
 from rgbt.metrics.scores import miou
+from rgbt.tracking.pictures import colours
+from rgbt.tracking.terminal import info
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from rgbt.dataset import LabelledDataset
     from rgbt.types import Sample
 
@@ -42,14 +37,10 @@ Labels = NDArray[np.uint8]
 ReadPrediction = Callable[[str], Labels]
 """Name of an image -> (H, W) predicted class indices."""
 
-RULES = ("first", "largest_difference")
-"""``pick=``: the first of the split, or those where two methods differ most."""
+PREDICTIONS = "label:folder of predicted label images, with commas between methods"
 
 WHOLE = Regions(partition="ring", regions=1, aspect="image", absent="exclude")
 """The image as one region."""
-
-LAYOUTS = ("rows", "columns")
-"""``layout=``: one row per image (SpatialSeg, CRM), or one column per image (Temporal)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +48,6 @@ class PanelRow:
     """One image of a panel.
 
     Attributes:
-        name: of the image.
         rgb: (H, W, 3) uint8.
         thermal: (H, W) uint8.
         label: (H, W) class indices or 255.
@@ -76,19 +66,53 @@ class PanelRow:
 
 @dataclass(frozen=True)
 class QualitativePanel:
-    """A qualitative figure.
-
-    Attributes:
-        classes: K names.
-        palette: (K, 3) uint8.
-        box: rows and columns of the innermost region.
-    """
+    """A qualitative figure, with a box on the rows and columns of the innermost region."""
 
     methods: tuple[str, ...]
     rows: tuple[PanelRow, ...]
     classes: tuple[str, ...]
     palette: Labels
     box: tuple[slice, slice]
+
+
+def make(given: FigureInput) -> Figure:
+    """Images, ground truth and predictions."""
+    named = given.named("methods", PREDICTIONS)
+    folders = {label: Path(place).expanduser() for label, place in named.items()}
+    form: Any = given.get("format", "auto")
+    suffix, dataset = given.get("suffix", ""), given.dataset
+    reader = PredictionReader(dataset.classes, dataset.palette, form)
+
+    def reading(folder: Path) -> ReadPrediction:
+        def read(name: str) -> Labels:
+            path = folder / f"{name}{suffix}.png"
+            if not path.is_file():
+                raise InputError(
+                    f"methods: there is no prediction {path}; name a folder that holds "
+                    f"NAME{suffix}.png for every image shown, or other images with names=..."
+                )
+            return reader.read(path)
+
+        return read
+
+    if "names" in given.values and ("pick" in given.values or "rows" in given.values):
+        raise InputError("names= says which images are shown; leave pick= and rows= out.")
+    names = given.names(given.get("rows", 4))
+    if given.get("pick", "first") == "largest_difference":
+        split = given.get("split", "test")
+        options = ScoringOptions(partitions=("ring",), regions=1, form=form, suffix=suffix)
+        mious = {}
+        with progress("comparing", len(folders) * len(dataset.names(split))) as advance:
+            for label, folder in folders.items():
+                (counts,) = score_folder(folder, dataset, split, options, advance).counts
+                mious[label] = image_mious(counts)
+        names = most_different(mious, dataset.names(split), given.get("rows", 4))
+    readers = {label: reading(folder) for label, folder in folders.items()}
+    made = panel(dataset, readers, names, given.regions)
+    for row in made.rows:
+        scores = zip(made.methods, row.mious, strict=True)
+        info(f"{row.name}: " + ", ".join(f"{label} mIoU {each:.1f}" for label, each in scores))
+    return draw(made, given.get("layout", "rows"))
 
 
 def image_mious(counts: Counts) -> dict[str, float]:
@@ -103,12 +127,12 @@ def panel(
     names: Sequence[str],
     regions: Regions,
 ) -> QualitativePanel:
-    """The pictures of a panel.
+    """The pictures of a panel, one row per name.
 
     Args:
         dataset: holds the images.
         methods: label -> reader of its predictions.
-        names: of the images, one per row.
+        names: of the images.
         regions: rings; the box is around the innermost.
 
     Raises:
@@ -137,31 +161,22 @@ def panel(
 def _row(
     sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[np.bool_]
 ) -> PanelRow:
-    if sample.label is None:
+    label = sample.label
+    if label is None:
         raise InputError(f"names: '{sample.name}' has no label; choose images that are labelled.")
-    predictions = {label: read(sample.name) for label, read in methods.items()}
-    for label, prediction in predictions.items():
-        check_size(sample.name, label, sample.label, prediction)
+    predictions = {method: read(sample.name) for method, read in methods.items()}
+    for method, each in predictions.items():
+        if each.shape != label.shape:
+            raise InputError(
+                f"methods: the prediction of '{sample.name}' by '{method}' is {each.shape[0]}x"
+                f"{each.shape[1]} pixels but its label is {label.shape[0]}x{label.shape[1]}; "
+                "save predictions at the size of the labels."
+            )
     whole = RegionCounter(len(scored), WHOLE)
-    matrices = [whole(sample.label, each).sum(0) for each in predictions.values()]
-    return PanelRow(
-        name=sample.name,
-        rgb=sample.rgb,
-        thermal=sample.thermal,
-        label=sample.label,
-        predictions=tuple(predictions.values()),
-        mious=tuple(float(100 * miou(each, "exclude", scored)) for each in matrices),
-    )
-
-
-def check_size(name: str, method: str, label: Labels, prediction: Labels) -> None:
-    """Raise InputError unless a prediction has the size of the label."""
-    if prediction.shape != label.shape:
-        raise InputError(
-            f"methods: the prediction of '{name}' by '{method}' is {prediction.shape[0]}x"
-            f"{prediction.shape[1]} pixels but its label is {label.shape[0]}x{label.shape[1]}; "
-            "save predictions at the size of the labels."
-        )
+    matrices = [whole(label, each).sum(0) for each in predictions.values()]
+    mious = tuple(float(100 * miou(each, "exclude", scored)) for each in matrices)
+    images = sample.rgb, sample.thermal, label
+    return PanelRow(sample.name, *images, tuple(predictions.values()), mious)
 
 
 def most_different(
@@ -190,44 +205,43 @@ def most_different(
     return tuple(sorted(known, key=lambda name: -gaps[name])[:number])
 
 
-@styled
+@style.styled
 def draw(data: QualitativePanel, layout: str = "rows") -> Figure:
     """Pictures with a white box on the centre; below them the classes."""
+    from matplotlib.patches import Rectangle
+
     plain = ("RGB", "thermal", "ground truth", *data.methods)
     height, width = data.rows[0].thermal.shape
     shape = (len(data.rows), len(plain))
     lines, columns = shape if layout == "rows" else shape[::-1]
-    cell = (PAGE - 0.25) / columns
-    legend = legend_height(PAGE, len(data.classes))
-    titles = [folded(title, cell if layout == "rows" else cell * height / width) for title in plain]
+    cell = (style.PAGE - 0.25) / columns
+    legend = style.legend_height(style.PAGE, len(data.classes))
+    titles = [
+        style.folded(title, cell if layout == "rows" else cell * height / width) for title in plain
+    ]
     folds = 0.14 * max(title.count("\n") for title in titles) if layout == "rows" else 0.0
-    figure = new_figure(PAGE, lines * (cell * height / width + 0.02) + 0.2 + folds + legend)
-    pack(figure)
+    figure = style.new_figure(
+        style.PAGE, lines * (cell * height / width + 0.02) + 0.2 + folds + legend
+    )
+    style.pack(figure)
     grid = figure.subplots(lines, columns, squeeze=False)
     axes = grid if layout == "rows" else grid.T
+    box_rows, box_columns = data.box
+    corner = (box_columns.start - 0.5, box_rows.start - 0.5)
+    size = (box_columns.stop - box_columns.start, box_rows.stop - box_rows.start)
     for line, row in zip(axes, data.rows, strict=True):
-        _draw_row(line, row, data)
+        thermal = np.repeat(row.thermal[..., None], 3, axis=2)
+        painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
+        for each, picture in zip(line, (row.rgb, thermal, *painted), strict=True):
+            style.show_image(each, picture)
+            for colour, edge in (("black", 1.4), ("white", 0.8)):
+                box = Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge)
+                each.add_patch(box)
     names = [row.name for row in data.rows]
     above, beside = (titles, names) if layout == "rows" else (names, titles)
     for each, title in zip(grid[0], above, strict=True):
         each.set_title(title)
     for each, title in zip(grid[:, 0], beside, strict=True):
-        each.set_ylabel(title, fontsize=SMALL)
-    class_legend(figure, data.classes, data.palette)
+        each.set_ylabel(title, fontsize=style.SMALL)
+    style.class_legend(figure, data.classes, data.palette)
     return figure
-
-
-def _draw_row(axes: Sequence[Axes], row: PanelRow, data: QualitativePanel) -> None:
-    from matplotlib.patches import Rectangle
-
-    from rgbt.tracking.pictures import colours
-
-    thermal = np.repeat(row.thermal[..., None], 3, axis=2)
-    painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
-    rows, columns = data.box
-    corner = (columns.start - 0.5, rows.start - 0.5)
-    size = (columns.stop - columns.start, rows.stop - rows.start)
-    for each, picture in zip(axes, (row.rgb, thermal, *painted), strict=True):
-        show_image(each, picture)
-        for colour, width in (("black", 1.4), ("white", 0.8)):
-            each.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=width))

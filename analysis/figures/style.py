@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from analysis.arguments import check_out
 from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 COLUMN, PAGE = 3.4, 7.0
 """Width in inches of one column and of a page of two columns (IEEE)."""
@@ -89,24 +87,12 @@ RC: Any = {
 }
 
 
-def styled(draw: Callable[P, T]) -> Callable[P, T]:
-    """Make `draw` draw with the letters, lines and sizes of `RC`."""
-
-    @wraps(draw)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> T:
-        from matplotlib import rc_context
-
-        with rc_context(RC):
-            return draw(*args, **kwargs)
-
-    return drawn
+styled = rc_context(RC)
+"""Decorator: draw with the letters, lines and sizes of `RC`."""
 
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of `width` x `height` inches that makes room for its labels."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -118,11 +104,7 @@ def pack(figure: Figure) -> None:
 
 
 def out_path(out: str) -> Path:
-    """The file that ``out=`` names, before anything is computed for it.
-
-    Raises:
-        InputError: its ending is none of `SUFFIXES`, or its folder cannot be written.
-    """
+    """The file that ``out=`` names; InputError for another ending, or where none can be written."""
     path = Path(out).expanduser()
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -135,11 +117,7 @@ def out_path(out: str) -> Path:
 
 @styled
 def save(figure: Figure, path: Path) -> None:
-    """Write `figure` at its size: PDF and SVG with text as text, PNG at 300 dots per inch.
-
-    Raises:
-        InputError: see `out_path`.
-    """
+    """Write `figure` at its size: PDF and SVG with text as text, PNG at 300 dots per inch."""
     kind = out_path(str(path)).suffix.lower()[1:]
     # Without the time of day the same data gives the same file.
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {}}[kind]
@@ -177,32 +155,24 @@ def region_axis(axes: Axes, regions: int, label: str = "region") -> None:
     axes.set_xlabel(label)
 
 
-def draw_borders(axes: Axes, region_map: NDArray[np.integer], colour: str = "white") -> None:
-    """Lines between the regions, dark below bright so that they show on any picture.
-
-    Args:
-        axes: with an image of the same size.
-        region_map: (H, W) region of every pixel.
-        colour: of the bright line.
-    """
+def draw_borders(axes: Axes, region_map: NDArray[np.integer]) -> None:
+    """Lines between the regions (H, W), dark below bright so that they show on any picture."""
     levels = np.arange(0.5, int(region_map.max()) + 0.5)
     if len(levels) == 0:
         return
-    for line, width in (("black", 1.6), (colour, 0.7)):
+    for line, width in (("black", 1.6), ("white", 0.7)):
         axes.contour(region_map, levels, colors=line, linewidths=width)
 
 
-def number(axes: Axes, place: tuple[int, int], text: str, size: float = SMALL) -> None:
+def number(axes: Axes, place: tuple[int, int], text: str) -> None:
     """A number on a picture at (row, column), on a white ground."""
     box = {"boxstyle": "round,pad=0.06", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
-    at = {"ha": "center", "va": "center", "fontsize": size, "bbox": box}
+    at = {"ha": "center", "va": "center", "fontsize": SMALL, "bbox": box}
     axes.text(place[1], place[0], text, **at)  # type: ignore[arg-type]
 
 
 def class_legend(figure: Figure, names: Sequence[str], palette: NDArray[np.uint8]) -> None:
     """Names of classes with their colours, below everything."""
-    from matplotlib.patches import Patch
-
     patches = [
         Patch(facecolor=colour / 255.0, edgecolor="black", linewidth=0.4, label=readable(name))
         for name, colour in zip(names, palette, strict=True)
@@ -226,8 +196,6 @@ def legend_height(width: float, classes: int) -> float:
 
 def log_axis(axes: Axes) -> None:
     """A logarithmic vertical axis whose ticks say numbers, also within a decade."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

@@ -4,30 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.figures.style import (
-    APART,
-    COLOURS,
-    MARKERS,
-    PAGE,
-    new_figure,
-    region_axis,
-    say_splits,
-    series_legend,
-    styled,
-)
+from analysis.figures import style
+from analysis.figures.inputs import FigureInput, check_one_dataset
+from analysis.figures.maps import occupancy_over
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.metric import Absent
+from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.scores import class_mean, miou, recall
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 TITLES = {
     "vertical": "vertical (left to right)",
@@ -41,7 +30,6 @@ class Trend:
     """Scores over the regions of one partition, percent.
 
     Attributes:
-        partition: "vertical", "horizontal" or "ring".
         occupancy: (R,) sample occupancy rate (Eq. 2).
         ious: method -> (R,) mean IoU.
         accuracies: method -> (R,) mean class accuracy.
@@ -60,6 +48,24 @@ class Trend:
         return {name: values - values[0] for name, values in series.items()}
 
 
+def make(given: FigureInput) -> Figure:
+    """IoU, accuracy and occupancy over three partitions."""
+    regions = given.get("regions", 5)
+    counts = {each: given.counts("methods", f"{each}{regions}") for each in TITLES}
+    absent = given.absent(each for methods in counts.values() for each in methods.values())
+    statistics = given.statistics()
+    of_methods = next(iter(counts["ring"].values()))
+    check_one_dataset(statistics, of_methods)
+    height, width = statistics.region_map.shape
+    series = []
+    for partition, methods in counts.items():
+        chosen: Any = {"partition": partition, "aspect": "image" if partition == "ring" else None}
+        cut = Regions(regions=regions, absent=absent, **chosen)
+        occupancy = occupancy_over(statistics, cut.map((height, width)))
+        series.append(trend(partition, occupancy, methods, absent))
+    return draw(series, splits=(statistics.split, of_methods.split))
+
+
 def trend(
     partition: str,
     occupancy: NDArray[np.float64],
@@ -72,13 +78,10 @@ def trend(
     Whether the paper counts the background is not stated; here it counts, as in its tables.
 
     Args:
-        partition: "vertical", "horizontal" or "ring".
+        partition: a key of `TITLES`.
         occupancy: (R,) in 0..1.
-        methods: label -> counts with R regions of that partition.
+        methods: label -> counts; InputError if they are not over R regions of that partition.
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-
-    Raises:
-        InputError: counts of another partition.
     """
     expected = f"{partition}{len(occupancy)}"
     for label, counts in methods.items():
@@ -99,44 +102,28 @@ def trend(
     )
 
 
-@styled
+@style.styled
 def draw(trends: Sequence[Trend], splits: tuple[str, str]) -> Figure:
     """One panel per partition; methods by colour, IoU in full and accuracy in open markers.
 
-    Args:
-        trends: of the partitions.
-        splits: that the occupancy and that the scores are of; shown where they differ.
+    `splits` are those of the occupancy and of the scores, shown where they differ.
     """
-    figure = new_figure(PAGE, 2.5)
+    figure = style.new_figure(style.PAGE, 2.5)
     panels = figure.subplots(1, len(trends), sharey=True, squeeze=False)[0]
-    for index, (axes, each) in enumerate(zip(panels, trends, strict=True)):
-        _draw_one(axes, each)
-        axes.set_title(f"({'abc'[index]}) {TITLES[each.partition]}")
+    for letter, axes, data in zip("abc", panels, trends, strict=False):
+        axes.set_title(f"({letter}) {TITLES[data.partition]}")
+        axes.axhline(0, color="grey", linewidth=0.6)
+        places, changes = np.arange(1, len(data.occupancy) + 1), data.changes()
+        for kind, line in (("IoU", "-"), ("Acc", "--")):
+            for index, method in enumerate(data.ious):
+                name, colour = f"{kind} ({method})", style.COLOURS[index % len(style.COLOURS)]
+                how = {"color": colour, "marker": style.MARKERS[index % len(style.MARKERS)]}
+                how |= {"markerfacecolor": colour if kind == "IoU" else "white"}
+                axes.plot(places, changes[name], linestyle=line, label=name, **how)
+        how = {"color": style.APART, "linestyle": ":", "marker": "*", "label": "SOR"}
+        axes.plot(places, changes["SOR"], ms=5, **how)
+        style.region_axis(axes, len(places))
     panels[0].set_ylabel("change from region 1\n(percent points)")
-    series_legend(figure, panels[0], columns=5)
-    say_splits(figure, splits)
+    style.series_legend(figure, panels[0], columns=5)
+    style.say_splits(figure, splits)
     return figure
-
-
-def _draw_one(axes: Axes, data: Trend) -> None:
-    places = np.arange(1, len(data.occupancy) + 1)
-    labels = list(data.ious)
-    axes.axhline(0, color="grey", linewidth=0.6)
-    for name, values in data.changes().items():
-        kind, _, method = name.removesuffix(")").partition(" (")
-        if not method:
-            axes.plot(places, values, color=APART, linestyle=":", marker="*", label=name, ms=5)
-            continue
-        index = labels.index(method)
-        colour = COLOURS[index % len(COLOURS)]
-        filled = kind == "IoU"
-        axes.plot(
-            places,
-            values,
-            color=colour,
-            marker=MARKERS[index % len(MARKERS)],
-            markerfacecolor=colour if filled else "white",
-            linestyle="-" if filled else "--",
-            label=name,
-        )
-    region_axis(axes, len(places))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -41,7 +42,7 @@ def find(
 
     Args:
         folder: holds the PNG files.
-        dataset: whose names are looked up.
+        dataset: its names are looked up.
         split: of the data set.
         suffix: between the name and the ending, e.g. "_pred"; "" for none.
         missing: "refuse", or "leave_out" to go on without the images that have no file.
@@ -56,21 +57,22 @@ def find(
     if not there:
         raise InputError(
             f"none of the {len(names)} images of split '{split}' has a file NAME{suffix}.png in "
-            f"{folder}; it holds {_listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
+            f"{folder}; it holds {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
         )
     if absent and missing == "refuse":
         raise InputError(
             f"{folder} lacks the predictions of {len(absent)} of the {len(names)} images of split "
-            f"'{split}' ({_listed(absent, f'{suffix}.png')}); add them, or count the others alone "
+            f"'{split}' ({listed(absent, f'{suffix}.png')}); add them, or count the others alone "
             "with missing=leave_out."
         )
     own = {f"{name}{suffix}" for name in names} | {f"{name}{OVERLAY}" for name in names}
     return PredictionFiles(there, absent, tuple(sorted(stems - own)))
 
 
-def listed(names: tuple[str, ...]) -> str:
+def listed(names: Sequence[str], ending: str = "") -> str:
     """The first names of many, for a sentence."""
-    return _listed(names, "")
+    shown = ", ".join(f"{name}{ending}" for name in names[:SHOWN])
+    return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"
 
 
 def _stems(folder: Path) -> set[str]:
@@ -82,35 +84,22 @@ def _stems(folder: Path) -> set[str]:
     stems = {path.stem for path in folder.glob("*.png")}
     if not stems:
         others = sorted(path.name for path in folder.iterdir())
-        holds = f"it holds {_listed(others, '')}" if others else "it is empty"
+        holds = f"it holds {listed(others)}" if others else "it is empty"
         raise InputError(f"predictions={folder}: expected PNG files named NAME.png, but {holds}.")
     return stems
 
 
 def _hint(stems: set[str], dataset: LabelledDataset, suffix: str) -> str:
-    """What else the names could mean: a suffix, or another split."""
-    for split in dataset.splits:
-        if not dataset.has(split):
-            continue
+    """What else the names could mean: another split, or the most frequent text after a name."""
+    for split in filter(dataset.has, dataset.splits):
         names = dataset.names(split)
         number = sum(f"{name}{suffix}" in stems for name in names)
         if number:
             return f", {number} of them images of split '{split}': give split={split}"
-        endings = _endings(stems, names)
-        if endings:
-            return f": give suffix={endings} and split={split} if these are the predictions"
+        pairs = ((stem, name) for stem in stems for name in names if name)
+        after = Counter(stem[len(name) :] for stem, name in pairs if stem.startswith(name))
+        after.pop(OVERLAY, None)
+        if after and after.most_common(1)[0][0]:
+            ending = after.most_common(1)[0][0]
+            return f": give suffix={ending} and split={split} if these are the predictions"
     return ""
-
-
-def _endings(stems: set[str], names: tuple[str, ...]) -> str:
-    """The most frequent text after a name of the split; "" where there is none."""
-    after = Counter(
-        stem[len(name) :] for stem in stems for name in names if name and stem.startswith(name)
-    )
-    after.pop(OVERLAY, None)
-    return after.most_common(1)[0][0] if after else ""
-
-
-def _listed(names: tuple[str, ...] | list[str], ending: str) -> str:
-    shown = ", ".join(f"{name}{ending}" for name in names[:SHOWN])
-    return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"

@@ -89,7 +89,7 @@ class PredictionReader:
 
     Args:
         classes: K names.
-        palette: their K (red, green, blue) colours.
+        palette: K (red, green, blue) colours.
         form: how files are read. "auto": one channel holds indices, RGB holds colours, and a
             palette counts where its indices and its colours say the same; "index": the stored
             numbers, whatever colours go with them (RGB with three equal channels too); "colour":
@@ -120,12 +120,21 @@ class PredictionReader:
         if self.form == "colour" or (self.form == "auto" and header.kind == "colours"):
             self._check_colours_differ()
             return self._from_colours(_decode(path, "RGB"), path)
-        if header.kind == "one channel":
-            return self._checked(_grey_indices(path, header), path)
+        if header.kind == "one channel" and header.bits != 8:  # decoders stretch these to 0..255
+            raise InputError(
+                f"{path}: expected 8 bits per pixel, got {header.bits}; save it as 8 bit, so that "
+                "its values are read as they are."
+            )
         if header.kind == "colours":
-            return self._checked(_equal_channels(path), path)
+            rgb = _decode(path, "RGB")
+            if (rgb != rgb[..., :1]).any():
+                raise InputError(
+                    f"{path}: format=index expects one channel of indices or three equal ones, got "
+                    "three that differ; use format=colour."
+                )
+            return self._checked(rgb[..., 0].copy(), path)
         indices = _decode(path)
-        if self.form == "auto":
+        if header.kind == "a palette" and self.form == "auto":
             self._check_palette(indices, path)
         return self._checked(indices, path)
 
@@ -163,14 +172,19 @@ class PredictionReader:
 
     def _check_palette(self, indices: Array, path: Path) -> None:
         """InputError unless the indices in use have the data set's colours."""
-        stored = _palette(path)
+        with Image.open(path) as image:
+            flat = image.getpalette("RGB") or []
         for index in np.unique(indices).tolist():
-            shown = stored[index] if index < len(stored) else None
-            wanted = self.palette[index] if index < len(self.palette) else None
-            if shown is None or wanted is None or shown != tuple(wanted):
+            shown = tuple(flat[3 * index : 3 * index + 3])
+            known = tuple(self.palette[index]) if index < len(self.palette) else ()
+            if len(shown) < 3 or shown != known:
+                there = f"only the classes 0 to {len(self.classes) - 1}"
+                if known:
+                    there = f"{self.classes[index]} {known} there"
                 raise InputError(
-                    f"{path}: palette index {index} is shown as {shown or 'no colour'} but the "
-                    f"data set has {_class(self.classes, wanted, index)}; say what counts: "
+                    f"{path}: palette index {index} is shown as "
+                    f"{shown if len(shown) == 3 else 'no colour'} but the "
+                    f"data set has {there}; say what counts: "
                     "format=index (the stored numbers) or format=colour (the colours shown)."
                 )
 
@@ -185,42 +199,11 @@ class PredictionReader:
             first[colour] = name
 
 
-def _class(classes: tuple[str, ...], colour: tuple[int, ...] | None, index: int) -> str:
-    if colour is None:
-        return f"only the classes 0 to {len(classes) - 1}"
-    return f"{classes[index]} {tuple(colour)} there"
-
-
-def _grey_indices(path: Path, header: Header) -> Array:
-    if header.bits != 8:  # decoders stretch these to 0..255
-        raise InputError(
-            f"{path}: expected 8 bits per pixel, got {header.bits}; save it as 8 bit, so that its "
-            "values are read as they are."
-        )
-    return _decode(path)
-
-
-def _equal_channels(path: Path) -> Array:
-    rgb = _decode(path, "RGB")
-    if (rgb != rgb[..., :1]).any():
-        raise InputError(
-            f"{path}: format=index expects one channel of indices or three equal ones, got three "
-            "that differ; use format=colour."
-        )
-    return rgb[..., 0].copy()
-
-
 def _packed(rgb: Array) -> NDArray[np.int32]:
     """(..., 3) colours as one number each, 0 .. 2^24 - 1."""
     wide = rgb.astype(np.int32)
     number: NDArray[np.int32] = (wide[..., 0] << 16) | (wide[..., 1] << 8) | wide[..., 2]
     return number
-
-
-def _palette(path: Path) -> list[tuple[int, int, int]]:
-    with Image.open(path) as image:
-        flat = image.getpalette("RGB") or []
-    return [(flat[n], flat[n + 1], flat[n + 2]) for n in range(0, len(flat) - 2, 3)]
 
 
 def _decode(path: Path, mode: Literal["stored", "RGB"] = "stored") -> Array:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import scored_classes
-from rgbt.metrics.metric import Absent
 
 ARCHIVE = Archive(
     "rgbt pixel maps 1",
@@ -24,9 +23,6 @@ ARCHIVE = Archive(
     optional=("unscored",),
 )
 
-BYTES_HOLD = 255
-"""Images that are added up in bytes before the sums are moved to wider integers."""
-
 Bytes = NDArray[np.uint8]
 Heat = NDArray[np.float64]
 
@@ -38,7 +34,6 @@ class PixelMaps:
     Attributes:
         intersection: (K, H, W) int32, images in which label and prediction are the class there.
         union: (K, H, W) int32, images in which one of them is; unlabelled pixels do not count.
-        classes: K names.
         palette: K (red, green, blue) colours.
         dataset: fingerprint of the data set.
         unscored: names of the classes that are left out of means over classes.
@@ -99,64 +94,51 @@ class PixelMaps:
 
 
 class MapSum:
-    """Adds images to pixel maps, from several threads at once.
+    """Adds images to pixel maps, from several threads at once; all of the size of the first.
 
-    The sums of up to 255 images are kept in bytes, which takes a quarter of the time of wider ones.
-
-    Args:
-        num_classes: K.
-        image_hw: (H, W) of every image.
+    Attributes:
+        sums: (2, K, H, W) intersection and union; None before the first image.
+        is_one_size: no image had another size, and was so left out.
     """
 
-    def __init__(self, num_classes: int, image_hw: tuple[int, int]) -> None:
-        shape = (num_classes, *image_hw)
-        self.intersection = np.zeros(shape, np.int32)
-        self.union = np.zeros(shape, np.int32)
-        self._bytes = np.zeros((2, *shape), np.uint8)
-        self._held = 0
+    def __init__(self, num_classes: int) -> None:
+        self.num_classes = num_classes
+        self.sums: NDArray[np.int32] | None = None
+        self.is_one_size = True
         self._lock = threading.Lock()
 
     def add(self, label: Bytes, prediction: Bytes) -> None:
         """Count one image: (H, W) each; pixels whose label is no class are left out."""
         with self._lock:
-            if self._held == BYTES_HOLD:
-                self.flush()
-            counted = label < len(self.union)
-            for index, (both, either) in enumerate(zip(*self._bytes, strict=True)):
+            if self.sums is None:
+                self.sums = np.zeros((2, self.num_classes, *label.shape), np.int32)
+            if self.sums.shape[2:] != label.shape:
+                self.is_one_size = False
+                return
+            counted = label < self.num_classes
+            for index, (both, either) in enumerate(zip(*self.sums, strict=True)):
                 labelled, predicted = label == index, (prediction == index) & counted
-                both += (labelled & predicted).view(np.uint8)
-                either += (labelled | predicted).view(np.uint8)
-            self._held += 1
-
-    def flush(self) -> None:
-        """Move what the bytes hold to `intersection` and `union`; call it after the last image."""
-        self.intersection += self._bytes[0]
-        self.union += self._bytes[1]
-        self._bytes[:] = 0
-        self._held = 0
+                both += labelled & predicted
+                either += labelled | predicted
 
 
-def iou_map(maps: PixelMaps, absent: Absent = "exclude") -> Heat:
+def iou_map(maps: PixelMaps) -> Heat:
     """Mean IoU over classes at every pixel, over the images: the map of SpatialSeg, Fig. 1(a).
 
         (1 / |C|) sum_{c in C} I_c(y, x) / U_c(y, x)
 
-    Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there. At a single pixel
-    most classes never occur, so that "released", which counts them as 0, mostly shows how many
-    classes occur; the default leaves them out. The mean of the map over a region is not the mIoU
-    of that region, which adds up pixels before it divides; only the latter is ever printed.
+    C are the scored classes with U > 0 at the pixel: at a single pixel most classes never occur, so
+    that absent ones as 0 would mostly show how many do. The mean of the map over a region is not
+    the mIoU of that region, which adds up pixels before it divides; only the latter is printed.
 
-    Args:
-        maps: see `PixelMaps`.
-        absent: "exclude": C are the scored classes with U > 0 at the pixel; "released": all scored
-            classes, 0 without.
+    Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there.
 
     Returns:
-        (H, W) fractions 0..1; NaN where there is nothing to score (under "exclude").
+        (H, W) fractions 0..1; NaN where there is nothing to score.
     """
     union = maps.union[maps.scored]
     ratio = maps.intersection[maps.scored] / np.maximum(union, 1)
-    there = (union > 0).sum(0) if absent == "exclude" else np.full(ratio.shape[1:], len(ratio))
-    heat: Heat = np.full(ratio.shape[1:], np.nan)
+    there = (union > 0).sum(0)
+    heat: Heat = np.full(there.shape, np.nan)
     np.divide(ratio.sum(0), there, out=heat, where=there > 0)
     return heat

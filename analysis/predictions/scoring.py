@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.bar import in_threads
 from analysis.predictions.folder import Missing, PredictionFiles, find
 from analysis.predictions.images import Array, Format, PredictionReader, check_one_kind
 from analysis.predictions.maps import MapSum, PixelMaps
@@ -38,7 +36,7 @@ class ScoringOptions:
     Attributes:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
-        form: how files are read, see `analysis.predictions.images.PredictionReader`.
+        form: see `analysis.predictions.images.PredictionReader`.
         missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
             label the "nearest" one of the prediction (by pixel centres).
@@ -111,121 +109,68 @@ def score_folder(
     found = find(folder, dataset, split, options.suffix, options.missing)
     if options.form == "auto":
         check_one_kind(found.paths.values())
-    counting = _CountingPass(dataset, options)
     names = tuple(found.paths)
-    size = (len(options.partitions), len(names), options.regions, *[dataset.num_classes] * 2)
-    counts = np.zeros(size, np.int32)
-    resized = []
-    for index, (matrices, was_resized) in enumerate(counting.run(found)):
-        counts[:, index] = matrices
-        if was_resized:
-            resized.append(names[index])
-        advance()
-    fingerprint, name = dataset.fingerprint(), options.name or folder.resolve().name
-    return FolderScores(
-        name=name,
-        counts=tuple(
-            Counts(
-                counts=by_image,
-                names=names,
-                night=dataset.nights(names),
-                classes=dataset.classes,
-                partition=counter.regions.name,
-                dataset=fingerprint,
-                split=split,
-                unscored=dataset.unscored,
-                absent=options.absent,
-            )
-            for by_image, counter in zip(counts, counting.counters, strict=True)
-        ),
-        maps=counting.maps(fingerprint, split, name, len(names)),
-        found=found,
-        resized=tuple(resized),
-    )
+    counters = [
+        RegionCounter(dataset.num_classes, _regions(partition, options.regions))
+        for partition in options.partitions
+    ]
+    reader = PredictionReader(dataset.classes, dataset.palette, options.form)
+    maps = MapSum(dataset.num_classes)
 
-
-class _CountingPass:
-    """The state of one pass, shared by its threads."""
-
-    def __init__(self, dataset: LabelledDataset, options: ScoringOptions) -> None:
-        self.dataset = dataset
-        self.options = options
-        self.reader = PredictionReader(dataset.classes, dataset.palette, options.form)
-        self.counters = [
-            RegionCounter(dataset.num_classes, _regions(partition, options.regions))
-            for partition in options.partitions
-        ]
-        self._sum: MapSum | None = None
-        self._sizes: set[tuple[int, ...]] = set()
-        self._lock = threading.Lock()
-
-    def run(self, found: PredictionFiles) -> Iterator[tuple[NDArray[np.int64], bool]]:
-        """Counts (partitions, R, K, K) and whether it was resized, of every image in order."""
-        threads = self.options.threads or os.cpu_count() or 1
-        with ThreadPoolExecutor(threads) as pool:
-            try:
-                yield from pool.map(self._one, found.paths, found.paths.values())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-
-    def maps(self, fingerprint: str, split: str, name: str, images: int) -> PixelMaps | None:
-        """What was added up, None if the images differed in size."""
-        if self._sum is None or len(self._sizes) > 1:
-            return None
-        self._sum.flush()
-        return PixelMaps(
-            intersection=self._sum.intersection,
-            union=self._sum.union,
-            images=images,
-            classes=self.dataset.classes,
-            palette=self.dataset.palette,
-            dataset=fingerprint,
-            split=split,
-            name=name,
-            unscored=self.dataset.unscored,
-        )
-
-    def _one(self, name: str, path: Path) -> tuple[NDArray[np.int64], bool]:
-        label = self.dataset.label(name)
+    def count(image: str, path: Path) -> tuple[NDArray[np.int64], bool]:
+        """Counts (partitions, R, K, K) and whether it was resized."""
+        label = dataset.label(image)
         if label is None:
             raise InputError(
-                f"'{name}' of {self.dataset.name} has no label to count predictions against; "
+                f"'{image}' of {dataset.name} has no label to count predictions against; "
                 "choose a labelled split."
             )
-        prediction = self.reader.read(path)
+        prediction = reader.read(path)
         differs = prediction.shape != label.shape
         if differs:
-            prediction = self._resized(prediction, label, path)
-        self._add(label, prediction)
-        return np.stack([counter(label, prediction) for counter in self.counters]), differs
+            prediction = _resized(prediction, label, path, options.resize)
+        maps.add(label, prediction)
+        return np.stack([counter(label, prediction) for counter in counters]), differs
 
-    def _resized(self, prediction: Array, label: Array, path: Path) -> Array:
-        shapes = (prediction.shape, label.shape)
-        aspects = [height / width for height, width in shapes]
-        if self.options.resize == "nearest" and abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
-            raise InputError(
-                f"{path} is {prediction.shape[0]}x{prediction.shape[1]} pixels and its label "
-                f"{label.shape[0]}x{label.shape[1]}, which is another shape and no other size; is "
-                "it turned, or cropped? write predictions of the whole image."
-            )
-        if self.options.resize == "refuse":
-            raise InputError(
-                f"{path} is {prediction.shape[0]}x{prediction.shape[1]} pixels but its label is "
-                f"{label.shape[0]}x{label.shape[1]}; write predictions at the size of the label, "
-                "or count the nearest pixel with resize=nearest."
-            )
-        size = (label.shape[1], label.shape[0])
-        return np.asarray(cv2.resize(prediction, size, interpolation=cv2.INTER_NEAREST_EXACT))
+    size = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
+    counts = np.zeros(size, np.int32)
+    resized = []
+    every = in_threads(count, names, found.paths.values(), threads=options.threads)
+    for index, (matrices, was_resized) in enumerate(every):
+        counts[:, index] = matrices
+        resized += [names[index]] if was_resized else []
+        advance()
+    name = options.name or folder.resolve().name
+    shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
+    shared |= {"split": split, "dataset": dataset.fingerprint()}
+    summed = None
+    if maps.sums is not None and maps.is_one_size:
+        both = {"intersection": maps.sums[0], "union": maps.sums[1]}
+        about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
+        summed = PixelMaps(**both, **about, **shared)
+    shared |= {"names": names, "night": dataset.nights(names), "absent": options.absent}
+    made = [
+        Counts(counts=by_image, partition=counter.regions.name, **shared)
+        for by_image, counter in zip(counts, counters, strict=True)
+    ]
+    return FolderScores(name, tuple(made), summed, found, tuple(resized))
 
-    def _add(self, label: Array, prediction: Array) -> None:
-        with self._lock:
-            self._sizes.add(label.shape)
-            if self._sum is None:
-                self._sum = MapSum(self.dataset.num_classes, (label.shape[0], label.shape[1]))
-            summed = self._sum
-        if summed.union.shape[1:] == label.shape:
-            summed.add(label, prediction)
+
+def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:
+    (height, width), (rows, columns) = prediction.shape, label.shape
+    if resize == "refuse":
+        raise InputError(
+            f"{path} is {height}x{width} pixels but its label is {rows}x{columns}; write "
+            "predictions at the size of the label, or count the nearest pixel with resize=nearest."
+        )
+    if abs(height / width / (rows / columns) - 1) > MOST_STRETCH:
+        raise InputError(
+            f"{path} is {height}x{width} pixels and its label {rows}x{columns}, which is another "
+            "shape and no other size; is it turned, or cropped? write predictions of the whole "
+            "image."
+        )
+    nearest = cv2.resize(prediction, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.asarray(nearest)
 
 
 def _regions(partition: Partition, regions: int) -> Regions:

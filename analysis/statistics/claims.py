@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from analysis.statistics.derive import (
     entropy_of,
     normalised,
     occupancy_of,
-    snr_of,
 )
 from analysis.statistics.judging import (
     ABOUT_TEN,
@@ -34,7 +34,12 @@ from analysis.statistics.judging import (
     every,
     most,
 )
-from analysis.statistics.resampling import MOST_RESAMPLES, ConsecutiveBlocks, ValueInterval
+from analysis.statistics.resampling import (
+    MOST_RESAMPLES,
+    ConsecutiveBlocks,
+    ValueInterval,
+    snr_samples,
+)
 from rgbt.checks import check_range
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -69,20 +74,33 @@ def claims(
         InputError: a number out of range.
     """
     check_resampling(blocks, resamples, level)
-    judge = Judge(
-        stats, ConsecutiveBlocks(stats, size=blocks, resamples=resamples, seed=seed), level
-    )
+    drawn = ConsecutiveBlocks(stats, size=blocks, resamples=resamples, seed=seed)
+    judge = Judge(stats, drawn, level)
+    labels = drawn.mean(stats.labels)
+    occupancy = 100 * occupancy_of(labels)
     found: list[Claim] = []
     if judge.has_centre:
-        found += [_occupancy(judge), *_classes(judge)]
+        difference = judge.centre(occupancy) - judge.edge(occupancy)
+        statement = "sample occupancy falls from the inner to the outer regions"
+        finding = judge.finding("centre - edge, points", difference, ABOVE_0)
+        steps = judge.largest_step("largest step outwards, points", occupancy)
+        found.append(_claim("occupancy/falls", "III-B.1", statement, finding, steps))
+        found += _classes(judge, class_occupancy_of(labels))
     if stats.partition.startswith("horizontal") and stats.num_regions > 2:
-        found.append(_middle(judge))
+        ends = (occupancy[:, 0] + occupancy[:, -1]) / 2
+        above = occupancy[:, stats.num_regions // 2] - ends
+        statement = "of horizontal strips the middle has the highest occupancy"
+        finding = judge.finding("middle - mean of the ends, points", above, ABOVE_0)
+        found.append(_claim("occupancy/middle", "III-B.1", statement, finding))
     found += _laplacian(judge)
-    for estimator in stats.noise:
-        for average in AVERAGES:
-            found += _snr(judge, estimator, average)
-    if judge.has_centre:
-        found += [_entropy(judge, background=True), _entropy(judge, background=False)]
+    for estimator, average in product(stats.noise, AVERAGES):
+        found += _snr(judge, estimator, average)
+    for word in ("with", "without") if judge.has_centre else ():
+        entropy = entropy_of(labels, background=word == "with")
+        difference = judge.centre(entropy) - judge.edge(entropy)
+        statement = f"label entropy {word} background is higher in the centre"
+        finding = judge.finding("centre - edge, bits", difference, ABOVE_0)
+        found.append(_claim(f"entropy/{word}_background", "III-C.1", statement, finding))
     return tuple(found)
 
 
@@ -93,116 +111,82 @@ def check_resampling(blocks: int, resamples: int, level: float) -> None:
     check_range("level", level, 0.5, 0.999)
 
 
-def _occupancy(judge: Judge) -> Claim:
-    values = 100 * occupancy_of(judge.blocks.mean(judge.stats.labels))
-    difference = judge.centre(values) - judge.edge(values)
-    findings = [
-        judge.finding("centre - edge, points", difference, ABOVE_0),
-        judge.largest_step("largest step outwards, points", values),
-    ]
-    return Claim(
-        "occupancy/falls",
-        "sample occupancy falls from the inner to the outer regions",
-        "III-B.1",
-        every([each.verdict for each in findings]),
-        tuple(findings),
-    )
+def _claim(
+    key: str, source: str, statement: str, *findings: Finding, way: tuple[str, str] = ("", "")
+) -> Claim:
+    """A claim that holds where all findings do; `way`: estimator and average of the noise."""
+    verdict = every([each.verdict for each in findings])
+    return Claim(key, statement, source, verdict, findings, *way)
 
 
-def _classes(judge: Judge) -> list[Claim]:
-    """Fig. 3, each class as (centre - edge) / (centre + edge): 1 central, 0 even, -1 outside."""
-    labels = judge.stats.labels
-    occupancy = class_occupancy_of(judge.blocks.mean(labels))
-    occurs = [k for k in range(1, len(judge.stats.classes)) if labels[..., k].any()]
+def _classes(judge: Judge, occupancy: Floats) -> list[Claim]:
+    """Fig. 3, each class as (centre - edge) / (centre + edge): 1 central, 0 even, -1 outside.
+
+    Evenness: mean over regions of the occupancy as Fig. 3 normalises it, 1 where all equal.
+    """
+    labels, classes = judge.stats.labels, judge.stats.classes
+    present = np.asarray(labels.any(1))
+    occurs = [index for index in range(1, len(classes)) if present[:, index].any()]
     by_class: dict[str, Finding] = {}
     for index in occurs:
         centre, edge = judge.centre(occupancy[:, index]), judge.edge(occupancy[:, index])
         with np.errstate(invalid="ignore"):
             samples = (centre - edge) / (centre + edge)
-        name = judge.stats.classes[index]
+        name = classes[index]
         what = f"{name}: (centre - edge) / (centre + edge)"
-        present = labels[..., index].sum(1) > 0
         wanted = BELOW_0 if name == EXCEPT else ABOVE_0
-        by_class[name] = _within_one(judge.rare(what, samples, wanted, present))
+        finding = judge.rare(what, samples, wanted, present[:, index])
+        low, high = np.clip(finding.interval[1:], -1.0, 1.0)  # what such an index can be
+        interval = finding.interval._replace(low=float(low), high=float(high))
+        by_class[name] = replace(finding, interval=interval)
     others = tuple(found for name, found in by_class.items() if name != EXCEPT)
-    found = [
-        Claim(
-            "classes/central",
-            f"most classes are concentrated in the centre ({EXCEPT} apart)",
-            "III-B.2",
-            most([each.verdict for each in others]),
-            others,
-        )
-    ]
+    statement = f"most classes are concentrated in the centre ({EXCEPT} apart)"
+    verdict = most([each.verdict for each in others])
+    found = [Claim("classes/central", statement, "III-B.2", verdict, others)]
     if EXCEPT in by_class:
         statement = f"{EXCEPT} is not concentrated in the centre"
-        finding = by_class[EXCEPT]
-        found.append(Claim("classes/except", statement, "III-B.2", finding.verdict, (finding,)))
+        found.append(_claim("classes/except", "III-B.2", statement, by_class[EXCEPT]))
     if EVEN in by_class and len(by_class) > 1:
-        found.append(_even_class(judge, occupancy, occurs))
+        evenness = normalised(occupancy).mean(-1)
+        even = classes.index(EVEN)
+        others_evenness = evenness[:, [index for index in occurs if index != even]].mean(-1)
+        what = f"evenness of {EVEN} - mean evenness of the others"
+        difference = evenness[:, even] - others_evenness
+        finding = judge.rare(what, difference, ABOVE_0, present[:, even])
+        statement = f"{EVEN} is distributed more evenly than the other classes"
+        found.append(_claim("classes/even", "III-B.2", statement, finding))
     return found
-
-
-def _within_one(finding: Finding) -> Finding:
-    """`finding` with the ends of its interval cut to what an index can be, -1..1."""
-    low, high = np.clip(finding.interval[1:], -1.0, 1.0)
-    interval = finding.interval._replace(low=float(low), high=float(high))
-    return replace(finding, interval=interval)
-
-
-def _even_class(judge: Judge, occupancy: Floats, occurs: list[int]) -> Claim:
-    """Evenness: mean over regions of the occupancy as Fig. 3 normalises it, 1 where all equal."""
-    evenness = normalised(occupancy).mean(-1)
-    even = judge.stats.classes.index(EVEN)
-    others = evenness[:, [index for index in occurs if index != even]]
-    finding = judge.rare(
-        f"evenness of {EVEN} - mean evenness of the others",
-        evenness[:, even] - others.mean(-1),
-        ABOVE_0,
-        judge.stats.labels[..., even].sum(1) > 0,
-    )
-    statement = f"{EVEN} is distributed more evenly than the other classes"
-    return Claim("classes/even", statement, "III-B.2", finding.verdict, (finding,))
-
-
-def _middle(judge: Judge) -> Claim:
-    values = 100 * occupancy_of(judge.blocks.mean(judge.stats.labels))
-    middle = judge.stats.num_regions // 2
-    ends = (values[:, 0] + values[:, -1]) / 2
-    finding = judge.finding("middle - mean of the ends, points", values[:, middle] - ends, ABOVE_0)
-    statement = "of horizontal strips the middle has the highest occupancy"
-    return Claim("occupancy/middle", statement, "III-B.1", finding.verdict, (finding,))
 
 
 def _laplacian(judge: Judge) -> list[Claim]:
     by_part = {part: judge.blocks.mean(judge.stats.laplacian, part) for part in judge.parts}
     everything = by_part[ALL]
-    found = []
+    claims_of: dict[str, tuple[str, list[Finding]]] = {}
     if judge.has_centre:
-        findings = [
-            judge.centre_edge(modality, everything[:, index], ABOVE_1)
-            for index, modality in enumerate(MODALITIES)
-        ]
-        found.append(_laplacian_claim("centre", "is higher in the centre (rgb, thermal)", findings))
+        claims_of["centre"] = (
+            "is higher in the centre (rgb, thermal)",
+            [
+                judge.centre_edge(modality, everything[:, index], ABOVE_1)
+                for index, modality in enumerate(MODALITIES)
+            ],
+        )
     ratio = judge.ratio("rgb / thermal", everything[:, 0], everything[:, 1], ABOVE_1)
-    found.append(_laplacian_claim("modality", "of rgb is above that of thermal", [ratio]))
-    for index, (modality, word, wanted) in enumerate(
-        (("rgb", "above", ABOVE_1), ("thermal", "below", BELOW_1))
-    ):
-        findings = [_day_over_night(judge, modality, by_part, index, wanted)]
-        statement = f"of {modality} by day is {word} that at night"
-        found.append(_laplacian_claim(f"day_{modality}", statement, findings))
-    return found
-
-
-def _laplacian_claim(key: str, statement: str, findings: list[Finding]) -> Claim:
-    verdict = every([each.verdict for each in findings])
-    text = f"Laplacian variance {statement}"
-    return Claim(f"laplacian/{key}", text, "III-B.3", verdict, tuple(findings))
+    claims_of["modality"] = "of rgb is above that of thermal", [ratio]
+    for index, word, wanted in ((0, "above", ABOVE_1), (1, "below", BELOW_1)):
+        statement = f"of {MODALITIES[index]} by day is {word} that at night"
+        finding = _day_over_night(judge, by_part, index, wanted)
+        claims_of[f"day_{MODALITIES[index]}"] = statement, [finding]
+    return [
+        _claim(f"laplacian/{key}", "III-B.3", f"Laplacian variance {statement}", *findings)
+        for key, (statement, findings) in claims_of.items()
+    ]
 
 
 def _snr(judge: Judge, estimator: str, average: str) -> list[Claim]:
-    by_part = {part: _snr_samples(judge, part, estimator, average) for part in judge.parts}
+    by_part = {
+        part: snr_samples(judge.stats, judge.blocks, part, estimator, average)
+        for part in judge.parts
+    }
     everything = by_part[ALL]
     claims_of: dict[str, tuple[str, list[Finding]]] = {}
     if judge.has_centre:
@@ -217,55 +201,20 @@ def _snr(judge: Judge, estimator: str, average: str) -> list[Claim]:
         )
     ratio = judge.ratio("thermal / rgb", everything[:, 1], everything[:, 0], ABOUT_TEN)
     claims_of["modality"] = "of thermal is about ten times that of rgb", [ratio]
-    claims_of["day"] = (
-        "by day is above that at night (rgb, thermal)",
-        [
-            _day_over_night(judge, modality, by_part, index, ABOVE_1)
-            for index, modality in enumerate(MODALITIES)
-        ],
-    )
+    by_day = [_day_over_night(judge, by_part, index, ABOVE_1) for index in range(len(MODALITIES))]
+    claims_of["day"] = "by day is above that at night (rgb, thermal)", by_day
+    way = estimator, average
     return [
-        Claim(
-            key=f"snr/{key}",
-            statement=f"signal to noise {statement}",
-            source="III-B.4",
-            verdict=every([each.verdict for each in findings]),
-            findings=tuple(findings),
-            estimator=estimator,
-            average=average,
-        )
+        _claim(f"snr/{key}", "III-B.4", f"signal to noise {statement}", *findings, way=way)
         for key, (statement, findings) in claims_of.items()
     ]
 
 
-def _snr_samples(judge: Judge, part: str, estimator: str, average: str) -> Floats:
-    """(1 + B, 2, R)."""
-    stats, blocks = judge.stats, judge.blocks
-    if average == "pooled":
-        return snr_of(blocks.mean(stats.mean, part), blocks.mean(stats.noise[estimator], part))
-    return blocks.mean(snr_of(stats.mean, stats.noise[estimator]), part)
-
-
 def _day_over_night(
-    judge: Judge, modality: str, by_part: dict[str, Floats], index: int, wanted: tuple[float, float]
+    judge: Judge, by_part: dict[str, Floats], index: int, wanted: tuple[float, float]
 ) -> Finding:
-    what = f"{modality}: day / night"
+    what = f"{MODALITIES[index]}: day / night"
     if DAY not in by_part:
         nothing = ValueInterval(math.nan, math.nan, math.nan)
         return Finding(what, wanted, nothing, OPEN, "no images of both day and night")
     return judge.ratio(what, by_part[DAY][:, index], by_part[NIGHT][:, index], wanted)
-
-
-def _entropy(judge: Judge, *, background: bool) -> Claim:
-    values = entropy_of(judge.blocks.mean(judge.stats.labels), background=background)
-    word = "with" if background else "without"
-    finding = judge.finding(
-        "centre - edge, bits", judge.centre(values) - judge.edge(values), ABOVE_0
-    )
-    return Claim(
-        f"entropy/{word}_background",
-        f"label entropy {word} background is higher in the centre",
-        "III-C.1",
-        finding.verdict,
-        (finding,),
-    )

@@ -47,7 +47,6 @@ class SpatialStatistics:
     """Measurements of every image of a split, by region.
 
     Attributes:
-        fingerprint: its fingerprint.
         classes: names of the K classes; class 0 is the background.
         palette: (K, 3) uint8, red, green, blue.
         partition: name of the regions, e.g. "ring9" (`rgbt.metrics.metric.Regions.name`).
@@ -89,23 +88,20 @@ class SpatialStatistics:
     def __post_init__(self) -> None:
         images, regions, classes = len(self.names), self.num_regions, len(self.classes)
         by_modality = (images, len(MODALITIES), regions)
-        expected = {
-            "palette": (classes, 3),
-            "labels": (images, regions, classes),
-            "ignored": (images, regions),
-            "occupied": (len(self.parts), classes, *self.region_map.shape),
-            "laplacian": by_modality,
-            "mean": by_modality,
+        expected: dict[str, tuple[tuple[int, ...], NDArray[Any]]] = {
+            "palette": ((classes, 3), self.palette),
+            "labels": ((images, regions, classes), self.labels),
+            "ignored": ((images, regions), self.ignored),
+            "occupied": ((len(self.parts), classes, *self.region_map.shape), self.occupied),
+            "laplacian": (by_modality, self.laplacian),
+            "mean": (by_modality, self.mean),
         }
-        found = {name: getattr(self, name).shape for name in expected}
-        found |= {f"noise['{name}']": values.shape for name, values in self.noise.items()}
+        expected |= {f"noise['{key}']": (by_modality, each) for key, each in self.noise.items()}
         if self.night is not None:
-            found["night"], expected["night"] = self.night.shape, (images,)
-        for name, shape in found.items():
-            if shape != expected.get(name, by_modality):
-                raise ValueError(
-                    f"{name}: expected shape {expected.get(name, by_modality)}, got {shape}."
-                )
+            expected["night"] = ((images,), self.night)
+        for name, (shape, values) in expected.items():
+            if values.shape != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {values.shape}.")
 
     @property
     def num_regions(self) -> int:
@@ -121,7 +117,7 @@ class SpatialStatistics:
         """(N,): which images belong to `part`: "all", "day" or "night".
 
         Raises:
-            InputError: another word, a data set that does not tell, or no such image.
+            InputError: no such part, a data set that does not tell, or no such image.
         """
         check_choice("part", part, (ALL, DAY, NIGHT))
         if part == ALL:
@@ -139,26 +135,22 @@ class SpatialStatistics:
         return wanted
 
     def select(self, part: str) -> SpatialStatistics:
-        """The statistics of the images of `part`; "all" is the whole.
-
-        Raises:
-            InputError: see `chosen`.
-        """
+        """The statistics of the images of `part`, see `chosen`; "all" is the whole."""
         wanted = self.chosen(part)
         if part == ALL:
             return self
         index = self.parts.index(part)
+        by_image: dict[str, Any] = {
+            key: getattr(self, key)[wanted]
+            for key in ("night", "labels", "ignored", "laplacian", "mean")
+        }
         return replace(
             self,
-            names=tuple(name for name, take in zip(self.names, wanted, strict=True) if take),
-            night=None if self.night is None else self.night[wanted],
-            labels=self.labels[wanted],
-            ignored=self.ignored[wanted],
+            names=tuple(np.array(self.names)[wanted].tolist()),
             parts=(part,),
             occupied=self.occupied[index : index + 1],
-            laplacian=self.laplacian[wanted],
-            mean=self.mean[wanted],
             noise={name: values[wanted] for name, values in self.noise.items()},
+            **by_image,
         )
 
     def save(self, path: Path) -> None:

@@ -1,7 +1,8 @@
 """What follows from the measurements: occupancy, Laplacian variance, signal to noise, entropy.
 
-Pure functions of `SpatialStatistics`, by part ("all", "day", "night"). The functions on arrays take
-any leading axes, so that resamples go through the same lines (`claims`).
+Pure functions of `SpatialStatistics`, by part ("all", "day", "night") and modality ("rgb" as grey,
+"thermal"); unknown words are refused (InputError). The functions on arrays take any leading axes,
+so that resamples go through the same lines (`claims`).
 """
 
 from __future__ import annotations
@@ -40,12 +41,6 @@ def occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Floats:
     return _ratio(occupied[1:].sum(0), occupied.sum(0))
 
 
-def class_occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Floats:
-    """The same for every class: (K, H, W), 0..1, sums to 1 over the classes."""
-    occupied = stats.select(part).occupied.sum(0)
-    return _ratio(occupied, occupied.sum(0))
-
-
 def region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
     """Sample occupancy rate of every region (SpatialSeg, Eq. 2).
 
@@ -66,22 +61,15 @@ def class_region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
 def normalised(occupancy: Floats) -> Floats:
     """Each class relative to the region where it is most frequent (SpatialSeg, Fig. 3).
 
-    Args:
-        occupancy: (..., K, R), as `class_region_occupancy` gives it.
-
     Returns:
-        (..., K, R), 0..1, with a 1 in every row; NaN for a class that does not occur.
+        (..., K, R) from such occupancies, 0..1, with a 1 in every row; NaN for a class that does
+        not occur.
     """
     return _ratio(occupancy, occupancy.max(-1, keepdims=True))
 
 
 def region_laplacian(stats: SpatialStatistics, modality: str, part: str = ALL) -> Floats:
     """Laplacian variance of every region (SpatialSeg, Eq. 3), mean over images.
-
-    Args:
-        stats: measurements.
-        modality: "rgb" (grey) or "thermal".
-        part: "all", "day" or "night".
 
     Returns:
         (R,), squared grey levels.
@@ -134,10 +122,7 @@ def label_entropy(stats: SpatialStatistics, part: str = ALL, background: bool = 
 
     Source: SpatialSeg, Eq. 5 and Sec. III-C.1, applied to the label inside a region.
 
-    Args:
-        stats: measurements.
-        part: "all", "day" or "night".
-        background: whether class 0 counts; without it the shares are those among the others.
+    Without the background (class 0) the shares are those among the other classes.
 
     Returns:
         (R,), 0..log2 K; NaN where a region has no pixel to count.

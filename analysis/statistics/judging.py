@@ -42,10 +42,9 @@ class Finding:
     """One number that a claim depends on.
 
     Attributes:
-        what: what is measured, e.g. "rgb, day: centre / edge".
+        what: is measured, e.g. "rgb, day: centre / edge".
         wanted: (low, high), where the claim puts it.
-        interval: value and its interval; NaN ends where the sample is too small for one.
-        verdict: of this number.
+        interval: NaN ends where the sample is too small for one.
         note: what else is worth knowing, e.g. "7 of 9 regions".
     """
 
@@ -138,11 +137,11 @@ class Judge:
         scale: Scale = "linear",
         level: float | None = None,
     ) -> Finding:
-        """Finding about one number.
+        """Finding about one number of `part`, (1 + B,) with its resamples.
 
         Args:
             what: says what it is.
-            samples: (1 + B,), the sample's and those of its resamples.
+            samples: see `ConsecutiveBlocks.interval`.
             wanted: where the claim puts it.
             part: that it comes from.
             scale: "ratio" for a positive quotient.

@@ -6,7 +6,6 @@ Everything is whole numbers until the last division, so that the order of sums d
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
@@ -41,46 +40,28 @@ SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32)
 MEDIAN_OF_NORMAL = 0.6744897501960817
 """Median of ``|x|`` for a standard normal x."""
 
-TALLEST_BAND = 256
-"""Rows added up at a time: 256 squares of the largest Laplacian (8 x 255) fit into 32 bits."""
-
 Image = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 
 class RegionSums:
-    """Sums over every region of an image, for one region map.
-
-    Neighbouring rows that are cut alike (a band) are added up first, whole rows at a time; what is
-    left are a few rows of sums, read along the runs of one region. An image is so read once and in
-    order, without a mask, for any partition.
+    """Sums over every region of an image, read once and in order along the runs of one region.
 
     Args:
         region_map: (H, W) uint8, region index 0..R-1.
     """
 
     def __init__(self, region_map: Image) -> None:
-        height = len(region_map)
-        begins = np.arange(height) % TALLEST_BAND == 0
-        begins[1:] |= (region_map[1:] != region_map[:-1]).any(1)
-        first_rows = np.flatnonzero(begins)
-        self._bands = list(pairwise([*first_rows.tolist(), height]))
-        bands = region_map[first_rows]
-        changes = np.ones(bands.shape, bool)
-        changes[:, 1:] = bands[:, 1:] != bands[:, :-1]
-        self._starts = np.flatnonzero(changes)
-        self._owner = bands.ravel()[self._starts]
-        self.num_regions = int(region_map.max()) + 1
+        flat = region_map.ravel()
+        self.begins = np.append(True, flat[1:] != flat[:-1])
+        self._starts = np.flatnonzero(self.begins)
+        self._owner = flat[self._starts]
 
     def __call__(self, values: NDArray[np.int32]) -> Floats:
-        """(R,) sums of (H, W) int32 values below 2^23 in size; whole, kept as float64."""
-        summed = np.empty((len(self._bands), values.shape[1]), np.int64)
-        for row, (begin, end) in zip(summed, self._bands, strict=True):
-            row[:] = np.add.reduce(values[begin:end], axis=0, dtype=np.int32)
-        along = np.add.reduceat(summed.ravel(), self._starts)
-        by_region = np.bincount(self._owner, weights=along, minlength=self.num_regions)
-        return np.asarray(by_region, np.float64)
+        """(R,) sums of (H, W) values; whole, kept as float64."""
+        along = np.add.reduceat(values.ravel(), self._starts, dtype=np.int64)
+        return np.asarray(np.bincount(self._owner, weights=along), np.float64)
 
 
 class ImageMeasurements(NamedTuple):
@@ -111,7 +92,7 @@ class ImageMeter:
         self._num_classes = num_classes
         self._kernel = kernel
         self._sums = RegionSums(region_map)
-        self.num_regions = self._sums.num_regions
+        self.num_regions = int(region_map.max()) + 1
         self._pixels = np.bincount(region_map.ravel()).astype(np.float64)
         inner = np.zeros(region_map.shape, np.int32)
         inner[1:-1, 1:-1] = 1
@@ -120,9 +101,6 @@ class ImageMeter:
         # A block of 2x2 pixels belongs to the region of its first pixel.
         corners = region_map[0 : height - 1 : 2, 0 : width - 1 : 2]
         self._block_bins = corners.astype(np.intp) * HAAR_BINS
-        changes = np.flatnonzero(np.diff(region_map.ravel())) + 1
-        self._region_begins = np.zeros(region_map.size, bool)
-        self._region_begins[np.r_[0, changes]] = True
 
     def __call__(self, sample: Sample) -> ImageMeasurements:
         """The measurements of one labelled pair of the size of the region map."""
@@ -145,7 +123,7 @@ class ImageMeter:
         """Pixels by region and class, (R, K), and ignored ones, (R,)."""
         flat = label.ravel()
         # Labels are large areas: a few thousand runs of one region and class instead of pixels.
-        begins = self._region_begins.copy()
+        begins = self._sums.begins.copy()
         begins[1:] |= flat[1:] != flat[:-1]
         starts = np.flatnonzero(begins)
         lengths = np.diff(starts, append=flat.size)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.statistics.data import ALL, SpatialStatistics
+from analysis.statistics.derive import snr_of
 from rgbt.metrics.names import DAY, NIGHT
 from rgbt.randomness import numpy_generator
 
@@ -59,13 +60,15 @@ class ConsecutiveBlocks:
     def __init__(
         self, stats: SpatialStatistics, *, size: int = 10, resamples: int = 2000, seed: int = 0
     ) -> None:
-        strata = (DAY, NIGHT) if stats.night is not None else (ALL,)
+        every = np.arange(len(stats.names))
+        strata = {ALL: every}
+        if stats.night is not None:
+            strata = {DAY: every[~stats.night], NIGHT: every[stats.night]}
         self._block_of = np.zeros(len(stats.names), np.intp)
         self._stratum_of: list[str] = []
         rng = numpy_generator(seed, "statistics")
         weights = []
-        for stratum in strata:
-            chosen = self._images(stats, stratum)
+        for stratum, chosen in strata.items():
             ordered = chosen[np.argsort(np.array(stats.names)[chosen], kind="stable")]
             count = -(-len(ordered) // size)
             self._block_of[ordered] = len(self._stratum_of) + np.arange(len(ordered)) // size
@@ -74,12 +77,6 @@ class ConsecutiveBlocks:
             weights.append(np.vstack([np.ones((1, count)), drawn]))
         self._weights = np.hstack(weights)
         self._images_of = np.bincount(self._block_of, minlength=len(self._stratum_of))
-
-    @staticmethod
-    def _images(stats: SpatialStatistics, stratum: str) -> NDArray[np.intp]:
-        if stratum == ALL or stats.night is None:
-            return np.arange(len(stats.names))
-        return np.flatnonzero(stats.night == (stratum == NIGHT))
 
     def mean(self, values: NDArray[np.number], part: str = ALL) -> Floats:
         """Mean over the images of `part`, of the sample and of every resample.
@@ -124,8 +121,8 @@ class ConsecutiveBlocks:
         stratum this is the t interval of its blocks. Ratios are treated on the logarithmic scale.
 
         Args:
-            samples: (1 + B,) as `mean` gives them, or computed from these row by row.
-            part: the part that they come from.
+            samples: (1 + B,) of `part` as `mean` gives them, or computed from these row by row.
+            part: see `mean`.
             level: of confidence, 0..1.
             scale: "ratio" for positive quotients.
 
@@ -152,3 +149,13 @@ class ConsecutiveBlocks:
     def _chosen(self, part: str) -> list[int]:
         """Blocks of `part`."""
         return [i for i, stratum in enumerate(self._stratum_of) if part in (ALL, stratum)]
+
+
+def snr_samples(
+    stats: SpatialStatistics, blocks: ConsecutiveBlocks, part: str, estimator: str, average: str
+) -> Floats:
+    """Signal to noise of the sample and of every resample, (1 + B, 2, R); see `region_snr`."""
+    mean, noise = stats.mean, stats.noise[estimator]
+    if average == "pooled":
+        return snr_of(blocks.mean(mean, part), blocks.mean(noise, part))
+    return blocks.mean(snr_of(mean, noise), part)

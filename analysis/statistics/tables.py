@@ -34,14 +34,14 @@ CSV_COLUMNS = (
 def occupancy_grids(stats: SpatialStatistics) -> tuple[TextTable, ...]:
     """Sample occupancy by part, by class, and by class relative to its largest region."""
     rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in stats.subsets()]
-    by_class = 100 * derive.class_region_occupancy(stats)
-    relative = 100 * derive.normalised(derive.class_region_occupancy(stats))
-    named = list(enumerate(stats.classes))[1:]
+    by_class = derive.class_region_occupancy(stats)
+    relative = derive.normalised(by_class)
+    titles = ("by class, % of the pixels", "by class, % of its largest region (Fig. 3)")
     return (
         region_grid("sample occupancy rate, % (Eq. 2)", rows),
-        region_grid("by class, % of the pixels", [(name, by_class[k]) for k, name in named]),
-        region_grid(
-            "by class, % of its largest region (Fig. 3)", [(name, relative[k]) for k, name in named]
+        *(
+            region_grid(title, list(zip(stats.classes[1:], 100 * values[1:], strict=True)))
+            for title, values in zip(titles, (by_class, relative), strict=True)
         ),
     )
 
@@ -138,7 +138,7 @@ def markdown(
 
     Args:
         stats: measurements.
-        claims: decided on them, of every estimator and average.
+        claims: of every estimator and average.
         ways: (estimator, average) of every table of signal to noise.
         level: of the intervals.
     """

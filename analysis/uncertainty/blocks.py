@@ -69,8 +69,14 @@ def make_blocks(
     if choice == "none":
         return _singles(len(names))
     sequences = _sequences(names)
+    if sequences is None and choice == "auto":
+        reason = f"Names such as '{names[0]}' hold no frame number that others continue; {ALONE}."
+        return _singles(len(names), " (their names tell no neighbours)", reason)
     if sequences is None:
-        return _without_frames(names, choice)
+        raise InputError(
+            f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
+            "but for one number); use blocks=none."
+        )
     if choice == "auto":
         return _automatic(sequences, series)
     places = [each.places for each in sequences]
@@ -111,10 +117,17 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     count = len(series)
     centred = series - series.mean()
     covered = math.ceil(math.sqrt(count)) + 5
-    lags = np.array([_autocovariance(centred, sequences, lag) for lag in range(covered + 1)])
+
+    def autocovariance(lag: int) -> float:
+        """Of pairs `lag` frames apart in one sequence, over the number of all images."""
+        long = [centred[each] for each in sequences if len(each) > lag]
+        return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
+
+    lags = np.array([autocovariance(lag) for lag in range(covered + 1)])
     if lags[0] <= 0:
         return 1
-    last = _last_correlated(lags / lags[0], count)
+    above = lags[1:] / lags[0] > BAND / math.sqrt(count)
+    last = len(above) if above.all() else int(np.argmin(above))
     if last == 0:
         return 1
     steps = np.arange(1, min(2 * last, covered) + 1)
@@ -127,27 +140,13 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     return max(1, math.ceil(float(length)))
 
 
-def _last_correlated(correlations: NDArray[np.float64], count: int) -> int:
-    """The last of the lags 1, 2, ... that are all above the band; 0: none is."""
-    above = correlations[1:] > BAND / math.sqrt(count)
-    return len(above) if above.all() else int(np.argmin(above))
-
-
-def _autocovariance(
-    centred: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]], lag: int
-) -> float:
-    """Of pairs `lag` frames apart in one sequence, over the number of all images."""
-    products = [
-        centred[each[: len(each) - lag]] @ centred[each[lag:]]
-        for each in sequences
-        if len(each) > lag
-    ]
-    return float(sum(products)) / len(centred)
-
-
 def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64]) -> ImageBlocks:
     """Runs of consecutive frames, or pieces of them where one run is too long for that."""
-    runs = [run for each in sequences for run in _runs(each)]
+    runs = []
+    for frames, places in sequences:
+        steps = np.diff(frames)
+        far = steps > GAP * np.median(steps) if len(steps) else steps
+        runs += np.split(places, np.flatnonzero(far) + 1)
     sizes = [len(run) for run in runs]
     count, longest = sum(sizes), max(sizes)
     said = f"{len(runs)} run{'s' * (len(runs) > 1)} of consecutive numbers ({_range(sizes)} images)"
@@ -155,7 +154,9 @@ def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64])
         shown = f"{len(runs)} blocks of {_range(sizes)} neighbouring frames"
         return _joined(count, runs, shown, f"The names form {said}; each is one block.")
     reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
-    length = _measured_length(series, runs)
+    length = max(block_length(each, runs) for each in series)
+    while length > 1 and sum(math.ceil(size / length) for size in sizes) < FEWEST:
+        length -= 1
     if length <= 1:
         reason += f"; scores of neighbours are not shown to be correlated, {ALONE}."
         return _singles(count, reason=reason)
@@ -163,36 +164,10 @@ def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64])
     return replace(_pieces(runs, length), reason=reason)
 
 
-def _measured_length(series: NDArray[np.float64], runs: Sequence[NDArray[np.int64]]) -> int:
-    """The longest length of the scores, as far as it leaves `FEWEST` blocks."""
-    wanted = max(block_length(each, runs) for each in series)
-    while wanted > 1 and sum(math.ceil(len(run) / wanted) for run in runs) < FEWEST:
-        wanted -= 1
-    return wanted
-
-
-def _runs(sequence: SequenceFrames) -> list[NDArray[np.int64]]:
-    """Places of the frames that follow one another without a gap (`GAP`)."""
-    steps = np.diff(sequence.frames)
-    if not len(steps):
-        return [sequence.places]
-    return np.split(sequence.places, np.flatnonzero(steps > GAP * np.median(steps)) + 1)
-
-
 def _range(sizes: Sequence[int]) -> str:
     """For example "2 to 20", or "10" where all are equal."""
     least, most = min(sizes), max(sizes)
     return str(most) if least == most else f"{least} to {most}"
-
-
-def _without_frames(names: Sequence[str], choice: NamedBlocks | int) -> ImageBlocks:
-    if choice == "auto":
-        reason = f"Names such as '{names[0]}' hold no frame number that others continue; {ALONE}."
-        return _singles(len(names), " (their names tell no neighbours)", reason)
-    raise InputError(
-        f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
-        "but for one number); use blocks=none."
-    )
 
 
 def _sequences(names: Sequence[str]) -> list[SequenceFrames] | None:
@@ -217,13 +192,10 @@ def _sequences(names: Sequence[str]) -> list[SequenceFrames] | None:
             found.setdefault(rest, []).append((int(words[place][frame]), place))
     if all(len(frames) == 1 for frames in found.values()):
         return None
-    ordered = [sorted(frames) for frames in found.values()]
+    ordered = (zip(*sorted(frames), strict=True) for frames in found.values())
     return [
-        SequenceFrames(
-            frames=np.array([frame for frame, _ in each], np.float64),
-            places=np.array([place for _, place in each], np.int64),
-        )
-        for each in ordered
+        SequenceFrames(np.array(frames, np.float64), np.array(places, np.int64))
+        for frames, places in ordered
     ]
 
 

@@ -11,7 +11,6 @@ from analysis.uncertainty.estimate import Estimate, by_part, estimate_of, image_
 from analysis.uncertainty.images import CommonImages, prepare
 from analysis.uncertainty.intervals import (
     Interval,
-    Values,
     holm,
     over_images,
     over_seeds,
@@ -32,8 +31,6 @@ class Difference:
     """Method b less method a in one score; percent points (variance: squared percent points).
 
     Attributes:
-        a: the score of the first method.
-        b: of the second.
         value: b - a, means over seeds.
         p_images: two-sided p-value with the methods exchanged at random on each block of images;
             NaN where there is nothing to score.
@@ -144,36 +141,30 @@ def compare(
 def _differences(
     images: CommonImages, parsed: Sequence[ParsedMetric], *, paired: bool
 ) -> Iterator[Difference]:
+    settings = images.settings
     a, b = images.drawn(parsed)
     swapped_a, swapped_b = images.swapped(parsed)
     every = zip(parsed, a.rows(), b.rows(), swapped_b - swapped_a, strict=True)
     for each, rows_a, rows_b, swapped in every:
         first, second = (estimate_of(images, each, *rows) for rows in (rows_a, rows_b))
         value = second.value - first.value
-        plain = Difference(
-            metric=each.metric, a=first, b=second, value=value, p_images=swap_p(value, swapped)
-        )
         resampled, without = rows_b[1] - rows_a[1], rows_b[2] - rows_a[2]
-        points = (rows_b[0] - rows_a[0],) if paired else (rows_a[0], rows_b[0])
-        yield _with_intervals(images, plain, (resampled, without), points)
-
-
-def _with_intervals(
-    images: CommonImages,
-    plain: Difference,
-    resampled: tuple[Values, Values],
-    points: tuple[Values, ...],
-) -> Difference:
-    settings, value = images.settings, plain.value
-    around = over_images(value, *resampled, method=settings.method, level=settings.level)
-    spread = over_seeds(*points)
-    if around is None or spread is None:
-        return replace(plain, images=around)
-    whole = together(image_spread(images, resampled[0]), spread)
-    used = widest(settings.level, whole, spread)
-    return replace(
-        plain,
-        images=around,
-        both=student(value, used, settings.level),
-        p_both=student_p(value, used),
-    )
+        around = over_images(
+            value, resampled, without, method=settings.method, level=settings.level
+        )
+        spread = over_seeds(*((rows_b[0] - rows_a[0],) if paired else (rows_a[0], rows_b[0])))
+        both, p_both = None, math.nan
+        if around is not None and spread is not None:
+            whole = together(image_spread(images, resampled), spread)
+            used = widest(settings.level, whole, spread)
+            both, p_both = student(value, used, settings.level), student_p(value, used)
+        yield Difference(
+            metric=each.metric,
+            a=first,
+            b=second,
+            value=value,
+            p_images=swap_p(value, swapped),
+            images=around,
+            both=both,
+            p_both=p_both,
+        )

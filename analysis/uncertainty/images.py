@@ -139,7 +139,8 @@ def prepare(
         InputError: counts of other images, classes, scored classes, regions or data; no images of
             that part; blocks that cannot be made.
     """
-    alike = _alike(methods)
+    like = methods[0][0]
+    alike = [[_like(like, counts) for counts in seeds] for seeds in methods]
     parts = [[images_of(metric, counts) for counts in seeds] for seeds in alike]
     first = parts[0][0]
     regions, classes = first.counts.shape[1], len(first.classes)
@@ -160,9 +161,10 @@ def prepare(
         blocks = make_blocks(first.names, settings.blocks, _influence(single))
     except InputError as error:
         raise InputError(f"{metric.part}: {error}" if metric.part else str(error)) from None
-    return replace(
-        single, methods=tuple(_summed(each, blocks) for each in single.methods), blocks=blocks
-    )
+    order = np.argsort(blocks.index, kind="stable")
+    starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))
+    summed = (np.add.reduceat(each[:, order], starts, axis=1) for each in single.methods)
+    return replace(single, methods=tuple(summed), blocks=blocks)
 
 
 WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
@@ -182,19 +184,6 @@ def _influence(single: CommonImages) -> Scores:
     )
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
     return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
-
-
-def _summed(method: NDArray[np.float64], blocks: ImageBlocks) -> NDArray[np.float64]:
-    """(S, B, F) from (S, N, F)."""
-    order = np.argsort(blocks.index, kind="stable")
-    starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))
-    return np.asarray(np.add.reduceat(method[:, order], starts, axis=1), np.float64)
-
-
-def _alike(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
-    """The counts in one order of images; refused where they cannot be compared."""
-    first = methods[0][0]
-    return [[_like(first, counts) for counts in seeds] for seeds in methods]
 
 
 def _like(first: Counts, other: Counts) -> Counts:

@@ -65,7 +65,14 @@ def over_images(
         return None
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
     if method == "bca":
-        tails = _corrected(tails, _bias(value, known), _acceleration(without_each))
+        from scipy.special import ndtr, ndtri
+
+        # How far the resampled scores lie to one side of the score itself.
+        below = (known < value).sum() + 0.5 * (known == value).sum()
+        share = min(max(below, 0.5), known.size - 0.5) / known.size
+        bias = float(ndtri(share))
+        moved = bias + ndtri(tails)
+        tails = ndtr(bias + moved / (1.0 - _acceleration(without_each) * moved))
     low, high = np.quantile(known, np.sort(tails))
     # Resampling raises a variance over regions; where that is all there is, quantiles miss it.
     return Interval(min(float(low), value), max(float(high), value))
@@ -97,29 +104,12 @@ def corrected(value: float, bias: float, spread: Spread, level: float) -> Interv
     return Interval(min(max(0.0, around.low), value), max(around.high, value))
 
 
-def _bias(value: float, known: Values) -> float:
-    """z0: how far the resampled scores lie to one side of the score itself."""
-    from scipy.special import ndtri
-
-    below = (known < value).sum() + 0.5 * (known == value).sum()
-    share = min(max(below, 0.5), known.size - 0.5) / known.size
-    return float(ndtri(share))
-
-
 def _acceleration(without_each: Values) -> float:
     """How fast the standard error changes with the score; from the jackknife."""
     known = without_each[~np.isnan(without_each)]
     moved = known.mean() - known if known.size else known
     squares = float((moved**2).sum())
     return float((moved**3).sum()) / (6.0 * squares**1.5) if squares > 0 else 0.0
-
-
-def _corrected(tails: Values, bias: float, acceleration: float) -> Values:
-    from scipy.special import ndtr, ndtri
-
-    moved = bias + ndtri(tails)
-    shares: Values = ndtr(bias + moved / (1.0 - acceleration * moved))
-    return shares
 
 
 def over_seeds(*methods: Values) -> Spread | None:

@@ -11,7 +11,7 @@ import numpy as np
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.run_files import Description
 from rgbt.tracking.run_folder import RunFolder
-from tests.analysis.figures.drawn import counts
+from tests.analysis.counts import counts_of
 
 SCORES = {
     ("clean", "clean", "", 0.0): 80,
@@ -33,7 +33,7 @@ def right(percent: int, images: int = 12) -> Counts:
     """
     a = round(2 * PIXELS * percent / (100 + percent))
     one = [[a, PIXELS - a], [PIXELS - a, a]]
-    return counts(np.array([[one]] * images), "ring1")
+    return counts_of(np.array([[one]] * images))
 
 
 def write_levels(folder: Path, scores: dict[tuple[str, str, str, float], int]) -> Path:

@@ -13,7 +13,6 @@ from analysis.robustness import levels_of, trainings, under
 from rgbt.checks import InputError
 from rgbt.evaluation.robustness import CLEAN, FOLDER, FORMAT
 from rgbt.metrics.named import value
-from tests.analysis import robust_runs
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
 
@@ -119,24 +118,3 @@ def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
     code, out, err = call(entry, "a=k2", "b=k0", "corruption=rgb_removed", *where)
     assert code == 0, err
     assert "15.00" in out
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["severity=3"], "'severity' has no effect without corruption=..."),
-        (["corruption=noise", "frames=next"], "is of single frames; omit frames="),
-        (["corruption=noise", "severity=3"], "holds noise at 8, 16; give one of these"),
-    ],
-)
-def test_compare_refuses(call: Call, runs: Path, words: list[str], sentence: str) -> None:
-    code, out, err = call(entry, "a=k2", "b=k0", f"runs_dir={runs}", *words)
-    assert (code, out) == (2, "")
-    assert sentence in err
-
-
-def test_scores_by_hand() -> None:
-    # 75,000 of 100,000 right in both classes: 75 / (200 - 75) = 60 percent.
-    (matrix,) = robust_runs.right(60, images=1).counts[0].tolist()
-    assert matrix == [[75_000, 25_000], [25_000, 75_000]]
-    assert value("mIoU", robust_runs.right(60), "released") == pytest.approx(60)

@@ -21,9 +21,9 @@ from analysis.uncertainty import Resampling, estimate
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.run_files import Description, counts_name
-from rgbt.tracking.run_folder import RunFolder
-from tests.commands import SPLITS, Call
+from tests.analysis.counts import counts_of
+from tests.analysis.test_results import make_run
+from tests.commands import SPLITS, Call, assert_one_sentence
 from tests.conftest import pair
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,10 +44,6 @@ def predictions(data: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def score(call: Call, *arguments: str) -> tuple[int, str, str]:
-    return call(entry, *arguments)
-
-
 def place(data: Path) -> tuple[str, str]:
     return "dataset=mfnet", f"dataset.root={data}"
 
@@ -56,8 +52,8 @@ def test_a_folder_is_scored_and_written(
     call: Call, data: Path, predictions: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "scores"
-    code, shown, err = score(
-        call, f"predictions={predictions}", *place(data), f"out={out}", "resamples=0"
+    code, shown, err = call(
+        entry, f"predictions={predictions}", *place(data), f"out={out}", "resamples=0"
     )
     assert code == 0, err
     counts = {name: Counts.load(out / f"counts_{name}5.npz") for name in ("ring", "vertical")}
@@ -91,8 +87,8 @@ def test_intervals_hold_the_score(call: Call, data: Path, tmp_path: Path) -> Non
         cv2.imwrite(str(folder / f"{name}.png"), np.where(label > number % 4, label, 0))
     fewer = ("partition=ring", "regions=2", "resamples=500", "blocks=none", "level=0.9")
     out = tmp_path / "scores"
-    code, shown, err = score(
-        call, f"predictions={folder}", *place(data), *fewer, f"out={out}", "name=mine"
+    code, shown, err = call(
+        entry, f"predictions={folder}", *place(data), *fewer, f"out={out}", "name=mine"
     )
     assert code == 0, err
     assert "90 % intervals over images" in shown
@@ -115,16 +111,7 @@ def test_each_convention_has_intervals_of_its_own() -> None:
     images[:, :, 0, 1] = np.arange(20)[:, None] % 3
     images[:2, 0, 1, 1] = 5
     images[:, 1, 0, 1] = 0  # the second class is nowhere in the second region
-    names = tuple(f"{number:05d}D" for number in range(20))
-    counts = Counts(
-        counts=images,
-        names=names,
-        night=None,
-        classes=("a", "b"),
-        partition="vertical2",
-        dataset="f",
-        split="test",
-    )
+    counts = counts_of(images)
     settings = Resampling(resamples=400, blocks="none")
     (table,) = score_tables([("ours", counts)], settings)
     for absent in ("released", "exclude"):
@@ -144,11 +131,11 @@ def test_what_was_left_out_is_said_in_the_terminal_and_in_the_file(
 ) -> None:
     (predictions / f"{SPLITS['test'][0]}.png").rename(predictions / "stray.png")
     arguments = (f"predictions={predictions}", *place(data), "resamples=0")
-    code, _, err = score(call, *arguments)
+    code, _, err = call(entry, *arguments)
     assert code == 2
     assert "lacks the predictions of 1 of the 3 images" in err
     out = tmp_path / "scores"
-    code, shown, _ = score(call, *arguments, "missing=leave_out", f"out={out}")
+    code, shown, _ = call(entry, *arguments, "missing=leave_out", f"out={out}")
     assert code == 0
     for text in (shown, (out / "scores.md").read_text()):
         assert "1 of 3 images of the split have no prediction and are left out" in text
@@ -160,17 +147,17 @@ def test_stored_counts_are_scored(
 ) -> None:
     out = tmp_path / "scores"
     arguments = (f"predictions={predictions}", *place(data), "resamples=0")
-    score(call, *arguments, f"out={out}", "name=scores", "partition=ring")
+    call(entry, *arguments, f"out={out}", "name=scores", "partition=ring")
     written = (out / "scores.csv").read_text()
     stored = f"counts={out / 'counts_ring5.npz'}"
-    code, _, err = score(call, stored, "resamples=0", f"out={tmp_path / 'again'}")
+    code, _, err = call(entry, stored, "resamples=0", f"out={tmp_path / 'again'}")
     assert code == 0, err
     assert "no map by pixel" in err
     assert (tmp_path / "again" / "scores.csv").read_text() == written
-    code, _, err = score(call, stored, "regions=9")
+    code, _, err = call(entry, stored, "regions=9")
     assert code == 2
     assert "'regions' has no effect on stored counts" in err
-    code, _, err = score(call, stored, *place(data))
+    code, _, err = call(entry, stored, *place(data))
     assert "'dataset' has no effect on stored counts" in err
 
 
@@ -179,21 +166,21 @@ def test_a_folder_holds_scores_of_one_method(
 ) -> None:
     out = tmp_path / "scores"
     arguments = (f"predictions={predictions}", *place(data), "resamples=0", f"out={out}")
-    assert score(call, *arguments)[0] == 0
+    assert call(entry, *arguments)[0] == 0
     (out / "counts_test.npz").write_text("of a run")
     (out / "counts_ring9.npz").write_text("of an earlier call")
     twin = tmp_path / "elsewhere" / predictions.name  # of the same name
     shutil.copytree(predictions, twin)
-    code, _, err = score(call, f"predictions={twin}", *arguments[1:])
+    code, _, err = call(entry, f"predictions={twin}", *arguments[1:])
     assert code == 2
     assert (
         f"holds the scores of predictions={predictions} split=test; give predictions={twin}" in err
     )
-    code, _, err = score(call, f"counts={out}", "resamples=0", f"out={out}")
+    code, _, err = call(entry, f"counts={out}", "resamples=0", f"out={out}")
     assert code == 2
     assert f"give counts={out} its own folder" in err
     # The same method again: nothing of the first time is left, and nothing of others is touched.
-    code, _, err = score(call, *arguments, "partition=ring", "regions=3")
+    code, _, err = call(entry, *arguments, "partition=ring", "regions=3")
     assert code == 0
     assert "removed from" in err
     assert "counts_ring5.npz, counts_ring9.npz, counts_vertical5.npz" in err
@@ -201,34 +188,11 @@ def test_a_folder_holds_scores_of_one_method(
     assert left == {"counts_ring3.npz", "counts_test.npz", "maps.npz"}
 
 
-def test_day_and_night_say_their_own_blocks(call: Call) -> None:
-    del call
-    rng = np.random.default_rng(0)
-    counts = Counts(
-        counts=rng.integers(0, 50, (40, 2, 3, 3)),
-        names=tuple(f"{number:05d}{'N' if number < 12 else 'D'}" for number in range(40)),
-        night=tuple(number < 12 for number in range(40)),
-        classes=("a", "b", "c"),
-        partition="ring2",
-        dataset="x",
-        split="test",
-    )
-    settings = Resampling(resamples=100, blocks="none")
-    (table,) = score_tables([("m", counts)], settings)
-    assert "of 40 single images; day of 28 single images; night of 12 single" in table.intervals
-
-
 def test_a_part_that_is_too_small_stops_nothing_else() -> None:
-    rng = np.random.default_rng(0)
-    counts = Counts(
-        counts=rng.integers(0, 50, (100, 2, 3, 3)),
-        names=tuple(f"{number:05d}{'N' if number < 30 else 'D'}" for number in range(100)),
-        night=tuple(number < 30 for number in range(100)),
-        classes=("a", "b", "c"),
-        partition="ring2",
-        dataset="x",
-        split="test",
-    )
+    night = tuple(number < 30 for number in range(100))
+    array = np.random.default_rng(0).integers(0, 50, (100, 2, 3, 3))
+    names = tuple(f"{number:05d}{'DN'[dark]}" for number, dark in enumerate(night))
+    counts = counts_of(array, names=names, night=night)
     (table,) = score_tables([("m", counts)], Resampling(resamples=100, blocks=5))
     assert "of 20 blocks of up to 5" in table.intervals
     assert "night has none (night: blocks=5: 30 images make 6 blocks" in table.intervals
@@ -239,91 +203,44 @@ def test_a_part_that_is_too_small_stops_nothing_else() -> None:
 
 
 def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
     for seed in (0, 1):
-        run = RunFolder(tmp_path / "runs" / f"aaa{seed}")
-        run.write_config("name: x")
-        run.describe(Description("m", {"rgbt.group": "m", "rgbt.seed": str(seed)}, {}))
-        Counts(
-            counts=rng.integers(0, 50, (12, 2, 3, 3)),
-            names=tuple(map(str, range(12))),
-            night=None,
-            classes=("a", "b", "c"),
-            partition="ring2",
-            dataset="x",
-            split="test",
-        ).save(run.path / counts_name("test"))
-        run.finish({})
+        make_run(tmp_path / "runs", f"aaa{seed}", "m", seed)
     out = tmp_path / "out"
     words = (f"runs_dir={tmp_path / 'runs'}", "resamples=0")
-    code, shown, err = score(call, "counts=m", f"out={out}", *words)
+    code, shown, err = call(entry, "counts=m", f"out={out}", *words)
     assert code == 0, err
     assert "m seed 0, test" in shown
     assert "m seed 1, test" in shown
     # Another method's scores do not go into the same folder, counted here or elsewhere.
-    code, _, err = score(call, "counts=aaa0", f"out={out}", *words)
+    code, _, err = call(entry, "counts=aaa0", f"out={out}", *words)
     assert code == 2
     assert "holds the scores of counts=m; give counts=aaa0 its own folder" in err
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "word"),
     [
         (("predictions=a",), "the data set has to be named: dataset=mfnet"),
-        (
-            ("predictions=a", "dataset=mfnet", "out=/dev/null/x"),
-            "/dev/null is a file; give a folder",
-        ),
+        (("predictions=a", "dataset=mfnet", "out=/dev/null/x"), "is a file; give a folder"),
         ((), "expected one of predictions=folder and counts=run, got neither"),
         (("predictions=a", "counts=b"), "got predictions and counts"),
         (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect here"),
         (("predictions=a", "dataset=mfnte"), "did you mean 'mfnet'"),
         (("predictions=a", "dataset=mfnet"), "dataset.root"),
         (("predictions=a", "resamples=many"), "'resamples' must be a whole number"),
-        (("predictions=a", "level=high"), "'level' must be a number"),
-        (("predictions=a", "blocks=run"), "'blocks' must be 'auto'"),
+        (("split=val",), "3 of them images of split 'test': give split=test"),
+        (("split=tset",), "did you mean 'test'"),
+        (("regions=0",), "'regions' must be a whole number from 1 to 255"),
     ],
 )
-def test_arguments_that_make_no_sense(
-    call: Call, arguments: tuple[str, ...], sentence: str
+def test_arguments_that_make_no_sense_are_refused(
+    call: Call, data: Path, predictions: Path, arguments: tuple[str, ...], word: str
 ) -> None:
-    code, _, err = score(call, *arguments)
+    is_of_folder = arguments and arguments[0].startswith(("split", "regions"))
+    folder = (f"predictions={predictions}", *place(data)) if is_of_folder else ()
+    code, _, err = call(entry, *folder, *arguments)
     assert code == 2
-    assert sentence in err
-    assert len(err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("argument", "sentence"),
-    [
-        ("partition=rings", "did you mean 'ring'"),
-        ("regions=0", "'regions' must be a whole number from 1 to 255"),
-        ("format=color", "'format' must be 'auto', 'index' or 'colour'"),
-        ("split=val", "2 of them"),
-        ("split=tset", "did you mean 'test'"),
-    ],
-)
-def test_choices_that_do_not_fit_the_folder(
-    call: Call, data: Path, predictions: Path, argument: str, sentence: str
-) -> None:
-    sentence = sentence.replace("2 of them", "3 of them images of split 'test': give split=test")
-    code, _, err = score(call, f"predictions={predictions}", *place(data), argument)
-    assert code == 2
-    assert sentence in err
-
-
-def test_help_waits_for_no_heavy_import() -> None:
-    code = (
-        "import sys; sys.argv[1:] = ['--help']\n"
-        "from analysis.score import *\n"
-        "try: entry()\n"
-        "except SystemExit as left: assert left.code == 0\n"
-        "heavy = {'torch', 'matplotlib', 'mlflow', 'pandas', 'PIL', 'cv2'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "usage: rgbt score [option=value ...]" in done.stdout
+    assert_one_sentence(err, word)
 
 
 @pytest.mark.slow

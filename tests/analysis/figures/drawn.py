@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from analysis.figures.style import save
 from analysis.statistics.data import SpatialStatistics
-from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 
 CLASSES = ("unlabeled", "car", "color_cone")
@@ -33,20 +32,6 @@ def letters(figure: Figure, folder: Path) -> list[float]:
     path = folder / "sizes.svg"
     save(figure, path)
     return [float(size) for size in re.findall(r"font(?:-size)?: ([\d.]+)px", path.read_text())]
-
-
-def counts(by_region: np.ndarray, partition: str = "ring2", names: tuple[str, ...] = ()) -> Counts:
-    """Counts of one image, or of one image per first index: ([N,] R, K, K)."""
-    matrices = by_region if by_region.ndim == 4 else by_region[None]
-    return Counts(
-        counts=matrices,
-        names=names or tuple(f"{index:05d}D" for index in range(len(matrices))),
-        night=None,
-        classes=tuple(f"class{index}" for index in range(matrices.shape[-1])),
-        partition=partition,
-        dataset="fingerprint",
-        split="test",
-    )
 
 
 def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -> SpatialStatistics:

@@ -10,7 +10,8 @@ import pytest
 
 from analysis.figures.classes import class_regions, draw
 from rgbt.checks import InputError
-from tests.analysis.figures.drawn import counts, statistics, strips, texts
+from tests.analysis.counts import counts_of
+from tests.analysis.figures.drawn import statistics, strips, texts
 
 HALVES = strips(2)
 
@@ -31,11 +32,6 @@ def test_shares_of_the_largest_region_by_hand() -> None:
     assert data.miou is None
 
 
-def test_a_part_alone() -> None:
-    stats = statistics(two_images(), HALVES, np.array([False, True]))
-    np.testing.assert_allclose(class_regions(stats, "night").shares[0], [0, 100])
-
-
 def test_a_class_that_occurs_nowhere_has_no_share_and_is_said_so(tmp_path: Path) -> None:
     labels = np.minimum(two_images(), 1)
     data = class_regions(statistics(labels, HALVES, None))
@@ -45,7 +41,7 @@ def test_a_class_that_occurs_nowhere_has_no_share_and_is_said_so(tmp_path: Path)
 
 def test_miou_of_a_method_over_the_same_regions(tmp_path: Path) -> None:
     matrices = np.array([[[6, 2], [0, 2]], [[8, 0], [0, 2]]])
-    method = "CRM-B", counts(matrices, "vertical2")
+    method = "CRM-B", counts_of(matrices, partition="vertical2")
     data = class_regions(statistics(two_images(), HALVES, None), "all", method)
     np.testing.assert_allclose(data.miou, [62.5, 100])
     found = texts(draw(data, ("test", "test")), tmp_path)
@@ -54,7 +50,7 @@ def test_miou_of_a_method_over_the_same_regions(tmp_path: Path) -> None:
 
 def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
     matrices = np.array([[[[6, 2], [0, 2]]] * 2, [[[8, 0], [0, 2]]] * 2])
-    by_day = counts(matrices, "vertical2")
+    by_day = counts_of(matrices, partition="vertical2")
     stats = statistics(two_images(), HALVES, np.array([False, True]))
     known = replace(by_day, night=(False, True))
     data = class_regions(stats, "night", ("CRM-B", known))
@@ -69,6 +65,6 @@ def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
 
 
 def test_counts_over_other_regions_are_refused() -> None:
-    method = "CRM-B", counts(np.ones((2, 2, 2), int), "ring2")
+    method = "CRM-B", counts_of(np.ones((2, 2, 2), int))
     with pytest.raises(InputError, match="'CRM-B' was counted over ring2 but the statistics over"):
         class_regions(statistics(two_images(), HALVES, None), "all", method)

@@ -12,7 +12,8 @@ from analysis.figures.consistency import class_consistency, draw
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from tests.analysis.figures.drawn import counts, texts
+from tests.analysis.counts import counts_of
+from tests.analysis.figures.drawn import texts
 from tests.analysis.uncertainty.simulated import CLASSES, pairs_of
 
 
@@ -20,7 +21,7 @@ def alike(share: int, partition: str = "aligned1") -> Counts:
     """Pairs that agree on class 0 in `share` of 100 pixels; the others are class 1 in frame 2."""
     pairs = np.zeros((3, 2, 2), int)
     pairs[0, 0] = share, 100 - share
-    return counts(pairs, partition)
+    return counts_of(pairs, partition=partition)
 
 
 def test_series_by_hand_and_their_means() -> None:
@@ -45,14 +46,6 @@ def test_ca_is_by_the_union_of_the_protocol() -> None:
         np.testing.assert_allclose(data.ca, [[100 * 60 / union, 0]])
 
 
-def test_classes_without_pixels_count_as_asked() -> None:
-    nothing = alike(100)  # class 1 is nowhere
-    assert class_consistency({"(G)": [nothing]}, "released").means() == {"(G)": (50, 50)}
-    data = class_consistency({"(G)": [nothing]}, "exclude")
-    np.testing.assert_array_equal(data.tc, [[100, np.nan]])
-    assert data.means() == {"(G)": (100, 100)}
-
-
 def test_is_what_the_metrics_are() -> None:
     seeds = [pairs_of(10, 0.6, seed) for seed in range(2)]
     data = class_consistency({"ours": seeds}, "released")
@@ -61,13 +54,6 @@ def test_is_what_the_metrics_are() -> None:
             metric = f"class/{name}/{score}"
             expected = np.mean([value(metric, each, "released") for each in seeds])
             assert row[0, column] == pytest.approx(expected)
-
-
-def test_draws_every_series_and_class_with_means(tmp_path: Path) -> None:
-    data = class_consistency({"(G)": [alike(60)], "(H)": [alike(80)]}, "released")
-    found = texts(draw(data), tmp_path)
-    assert {"(G) (TC 30.0, CA 30.0)", "(H) (TC 40.0, CA 40.0)", "class0", "class1"} <= set(found)
-    assert "virtual views, first frame brought into the second" in found
 
 
 @pytest.mark.parametrize(
@@ -90,7 +76,7 @@ def test_counts_of_single_frames_are_refused() -> None:
     with pytest.raises(
         InputError, match=r"counts of 'x' \(ring2\) are of single .*consistency run="
     ):
-        class_consistency({"x": [counts(np.ones((2, 2, 2), int))]}, "released")
+        class_consistency({"x": [counts_of(np.ones((2, 2, 2), int))]}, "released")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 from analysis.figures.image_quality import draw, laplacian_series, snr_series
 from analysis.statistics.data import SpatialStatistics
 from analysis.statistics.resampling import ConsecutiveBlocks
-from rgbt.checks import InputError
 from tests.analysis.figures.drawn import statistics, strips, texts
 
 LABELS = np.zeros((40, 4, 6), np.uint8)
@@ -68,26 +67,6 @@ def test_intervals_are_of_the_blocks_of_their_part(measured: SpatialStatistics, 
             np.testing.assert_allclose(series.bands[modality, part], expected, rtol=1e-5)
 
 
-def test_intervals_hold_the_value_and_are_wider_for_fewer_images(
-    measured: SpatialStatistics,
-) -> None:
-    data = laplacian_series(measured, blocks(measured))
-    for key, (low, high) in data.bands.items():
-        assert (low < data.values[key]).all()
-        assert (data.values[key] < high).all()
-    few = measured.chosen("day") & (np.arange(40) % 2 == 0)
-    fewer = statistics(LABELS[few], strips(3), None)
-    assert fewer.laplacian.shape[0] == 10
-    relative = [
-        float(np.log(series.bands["rgb", "all"][1] / series.bands["rgb", "all"][0])[0])
-        for series in (
-            data,
-            laplacian_series(fewer, ConsecutiveBlocks(fewer, size=1, resamples=400)),
-        )
-    ]
-    assert relative[1] > relative[0] > 0
-
-
 def test_a_single_image_has_no_interval_and_is_drawn(tmp_path: Path) -> None:
     single = statistics(LABELS[:1], strips(3), None)
     data = laplacian_series(single, blocks(single))
@@ -108,8 +87,3 @@ def test_far_modalities_get_a_logarithmic_axis(measured: SpatialStatistics, tmp_
     } <= set(found)
     assert "signal-to-noise ratio (immerkaer)" in found
     assert "(all 40, day 20, night 20)" in found
-
-
-def test_unknown_estimator(measured: SpatialStatistics) -> None:
-    with pytest.raises(InputError, match="did you mean 'immerkaer'"):
-        snr_series(measured, blocks(measured), "imerkaer", "pooled")

@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 from analysis.figures.maps import (
-    RegionPicture,
-    draw_heats,
     draw_regions,
     iou_heat,
-    is_around,
     number_beside,
     occupancy_heat,
     occupancy_over,
@@ -22,7 +19,6 @@ from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.predictions.table import ScoreKey, score_table
 from analysis.statistics.derive import region_occupancy
-from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Absent, Regions
 from tests.analysis.figures.drawn import CLASSES, PALETTE, statistics, strips, texts
@@ -84,13 +80,6 @@ def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absen
     np.testing.assert_allclose([100 * heat.centre, 100 * heat.edge, 100 * heat.whole], wanted)
 
 
-def test_absent_classes_can_be_left_out() -> None:
-    union = np.ones((2, 6, 8))
-    union[1] = 0
-    rings = Regions(partition="ring", regions=2, aspect="image", absent="exclude")
-    assert iou_heat(maps(np.zeros_like(union) + union, union), rings).whole == 1.0
-
-
 def test_occupancy_is_the_share_of_labels_that_are_not_background() -> None:
     labels = np.zeros((4, 6, 8), np.uint8)
     inner = RINGS.map((6, 8)) == 0
@@ -113,37 +102,12 @@ def test_occupancy_over_the_measured_regions_is_what_the_statistics_say() -> Non
         np.testing.assert_allclose(found, region_occupancy(stats, part))
 
 
-def test_strips_have_no_centre() -> None:
-    stats = statistics(np.zeros((2, 6, 8), np.uint8), RINGS, None)
-    with pytest.raises(InputError, match=r"no centre and no edge; use rings"):
-        occupancy_heat(stats, strips(5))
-
-
-def test_draws_the_numbers_and_says_what_centre_and_edge_are(tmp_path: Path) -> None:
-    labels = np.zeros((4, 60, 80), np.uint8)
-    labels[:1] = 1
-    stats = statistics(labels, RINGS, None)
-    both = [iou_heat(maps(np.ones((2, 60, 80)), np.full((2, 60, 80), 2)), RINGS)]
-    both.append(occupancy_heat(stats, RINGS))
-    found = " ".join(texts(draw_heats(both), tmp_path))
-    assert "mIoU: centre 50.0 %" in found
-    assert "SOR: centre 25.0 %" in found
-    assert "pixels pooled" in found
-    assert "edge 25.0 %" in found
-    assert "inner and outer region of ring2" in found
-    assert "(a) IoU: RTFNet, test" in found
-    assert "(b) sample occupancy: toy, train" in found
-    assert "1.0" in found  # the scale ends at 1 whatever the values
-    assert "(a)" not in " ".join(texts(draw_heats(both[1:]), tmp_path))
-
-
 @pytest.mark.parametrize("regions", [strips(9, "ring"), strips(5), strips(5, "horizontal")])
 def test_every_region_is_numbered_inside(tmp_path: Path, regions: Regions) -> None:
     region_map = regions.map((480, 640))
     places = number_beside(region_map)
     assert [int(region_map[place]) for place in places if place] == list(range(regions.regions))
-    data = RegionPicture(np.zeros((480, 640)), region_map, regions.name)
-    found = texts(draw_regions(data), tmp_path)
+    found = texts(draw_regions(np.zeros((480, 640)), region_map), tmp_path)
     assert {str(number + 1) for number in range(regions.regions)} <= set(found)
 
 
@@ -151,9 +115,3 @@ def test_numbers_of_rings_stand_apart() -> None:
     places = number_beside(strips(9, "ring").map((480, 640)))
     columns = sorted(place[1] for place in places if place)
     assert min(np.diff(columns)) > 15  # 7 point digits take 15 of 640 pixels in a column
-
-
-def test_only_outer_rings_are_around() -> None:
-    rings, beside = strips(3, "ring").map((48, 64)), strips(3).map((48, 64))
-    assert [is_around(rings, region) for region in range(3)] == [False, True, True]
-    assert not any(is_around(beside, region) for region in range(3))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import torch
 from analysis.figures.masks import (
     HIDDEN,
     PATCHES,
-    draw,
     mask_examples,
     masker_overrides,
     whole_cells,
@@ -21,7 +19,6 @@ from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.types import MaskPair, Sample
-from tests.analysis.figures.drawn import texts
 
 
 def sample(height: int = 100, width: int = 140) -> Sample:
@@ -90,8 +87,3 @@ def test_sizes_are_positive() -> None:
     assert whole_cells((8, 48)) == 96
     with pytest.raises(InputError, match="patches must be positive"):
         whole_cells((8, 0))
-
-
-def test_draws_a_column_per_mask(tmp_path: Path) -> None:
-    found = texts(draw(examples()), tmp_path)
-    assert {"square", "64 x 64 pixels", "RGB", "thermal"} <= set(found)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,10 +12,10 @@ from analysis.figures.panels import (
     most_different,
     panel,
 )
-from analysis.figures.style import save
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from tests.analysis.figures.drawn import counts, strips, texts
+from tests.analysis.counts import counts_of
+from tests.analysis.figures.drawn import strips
 
 NAMES = ["00001D", "00002N"]
 RINGS = strips(4, "ring")
@@ -69,30 +67,11 @@ def test_scores_of_an_image_leave_unscored_classes_out(dataset: MFNet) -> None:
     assert miou(lost, took) == pytest.approx(100)
 
 
-@pytest.mark.parametrize("layout", ["rows", "columns"])
-def test_draws_titles_names_classes_and_a_box_on_every_picture(
-    dataset: MFNet, tmp_path: Path, layout: str
-) -> None:
-    figure = draw(made(dataset, ours=right(dataset)), layout)
-    found = texts(figure, tmp_path)
-    assert {"RGB", "thermal", "ground truth", "ours", *NAMES, "car", "car stop"} <= set(found)
-    assert len(figure.axes) == 8
-    for axes in figure.axes:
-        assert axes.patches[-1].get_bbox().bounds == (7.5, 5.5, 16, 12)
-
-
 def test_ours_is_painted_in_the_colours_of_the_data_set(dataset: MFNet) -> None:
     figure = draw(made(dataset, names=NAMES[:1], ours=right(dataset)))
     shown = figure.axes[3].images[0].get_array()
     label = dataset.read("00001D").label
     np.testing.assert_array_equal(shown, np.array(dataset.palette, np.uint8)[label])
-
-
-def test_pdf_holds_the_pixels_as_they_are(dataset: MFNet, tmp_path: Path) -> None:
-    save(draw(made(dataset, names=NAMES[:1], ours=right(dataset))), tmp_path / "f.pdf")
-    content = (tmp_path / "f.pdf").read_bytes()
-    assert content.count(b"/Width 32") == 4
-    assert content.count(b"/Height 24") == 4
 
 
 def test_other_sizes_are_refused(dataset: MFNet) -> None:
@@ -108,7 +87,7 @@ def test_strips_have_no_centre(dataset: MFNet) -> None:
 def test_miou_of_images_is_over_the_classes_that_occur() -> None:
     matrices = np.zeros((2, 1, 3, 3), int)
     matrices[0, 0, :2, :2] = [[3, 1], [0, 0]]  # IoU 3/4, and 0 for a class that is only predicted
-    found = image_mious(counts(matrices, "ring1", ("a", "b")))
+    found = image_mious(counts_of(matrices, names=("a", "b")))
     assert found["a"] == pytest.approx(37.5)
     assert np.isnan(found["b"])
 

@@ -66,12 +66,6 @@ def test_mean_deviation_and_what_is_left_of_clean() -> None:
     assert np.isnan(Curve("x", np.array([[80.0, 40.0]])).summary(relative=False)[1]).all()
 
 
-def test_corruptions_that_are_named_in_their_order(methods) -> None:
-    assert [panel.row for panel in panels(methods, "released", ["noise"])] == ["noise"]
-    (missing,) = panels(methods, "released", ["features-thermal", "rgb_removed"])
-    assert missing.ticks == ("clean", "thermal alone (features)", "RGB removed (zeroed)")
-
-
 def test_a_method_that_was_not_measured_keeps_its_colour(training, tmp_path: Path) -> None:
     few = {key: each for key, each in SCORES.items() if key[0] in ("clean", "rgb_removed")}
     methods = {"few": [training("a", few)], "all": [training("b", less(10))]}
@@ -124,18 +118,6 @@ def test_draws_every_panel_with_its_unit_and_methods(
     np.testing.assert_allclose(drawn[0], expected[0], atol=0.01)
 
 
-def test_twelve_panels_have_three_lines(training) -> None:
-    scores = {("clean", "clean", "", 0.0): 80} | {
-        (f"kind{index}", f"kind {index}", "unit", float(severity)): 50
-        for index in range(12)
-        for severity in (1, 2)
-    }
-    figure = draw(panels({"a": [training("a", scores)]}, "released"), relative=False)
-    places = {tuple(axes.get_subplotspec().get_geometry()[:2]) for axes in figure.axes}
-    assert places == {(3, 4)}
-    assert len(figure.axes) == 12
-
-
 def test_what_cannot_be_shown_together(training, methods) -> None:
     def ladder(*severities: float) -> Scores:
         own = {("noise", "noise", "std", each): 50 for each in severities}
@@ -169,18 +151,3 @@ def test_the_command_draws_groups_and_writes_the_numbers(call: Call, tmp_path: P
     assert "mine (1 seed)" in out.read_text()
     assert "crm masker=none (2 seeds)" in out.read_text()
     assert "thermal alone" not in out.with_suffix(".md").read_text()
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["figure=robustness"], "needs runs=..., runs or groups"),
-        (["figure=robustness/relative", "runs=nowhere"], "'nowhere' is no run folder"),
-        (["figure=robustness", "runs=a", "frames=next"], "'frames' has no effect on figure="),
-        (["figure=regions/heat", "runs=a", "corruptions=noise"], "'corruptions' has no effect"),
-    ],
-)
-def test_bad_input(call: Call, tmp_path: Path, words: list[str], sentence: str) -> None:
-    code, out, err = call(entry, *words, f"out={tmp_path / 'f.pdf'}", f"runs_dir={tmp_path}")
-    assert (code, out) == (2, "")
-    assert sentence in err

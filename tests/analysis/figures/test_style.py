@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -13,16 +12,12 @@ from analysis.figures.style import (
     COLOURS,
     COLUMN,
     SMALL,
-    class_legend,
-    legend_height,
     new_figure,
-    out_path,
     save,
     series_style,
     styled,
 )
-from rgbt.checks import InputError
-from tests.analysis.figures.drawn import CLASSES, PALETTE, letters, texts
+from tests.analysis.figures.drawn import letters, texts
 
 
 @styled
@@ -62,28 +57,9 @@ def test_same_figure_gives_the_same_file(tmp_path: Path, suffix: str) -> None:
     assert len(list(tmp_path.iterdir())) == 2  # nothing temporary is left
 
 
-@pytest.mark.parametrize("name", ["f.eps", "f", "figures/"])
-def test_unknown_ending_is_refused(name: str) -> None:
-    with pytest.raises(InputError, match=r"expected a name that ends in .pdf, .svg or .png"):
-        out_path(name)
-
-
-def test_drawing_leaves_the_settings_of_matplotlib_alone() -> None:
-    import matplotlib
-
-    before = dict(matplotlib.rcParams)
-    simple()
-    assert dict(matplotlib.rcParams) == before
-
-
 def test_series_differ_in_colour_marker_or_line() -> None:
     styles = [tuple(series_style(index).values()) for index in range(32)]
     assert len(set(styles)) == 32
-
-
-def test_series_next_to_each_other_differ_without_colour() -> None:
-    plain = [tuple(series_style(index).values())[1:] for index in range(len(COLOURS))]
-    assert len(set(plain)) == len(COLOURS)
 
 
 def test_series_differ_in_brightness_or_hue_for_dichromats() -> None:
@@ -96,12 +72,3 @@ def test_series_differ_in_brightness_or_hue_for_dichromats() -> None:
     seen = (np.linalg.inv(to_lms) @ blind @ to_lms @ (rgb**2.2).T).T.clip(0) ** (1 / 2.2)
     gaps = [np.linalg.norm(seen[i] - seen[j]) for i in range(6) for j in range(i)]
     assert min(gaps) > 0.12
-
-
-def test_class_legend_names_classes_and_takes_the_space_it_says(tmp_path: Path) -> None:
-    figure = new_figure(COLUMN, 1.0)
-    figure.subplots()
-    class_legend(figure, CLASSES, PALETTE)
-    assert {"unlabeled", "car", "color cone"} <= set(texts(figure, tmp_path))
-    heights = [legend_height(COLUMN, number) for number in (1, 5, 9)]
-    assert all(b > a for a, b in pairwise(heights))

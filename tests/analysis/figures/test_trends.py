@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from analysis.figures.trends import draw, trend
+from analysis.figures.trends import trend
 from rgbt.checks import InputError
-from tests.analysis.figures.drawn import counts, texts
+from tests.analysis.counts import counts_of
 
 TWO = np.array([[[6, 2], [0, 2]], [[8, 0], [0, 2]]])
 """Region 1: IoU 6/8 and 2/4, Acc 6/8 and 1. Region 2: all right."""
 
 
 def test_changes_from_the_first_region_by_hand() -> None:
-    data = trend("ring", np.array([0.4, 0.1]), {"CRM": counts(TWO)}, "released")
+    data = trend("ring", np.array([0.4, 0.1]), {"CRM": counts_of(TWO)}, "released")
     np.testing.assert_allclose(data.ious["CRM"], [62.5, 100])
     np.testing.assert_allclose(data.accuracies["CRM"], [87.5, 100])
     changes = data.changes()
@@ -26,15 +24,8 @@ def test_changes_from_the_first_region_by_hand() -> None:
     np.testing.assert_allclose(changes["SOR"], [0, -30])
 
 
-def test_images_are_added_before_dividing() -> None:
-    both = np.stack([TWO, 0 * TWO])
-    both[1, 0] = [[2, 0], [0, 0]]
-    data = trend("ring", np.array([0.4, 0.1]), {"CRM": counts(both)}, "released")
-    np.testing.assert_allclose(data.ious["CRM"][0], 50 * (8 / 10 + 2 / 4))
-
-
 def test_absent_classes_count_as_asked() -> None:
-    lonely = counts(np.array([[[4, 0], [0, 0]], [[4, 0], [0, 4]]]))
+    lonely = counts_of(np.array([[[4, 0], [0, 0]], [[4, 0], [0, 4]]]))
     released = trend("ring", np.ones(2), {"a": lonely}, "released")
     excluded = trend("ring", np.ones(2), {"a": lonely}, "exclude")
     assert (released.ious["a"][0], excluded.ious["a"][0]) == (50, 100)
@@ -43,20 +34,4 @@ def test_absent_classes_count_as_asked() -> None:
 @pytest.mark.parametrize("partition", ["vertical2", "ring3"])
 def test_counts_of_another_partition_are_refused(partition: str) -> None:
     with pytest.raises(InputError, match=f"'CRM' was counted over {partition}, expected ring2"):
-        trend("ring", np.ones(2), {"CRM": counts(TWO, partition)}, "released")
-
-
-def test_draws_three_panels_and_five_series(tmp_path: Path) -> None:
-    series = [
-        trend(
-            each,
-            np.array([0.4, 0.1]),
-            {"CRM (B)": counts(TWO, f"{each}2"), "RTF": counts(TWO, f"{each}2")},
-            "released",
-        )
-        for each in ("vertical", "horizontal", "ring")
-    ]
-    found = texts(draw(series, ("train", "test")), tmp_path)
-    assert "SOR: split train; scores: split test" in found
-    assert {"IoU (CRM (B))", "Acc (CRM (B))", "IoU (RTF)", "Acc (RTF)", "SOR"} <= set(found)
-    assert "(c) rings (inside to outside)" in found
+        trend("ring", np.ones(2), {"CRM": counts_of(TWO, partition=partition)}, "released")

@@ -25,21 +25,15 @@ from analysis.predictions.text import (
 )
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
+from tests.analysis.counts import counts_of
 
 FIRST = [[[4, 0, 0], [1, 3, 0], [0, 0, 0]], [[4, 0, 0], [0, 0, 0], [1, 1, 1]]]
 SECOND = [[[8, 0, 0], [0, 0, 0], [0, 0, 0]]] * 2
 
 
 def counts(*images: object, night: tuple[bool, ...] | None = (False, True)) -> Counts:
-    return Counts(
-        counts=np.array(images, np.int32),
-        names=("00001D", "00002N")[: len(images)],
-        night=night,
-        classes=("ground", "car", "person"),
-        partition="vertical2",
-        dataset="f",
-        split="test",
-    )
+    classes = ("ground", "car", "person")
+    return counts_of(np.array(images), night=night, classes=classes, partition="vertical2")
 
 
 @pytest.fixture
@@ -122,12 +116,6 @@ def test_grids_show_the_numbers(table: ScoreTable) -> None:
     parts = part_grid(table)
     assert parts.header == ("images", "mIoU", "Var", "mAcc", "IoU1", "IoU2")
     assert parts.rows[2] == ("day (1) released", "57.78", "48.23", "69.44", "51.67", "37.78")
-
-
-def test_without_day_and_night_there_are_only_all_images() -> None:
-    found = score_table(counts(FIRST, SECOND, night=None), "ours")
-    assert list(found.num_images) == ["all"]
-    assert {cell.images for cell in found.scores} == {"all"}
 
 
 def test_intervals_stand_beside_their_scores(table: ScoreTable) -> None:

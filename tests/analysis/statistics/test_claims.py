@@ -8,7 +8,6 @@ import pytest
 from analysis.statistics.claims import claims
 from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Judge, decide, every, most
 from analysis.statistics.resampling import ConsecutiveBlocks, ValueInterval
-from rgbt.checks import InputError
 from tests.analysis.statistics.scenes import made
 
 IMAGES = 120
@@ -52,6 +51,8 @@ def test_a_sample_as_the_paper_says() -> None:
         *("laplacian/centre", "laplacian/modality", "laplacian/day_rgb", "laplacian/day_thermal"),
         *("entropy/with_background", "entropy/without_background"),
     }
+    (even,) = plain["classes/even"].findings  # curve 0.75; car 0.667 and bump 0.741
+    assert even.interval.value == pytest.approx(0.75 - (0.667 + 0.741) / 2, abs=0.01)
     plain.pop("entropy/without_background")
     assert {key: claim.verdict for key, claim in plain.items()} == dict.fromkeys(plain, HOLDS)
     for average in ("pooled", "images"):
@@ -81,16 +82,6 @@ def test_a_sample_that_is_the_other_way_round() -> None:
         assert plain[key].verdict == FAILS, key
     noisy = by_key(claims(made(images=IMAGES, **turned)), "std", "pooled")
     assert {claim.verdict for claim in noisy.values()} == {FAILS}
-
-
-def test_no_difference_is_open() -> None:
-    """Night repeats day, and the edge the centre an image later."""
-    half = np.exp(np.random.default_rng(1).normal(size=(IMAGES // 2, 2, 3)))
-    half[..., 2] = np.roll(half[..., 0], 1, axis=0)
-    laplacian = np.concatenate([half, half])
-    plain = by_key(claims(made(images=IMAGES, laplacian=laplacian)))
-    assert plain["laplacian/centre"].verdict == OPEN
-    assert plain["laplacian/day_rgb"].verdict == OPEN
 
 
 def test_one_rise_among_falls_is_no_fall() -> None:
@@ -221,27 +212,6 @@ def test_blocks_are_neighbours_in_name_within_day_and_night() -> None:
     night_only = blocks.mean((np.arange(10) >= 5).astype(float), "night")
     np.testing.assert_array_equal(night_only, 1)
     np.testing.assert_allclose(blocks.mean(np.arange(10.0))[0], 4.5)
-
-
-@pytest.mark.slow
-def test_draws_depend_on_the_seed_alone() -> None:
-    stats = made(images=IMAGES, **as_the_paper_says())
-    assert claims(stats, seed=3) == claims(stats, seed=3)
-    assert claims(stats, seed=3) != claims(stats, seed=4)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"blocks": 0}, "blocks must lie in"),
-        ({"resamples": 10}, "resamples must lie in"),
-        ({"resamples": 100_001}, "resamples must lie in"),
-        ({"level": 1.0}, r"level must lie in \[0.5, 0.999\], got 1"),
-    ],
-)
-def test_numbers_out_of_range(given: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        claims(made(), **given)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.statistics import derive
-from analysis.statistics.collect import CHUNK, MeasurementSettings, collect
+from analysis.statistics.collect import MeasurementSettings, collect
 from analysis.statistics.data import SpatialStatistics
 from analysis.statistics.measure import ESTIMATORS, ImageMeter
 from rgbt.checks import InputError
@@ -61,7 +61,7 @@ def test_every_image_in_order_and_maps_by_part() -> None:
 
 
 def test_does_not_depend_on_the_number_of_workers() -> None:
-    dataset = memory([f"{n:05d}{'DN'[n % 2]}" for n in range(2 * CHUNK + 5)], hw=(12, 16))
+    dataset = memory([f"{n:05d}{'DN'[n % 2]}" for n in range(69)], hw=(12, 16))
     one = collect(dataset, "train", SETTINGS)
     for workers in (2, 5):
         assert_same(one, collect(dataset, "train", replace(SETTINGS, workers=workers)))
@@ -88,7 +88,6 @@ def test_day_and_night_are_the_images_of_each() -> None:
         assert chosen.subsets() == ("all",)
         for function in (
             derive.occupancy_map,
-            derive.class_occupancy_map,
             derive.region_occupancy,
             derive.class_region_occupancy,
             derive.label_entropy,
@@ -100,11 +99,13 @@ def test_day_and_night_are_the_images_of_each() -> None:
         )
 
 
-def test_an_image_of_another_size_is_one_sentence() -> None:
+def test_an_image_of_another_size_or_without_label_is_refused() -> None:
     rng = np.random.default_rng(0)
-    dataset = InMemory([random_sample("1D", (24, 32), rng), random_sample("2N", (24, 30), rng)])
+    first, other = random_sample("1D", (24, 32), rng), random_sample("2N", (24, 30), rng)
     with pytest.raises(InputError, match=r"'2N' is 24x30 pixels but '1D' is 24x32; .* one size"):
-        collect(dataset, "train", SETTINGS)
+        collect(InMemory([first, other]), "train", SETTINGS)
+    with pytest.raises(InputError, match="'2N' has no label"):
+        collect(InMemory([first, replace(other, label=None)]), "train", SETTINGS)
 
 
 def test_an_unreadable_file_stops_or_is_left_out(write_mfnet) -> None:
@@ -123,12 +124,6 @@ def test_an_unreadable_file_stops_or_is_left_out(write_mfnet) -> None:
         (root / "labels" / f"{name}.png").unlink()
     with pytest.raises(InputError, match="none of the 3 images of mfnet can be read"):
         collect(MFNet(str(root)), "train", skipping)
-
-
-def test_a_missing_label_is_one_sentence() -> None:
-    sample = random_sample("1D", (24, 32), np.random.default_rng(0))
-    with pytest.raises(InputError, match="'1D' has no label"):
-        collect(InMemory([replace(sample, label=None)]), "train", SETTINGS)
 
 
 @pytest.mark.parametrize("night", [True, False])

@@ -10,7 +10,7 @@ from analysis.statistics.collect import MeasurementSettings, collect
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
 from rgbt.types import Sample
-from tests.analysis.statistics.scenes import InMemory, made, random_sample
+from tests.analysis.statistics.scenes import InMemory, made
 
 HW = (60, 80)
 RINGS = Regions(partition="ring", regions=4, aspect="image", absent="released")
@@ -66,7 +66,6 @@ def test_an_ignored_pixel_is_no_background() -> None:
     np.testing.assert_allclose(by_class[1], [3 / 5, 0])
     np.testing.assert_allclose(by_class[2], [0, 1 / 3])
     assert stats.ignored.sum(0).tolist() == [1, 3]
-    np.testing.assert_allclose(derive.class_occupancy_map(stats).sum(0)[:, 0], 1)
 
 
 def test_entropy_by_hand() -> None:
@@ -97,11 +96,6 @@ def test_averages_of_ratios_by_hand() -> None:
     np.testing.assert_allclose(derive.region_noise(stats, "rgb"), 3)
 
 
-def test_noise_of_zero_is_no_division_by_zero() -> None:
-    stats = made(images=2, noise=np.zeros((2, 2, 3)))
-    np.testing.assert_allclose(derive.region_snr(stats, "rgb"), 100 / derive.EPSILON)
-
-
 def test_laplacian_is_the_mean_over_images() -> None:
     laplacian = np.zeros((4, 2, 3))
     laplacian[:, 0, 1] = 1, 3, 5, 11
@@ -126,10 +120,3 @@ def test_laplacian_is_the_mean_over_images() -> None:
 def test_unknown_words_are_refused(call, message: str) -> None:
     with pytest.raises(InputError, match=message):
         call(made())
-
-
-def test_a_part_without_images_is_refused() -> None:
-    dataset = InMemory([random_sample("1D", (24, 32), np.random.default_rng(0))])
-    stats = collect(dataset, "train", MeasurementSettings(regions=RINGS))
-    with pytest.raises(InputError, match="part=night: split 'train' of memory holds no such image"):
-        derive.region_occupancy(stats, "night")

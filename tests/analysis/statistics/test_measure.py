@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 
 from analysis.statistics.measure import (
-    ESTIMATORS,
     HAAR_BINS,
-    MEDIAN_OF_NORMAL,
-    TALLEST_BAND,
     ImageMeter,
     RegionSums,
     grouped_median,
 )
-from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
 from tests.analysis.statistics.scenes import random_sample
 
@@ -77,17 +73,6 @@ def test_measure_against_a_loop_over_pixels(partition, regions, hw, kernel) -> N
         np.testing.assert_allclose(ours, wanted, rtol=1e-12)
 
 
-def test_laplacian_variance_by_hand() -> None:
-    # One bright pixel of 10 in the middle of 3 x 5: its Laplacian is -40, its four neighbours see
-    # +10; but the border is mirrored, so the pixels above and below see it twice: +20 each.
-    image = np.zeros((3, 5), np.uint8)
-    image[1, 2] = 10
-    laplacian, mean, *_ = ImageMeter(np.zeros((3, 5), np.uint8), 2).measure(image)
-    values = np.array([-40, 10, 10, 20, 20, *[0] * 10])
-    assert laplacian[0] == pytest.approx((values**2).sum() / 15 - (values.sum() / 15) ** 2)
-    assert mean[0] == pytest.approx(10 / 15)
-
-
 def test_rgb_is_measured_as_grey() -> None:
     sample = random_sample("a", (8, 8), np.random.default_rng(0))
     red = np.zeros((8, 8, 3), np.uint8)
@@ -118,16 +103,6 @@ def test_planted_noise_is_found_in_every_region(shape: str) -> None:
         assert (found[STD] > 10).all(), "the gradient counts as noise"
 
 
-def test_noise_of_a_straight_edge_and_of_nothing() -> None:
-    image = np.full((40, 40), 50, np.uint8)
-    image[:, 20:] = 200
-    found = ImageMeter(np.zeros((40, 40), np.uint8), 9).measure(image)
-    assert found[IMMERKAER][0] == 0
-    # All magnitudes are 0: the median lies in the middle of [0, 0.5).
-    assert found[MAD][0] == pytest.approx(0.25 / 2 / MEDIAN_OF_NORMAL)
-    assert found[STD][0] == pytest.approx(75)
-
-
 def test_grouped_median_by_hand() -> None:
     # 4 zeros in [0, .5), 8 ones in [.5, 1.5): half of 12 is 6, two of eight into the second bin.
     histogram = np.zeros((3, 5), np.int64)
@@ -136,16 +111,6 @@ def test_grouped_median_by_hand() -> None:
     found = grouped_median(histogram)
     np.testing.assert_allclose(found[:2], [0.5 + 2 / 8, 3.0])
     assert np.isnan(found[2])
-
-
-def test_labels_are_counted_by_region() -> None:
-    region_map = regions_map("ring", 3, (24, 32))
-    sample = random_sample("a", (24, 32), np.random.default_rng(3))
-    labels, ignored = ImageMeter(region_map, 9).count_labels(sample.label)
-    for r in range(3):
-        inside = sample.label[region_map == r]
-        assert labels[r].tolist() == [int((inside == k).sum()) for k in range(9)]
-        assert ignored[r] == (inside == 255).sum()
 
 
 @pytest.mark.parametrize(
@@ -159,39 +124,8 @@ def test_sums_of_any_partition(partition: str, regions: int, hw: tuple[int, int]
     assert RegionSums(region_map)(values).tolist() == expected
 
 
-def test_sums_of_a_map_without_any_order() -> None:
-    rng = np.random.default_rng(0)
-    region_map = rng.integers(0, 7, (50, 30)).astype(np.uint8)
-    values = rng.integers(0, 1000, (50, 30)).astype(np.int32)
-    expected = [int(values[region_map == r].sum()) for r in range(7)]
-    assert RegionSums(region_map)(values).tolist() == expected
-
-
 def test_largest_values_do_not_overflow() -> None:
     """A checkerboard of 0 and 255 has the largest Laplacian there is, over 300 rows."""
     image = (np.indices((300, 300)).sum(0) % 2 * 255).astype(np.uint8)
     found = ImageMeter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
     assert found[0][0] == pytest.approx(1020.0**2)
-
-
-def test_sums_of_many_rows_do_not_overflow() -> None:
-    """1200 rows alike; 257 of the largest value would leave 32 bits."""
-    largest = 2**23 - 1
-    for value in (largest, -largest):
-        values = np.full((1200, 3), value, np.int32)
-        assert RegionSums(np.zeros((1200, 3), np.uint8))(values) == [3600 * value]
-    assert TALLEST_BAND * (8 * 255) ** 2 < 2**31
-
-
-def test_a_region_without_a_window_has_no_noise() -> None:
-    region_map = np.zeros((4, 4), np.uint8)
-    region_map[3, 3] = 1  # neither inside the border nor the first pixel of a block
-    found = ImageMeter(region_map, 9).measure(np.zeros((4, 4), np.uint8))
-    assert np.isnan(found[IMMERKAER][1])
-    assert np.isnan(found[MAD][1])
-    assert len(found) == 2 + len(ESTIMATORS)
-
-
-def test_refuses_an_unknown_kernel() -> None:
-    with pytest.raises(InputError, match="kernel: 'for' is not a choice; did you mean 'four'"):
-        ImageMeter(np.zeros((4, 4), np.uint8), 9, "for")

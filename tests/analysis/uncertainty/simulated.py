@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rgbt.metrics.counts import Counts
+from tests.analysis import counts
 
 CLASSES = ("road", "car", "person", "cone")
 REGIONS = 2
@@ -85,18 +87,11 @@ def pairs_of(
     drawn = np.random.default_rng([1, seed]).multinomial(sizes, cells.reshape(classes, -1))
     array = np.zeros((images, sets, classes + 1, classes, classes), np.int32)
     array[:, :, :classes] = drawn.reshape(images, sets, classes, classes, classes)
-    counts = counts_of(array.reshape(images, -1, classes, classes))
-    return replace(counts, partition=f"aligned{sets}", night=night)
+    flat = array.reshape(images, -1, classes, classes)
+    return counts_of(flat, partition=f"aligned{sets}", night=night)
 
 
-def counts_of(array: np.ndarray, name: str = "{:05d}D") -> Counts:
-    """(N, R, K, K) counts as `Counts`."""
-    return Counts(
-        counts=array,
-        names=tuple(name.format(index) for index in range(len(array))),
-        night=None,
-        classes=CLASSES,
-        partition="ring2",
-        dataset="simulated",
-        split="test",
-    )
+def counts_of(array: np.ndarray, **changed: Any) -> Counts:
+    """(N, R, K, K) counts of the classes of the population."""
+    given = {"classes": CLASSES, "partition": "ring2", "dataset": "simulated"}
+    return counts.counts_of(array, **(given | changed))

@@ -9,6 +9,7 @@ import numpy as np
 
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import miou, variance
+from tests.analysis.counts import counts_of
 
 CLASSES = ("road", "car", "person", "bike", "curve", "guardrail")
 SIZES = np.array([7.0, 5.0, 4.5, 4.0, 4.0, 4.0])
@@ -43,7 +44,7 @@ class Tilted:
         """Counts of this method, and of others on the same images."""
         sizes, effect = self._scenes(rng, images)
         return [
-            _counts(rng.multinomial(sizes, each._rows(rng, effect)), self.regions)
+            counts_of(rng.multinomial(sizes, each._rows(rng, effect)), classes=CLASSES)
             for each in (self, *others)
         ]
 
@@ -95,15 +96,3 @@ def _expected(tilt: float, regions: int) -> np.ndarray:
         sizes, effect = method._scenes(rng, STEP)
         expected += (sizes[..., None] * method._rows(rng, effect)).sum(0)
     return expected
-
-
-def _counts(array: np.ndarray, regions: int) -> Counts:
-    return Counts(
-        counts=array,
-        names=tuple(f"{index:05d}D" for index in range(len(array))),
-        night=None,
-        classes=CLASSES,
-        partition=f"ring{regions}",
-        dataset="simulated",
-        split="test",
-    )

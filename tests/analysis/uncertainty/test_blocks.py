@@ -75,161 +75,82 @@ def test_length_is_that_of_the_paper(keeps: float, count: int):
         assert block_length(series, [np.arange(count)]) == politis_white(series)
 
 
-def test_length_of_correlated_neighbours_is_longer():
-    rngs = [np.random.default_rng(seed) for seed in range(20)]
-    noise = [block_length(rng.normal(size=300), [np.arange(300)]) for rng in rngs]
-    alike = [block_length(autoregressive(rng, 300, 0.8), [np.arange(300)]) for rng in rngs]
-    assert np.median(noise) <= 2
-    assert np.median(alike) >= 8
-
-
-def test_length_does_not_see_over_the_end_of_a_sequence():
-    """The same values, in sequences of one image each: no neighbours, nothing correlated."""
+def test_length_follows_the_frames_of_each_sequence():
     series = autoregressive(np.random.default_rng(0), 300, 0.9)
-    assert block_length(series, [np.arange(300)]) > 5
+    length = block_length(series, [np.arange(300)])
+    assert length > 5
+    # The same values, in sequences of one image each: no neighbours, nothing correlated.
     assert block_length(series, [np.array([place]) for place in range(300)]) == 1
-
-
-def test_length_reads_the_order_of_the_frames():
-    series = autoregressive(np.random.default_rng(0), 300, 0.9)
     order = np.random.default_rng(1).permutation(300)
     shuffled = np.empty(300)
     shuffled[order] = series  # frame i lies at order[i]
-    assert block_length(shuffled, [order]) == block_length(series, [np.arange(300)])
-
-
-def test_length_of_little():
+    assert block_length(shuffled, [order]) == length
     assert block_length(np.full(50, 3.0), [np.arange(50)]) == 1
-    assert block_length(np.array([1.0]), [np.arange(1)]) == 1
-    assert block_length(np.arange(6.0), [np.arange(6)]) <= 2
 
 
 # Blocks by names.
 
-
-def test_single_images():
-    blocks = make_blocks(mfnet(12), "none", NOTHING)
-    assert blocks.said == "12 single images"
-    assert members(blocks, mfnet(12)) == {frozenset([name]) for name in mfnet(12)}
-    assert make_blocks(mfnet(12), 1, NOTHING).said == "12 single images"
+FRAMES = [f"frame{number}" for number in range(1, 41)]  # frame10 sorts before frame2 as text
+VIDEOS = [f"V{v:02d}_I{frame:03d}" for v in range(12) for frame in range(11)]
 
 
-def test_few_single_images_are_left_to_the_caller():
-    assert make_blocks(mfnet(3), "none", NOTHING).count == 3
+@pytest.mark.parametrize(
+    ("names", "choice", "said", "sizes"),
+    [
+        (mfnet(12), "none", "12 single images", [1] * 12),
+        (mfnet(12), 1, "12 single images", [1] * 12),
+        (FRAMES, 4, "10 blocks of up to 4 neighbouring frames", [4] * 10),
+        ([f"2021_{name}_left2" for name in mfnet(40, "")], 4, "10 blocks of up to 4 nei", [4] * 10),
+        (mfnet(30) + mfnet(30, "N"), 5, "12 blocks of up to 5 neighbouring", [5] * 12),
+        # Pieces do not cross sequences and are nearly equal.
+        (VIDEOS, 4, "36 blocks of up to 4 neighbouring frames", [3] * 12 + [4] * 24),
+        (VIDEOS, 500, "12 blocks of up to 11 neighbouring frames", [11] * 12),
+        (VIDEOS, "sequence", "12 sequences", [11] * 12),
+        (["a", "b", "c3"], "auto", "3 single images (their names tell no neighbours)", [1] * 3),
+    ],
+)
+def test_blocks_are_neighbours_of_one_sequence(names, choice, said: str, sizes: list[int]):
+    shuffled = np.random.default_rng(0).permutation(names).tolist()
+    blocks = make_blocks(shuffled, choice, NOTHING)
+    assert blocks.said.startswith(said)
+    assert blocks.reason == "" or choice == "auto"
+    found = members(blocks, shuffled)
+    assert sorted(map(len, found)) == sizes
+    for block in found:
+        places = sorted(names.index(name) for name in block)
+        assert places == list(range(places[0], places[0] + len(block)))
 
 
-def test_neighbours_by_number_whatever_the_order_of_names():
-    names = mfnet(40)
-    np.random.default_rng(0).shuffle(names)
-    blocks = make_blocks(names, 4, NOTHING)
-    expected = {frozenset(mfnet(40)[start : start + 4]) for start in range(0, 40, 4)}
-    assert members(blocks, names) == expected
-    assert blocks.said == "10 blocks of up to 4 neighbouring frames"
-
-
-def test_numbers_are_compared_as_numbers():
-    names = [f"frame{number}" for number in range(1, 25)]  # frame10 sorts before frame2 as text
-    blocks = make_blocks(sorted(names), 2, NOTHING)
-    expected = {frozenset(names[start : start + 2]) for start in range(0, 24, 2)}
-    assert members(blocks, sorted(names)) == expected
-
-
-def test_day_and_night_are_two_sequences():
-    names = mfnet(30, "D") + mfnet(30, "N")
-    blocks = make_blocks(names, 5, NOTHING)
-    assert blocks.count == 12
-    for block in members(blocks, names):
-        assert len({name[-1] for name in block}) == 1
-
-
-def test_sequences_of_kp():
-    names = [
-        f"set{s:02d}_V{v:03d}_I{frame:05d}"
-        for s in (0, 6)
-        for v in range(6)
-        for frame in range(1, 40, 19)
-    ]
-    blocks = make_blocks(names, "sequence", NOTHING)
-    assert blocks.said == "12 sequences"
-    expected = {
-        frozenset(name for name in names if name.startswith(f"set{s:02d}_V{v:03d}_"))
-        for s in (0, 6)
-        for v in range(6)
-    }
-    assert members(blocks, names) == expected
-
-
-def test_pieces_do_not_cross_sequences_and_are_nearly_equal():
-    names = [f"V{v}_I{frame:03d}" for v in range(4) for frame in range(11)]
-    blocks = make_blocks(names, 4, NOTHING)
-    sizes = sorted(len(block) for block in members(blocks, names))
-    assert sizes == [3] * 4 + [4] * 8
-    for block in members(blocks, names):
-        assert len({name[:2] for name in block}) == 1
-
-
-def test_blocks_longer_than_a_sequence_are_the_sequences():
-    names = [f"V{v:02d}_I{frame}" for v in range(12) for frame in range(3)]
-    longer, whole = (make_blocks(names, choice, NOTHING) for choice in (500, "sequence"))
-    assert members(longer, names) == members(whole, names)
-    assert "500" not in longer.said  # no block holds so many
-
-
-def test_auto_without_numbers_draws_single_images():
-    names = ["a", "b", "c3"]
-    assert make_blocks(names, "auto", NOTHING).said.startswith("3 single images (")
-
-
-def test_auto_takes_the_longest_of_the_scores():
+def test_auto_takes_the_longest_of_the_scores_and_leaves_enough_blocks():
     rng = np.random.default_rng(0)
     noise, alike = rng.normal(size=300), autoregressive(rng, 300, 0.8)
     length = block_length(alike, [np.arange(300)])
-    blocks = make_blocks(mfnet(300), "auto", np.stack([noise, alike]))
     assert length > block_length(noise, [np.arange(300)])
+    blocks = make_blocks(mfnet(300), "auto", np.stack([noise, alike]))
     assert blocks.count == math.ceil(300 / length)
-    assert make_blocks(mfnet(300), "auto", rng.normal(size=(1, 300))).count > blocks.count
-
-
-def test_auto_leaves_enough_blocks():
     ramp = np.arange(40.0)[None]
     assert block_length(ramp[0], [np.arange(40)]) > 4
     assert make_blocks(mfnet(40), "auto", ramp).count == FEWEST
-    assert make_blocks(mfnet(7), "auto", np.arange(7.0)[None]).said == "7 single images"
+    assert make_blocks(mfnet(7), "auto", ramp[:, :7]).said == "7 single images"
 
 
-# Refusals.
-
-
-@pytest.mark.parametrize("choice", ["sequence", 5])
-def test_names_without_numbers(choice):
-    names = [*mfnet(20), "final"]
-    with pytest.raises(InputError, match=f"blocks={choice}: names such as '00001D' tell no neigh"):
+@pytest.mark.parametrize(
+    ("names", "choice", "word"),
+    [
+        (
+            [*mfnet(20), "final"],
+            "sequence",
+            "blocks=sequence: names such as '00001D' tell no neigh",
+        ),
+        ([*mfnet(20), "final"], 5, "blocks=5: names such as '00001D' tell no neigh"),
+        ([f"{c}_{n}" for n, c in enumerate("abcdefghijklm")], 5, "tell no neighbouring frames"),
+        (mfnet(100), 20, "blocks=20: 100 images make 5 blocks of up to 20"),
+        (mfnet(100) + mfnet(100, "N"), "sequence", "200 images make 2 sequences"),
+    ],
+)
+def test_blocks_that_cannot_be_made_are_refused(names: list[str], choice, word: str):
+    with pytest.raises(InputError, match=word):
         make_blocks(names, choice, NOTHING)
-
-
-@pytest.mark.parametrize("ending", ["_left2", "_480x640", ""])
-def test_a_number_that_is_the_same_everywhere_is_no_frame(ending):
-    names = [f"2021_{frame:04d}{ending}" for frame in range(40)]
-    assert make_blocks(names, 4, NOTHING).said == "10 blocks of up to 4 neighbouring frames"
-
-
-def test_names_that_tell_no_neighbours():
-    names = [f"{letter}_{number}" for number, letter in enumerate("abcdefghijklm")]
-    assert (
-        make_blocks(names, "auto", NOTHING).said
-        == "13 single images (their names tell no neighbours)"
-    )
-    with pytest.raises(InputError, match="tell no neighbouring frames"):
-        make_blocks(names, 5, NOTHING)
-
-
-def test_too_few_blocks():
-    with pytest.raises(InputError, match="blocks=20: 100 images make 5 blocks of up to 20"):
-        make_blocks(mfnet(100), 20, NOTHING)
-    names = mfnet(100, "D") + mfnet(100, "N")
-    with pytest.raises(InputError, match="blocks=sequence: 200 images make 2 sequences"):
-        make_blocks(names, "sequence", NOTHING)
-    assert make_blocks(mfnet(100), 10, NOTHING).count == FEWEST
 
 
 def numbered(*runs: tuple[int, int]) -> list[str]:

@@ -22,23 +22,6 @@ from analysis.uncertainty.intervals import (
 )
 
 
-def test_interval():
-    interval = Interval(-1.0, 3.0)
-    assert interval.half == 2.0
-    assert all(end in interval for end in (-1.0, 0.0, 3.0))
-    assert 3.1 not in interval
-    assert -1.1 not in interval
-
-
-@pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
-def test_percentile_is_numpys(level: float):
-    resampled = np.random.default_rng(0).gamma(2.0, size=501)
-    found = over_images(2.0, resampled, np.empty(0), method="percentile", level=level)
-    expected = np.percentile(resampled, [50 * (1 - level), 50 * (1 + level)])
-    assert found is not None
-    np.testing.assert_allclose([found.low, found.high], expected, rtol=1e-13)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_bca_is_scipys(seed: int):
     """The ratio of sums of a skewed sample; the draws are SciPy's own."""
@@ -73,25 +56,8 @@ def test_nan_is_left_out(method):
     mixed = rng.permutation(np.concatenate([known, holes]))
     found = over_images(0.1, mixed, np.append(without, np.nan), method=method, level=0.9)
     assert found == expected
-
-
-@pytest.mark.parametrize("method", ["bca", "percentile"])
-def test_no_interval_of_nothing(method):
-    some, nothing = np.arange(10.0), np.empty(0)
-    assert over_images(math.nan, some, some, method=method, level=0.9) is None
-    assert over_images(1.0, np.full(10, np.nan), some, method=method, level=0.9) is None
-    assert over_images(1.0, nothing, nothing, method=method, level=0.9) is None
-
-
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("outlier", [-1.0, 1.0])
-def test_bca_ends_keep_their_order(side: float, outlier: float):
-    """A score beyond all resamples and one image that matters alone: both corrections extreme."""
-    resampled = side * np.linspace(1.0, 2.0, 10_000)
-    without = np.append(np.zeros(500), outlier)
-    found = over_images(0.0, resampled, without, method="bca", level=0.999)
-    assert found is not None
-    assert found.low <= found.high
+    for value, resampled in ((math.nan, known), (1.0, holes), (1.0, np.empty(0))):
+        assert over_images(value, resampled, without, method=method, level=0.9) is None
 
 
 @pytest.mark.parametrize("method", ["bca", "percentile"])
@@ -103,15 +69,6 @@ def test_interval_holds_the_value(method, value: float):
     assert found is not None
     assert value in found
     assert found.low <= found.high
-
-
-def test_percentile_of_the_negative_is_mirrored():
-    resampled = np.random.default_rng(0).gamma(2.0, size=1000)
-    found = over_images(2.0, resampled, np.empty(0), method="percentile", level=0.95)
-    mirrored = over_images(-2.0, -resampled, np.empty(0), method="percentile", level=0.95)
-    assert found is not None
-    assert mirrored is not None
-    np.testing.assert_allclose([mirrored.low, mirrored.high], [-found.high, -found.low])
 
 
 def test_bca_of_the_negative_is_mirrored():
@@ -152,15 +109,6 @@ def test_welch_is_scipys(sizes: tuple[int, int]):
     np.testing.assert_allclose([found.low, found.high], [expected.low, expected.high])
 
 
-def test_welch_where_one_method_does_not_vary():
-    """s_a = 0: the degrees of freedom are those of b alone."""
-    b = np.array([1.0, 2.0, 3.0, 4.0])
-    spread = over_seeds(np.array([5.0, 5.0]), b)
-    assert spread is not None
-    assert spread.freedom == pytest.approx(3.0)
-    assert spread.error == pytest.approx(b.std(ddof=1) / 2)
-
-
 def test_no_spread_of_one_seed_or_a_missing_score():
     two = np.array([1.0, 2.0])
     assert over_seeds(np.array([1.0])) is None
@@ -185,22 +133,6 @@ def test_together_by_hand():
     assert found.freedom == pytest.approx(625 / 91)
 
 
-def test_together_with_nothing_is_the_other():
-    found = together(Spread(0.0, 1.0), Spread(2.0, 7.0))
-    assert found.error == pytest.approx(2.0)
-    assert found.freedom == pytest.approx(7.0)
-
-
-def test_together_lies_between_the_parts():
-    """Freedom: at least the smaller one, at most the sum (Welch, 1947)."""
-    rng = np.random.default_rng(0)
-    for errors, freedoms in zip(rng.random((50, 2)), rng.integers(1, 40, (50, 2)), strict=True):
-        parts = [Spread(float(e), float(f)) for e, f in zip(errors, freedoms, strict=True)]
-        found = together(*parts)
-        assert found.error >= max(errors)
-        assert min(freedoms) - 1e-9 <= found.freedom <= sum(freedoms) + 1e-9
-
-
 # p-values.
 
 
@@ -212,17 +144,7 @@ def test_swap_p_by_hand():
     assert swap_p(0.0, swapped) == 1.0
     assert math.isnan(swap_p(math.nan, swapped))
     assert swap_p(1.0, np.full(3, np.nan)) == 1.0
-
-
-def test_swap_p_counts_what_differs_by_rounding():
-    third = 0.1 + 0.2  # 0.30000000000000004
-    assert swap_p(third, np.full(99, 0.3)) == 1.0
-    assert swap_p(third, np.full(99, -0.3)) == 1.0
-
-
-def test_swap_p_of_all_equal_differences_is_one():
-    assert swap_p(0.7, np.full(999, 0.7)) == 1.0
-    assert swap_p(0.0, np.zeros(999)) == 1.0
+    assert swap_p(0.1 + 0.2, np.full(99, -0.3)) == 1.0  # equal but for rounding
 
 
 def test_swap_p_against_all_signs():
@@ -242,10 +164,5 @@ def test_holm_by_hand():
     assert holm([0.5, 0.9]) == pytest.approx([1.0, 1.0])
     assert holm([0.02]) == [0.02]
     assert holm([]) == []
-
-
-def test_holm_leaves_nan_out():
-    found = holm([math.nan, 0.01, 0.03, math.nan])
-    assert math.isnan(found[0])
-    assert math.isnan(found[3])
-    assert found[1:3] == pytest.approx([0.02, 0.03])
+    assert holm([math.nan, 0.01, 0.03])[1:] == pytest.approx([0.02, 0.03])
+    assert math.isnan(holm([math.nan, 0.01])[0])

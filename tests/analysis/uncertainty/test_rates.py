@@ -173,28 +173,3 @@ def test_false_alarms_over_images_and_seeds(training_sd: float, trainings: int):
     print(trainings, training_sd, rates, any_of_all)
     assert all(rate <= 0.1 for rate in rates.values())
     assert any_of_all <= 0.1
-
-
-def test_auto_blocks_raise_no_false_alarms_where_errors_are_correlated():
-    """Independent noise shared by ten frames of one method is what would deceive single images."""
-    rng = np.random.default_rng(13)
-    raised = {"none": 0, 10: 0}
-    for number in range(RUNS):
-        methods = []
-        scenes = Population(image_sd=0.0, noise_sd=0.0)
-        shared = scenes.draw(rng, 200, 1)[0]
-        for _ in "ab":
-            labelled = shared.sum(-1)
-            share = 1 / (1 + np.exp(-1.5 - np.repeat(rng.normal(0, 0.5, 20), 10)))
-            right = rng.binomial(labelled, share[:, None, None])
-            array = np.zeros_like(shared)
-            for row in range(4):
-                array[..., row, row] = right[..., row]
-                array[..., row, (row + 1) % 4] = (labelled - right)[..., row]
-            methods.append([counts_of(array)])
-        for blocks in raised:
-            settings = replace(SETTINGS, blocks=blocks, seed=number, resamples=399)
-            raised[blocks] += compare(*methods, ["mIoU"], settings).differences[0].p <= 0.05
-    print({blocks: count / RUNS for blocks, count in raised.items()})
-    assert raised["none"] / RUNS > 0.3
-    assert raised[10] / RUNS <= 0.09

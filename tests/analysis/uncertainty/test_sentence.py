@@ -95,11 +95,6 @@ def test_told_takes_p_and_interval(p: float, low: float, level: float):
     assert "is not shown" in sentence(found, "a", "b")
 
 
-def test_equal_numbers_of_trainings_without_an_interval_over_them():
-    found = compared("mIoU", 61.0, 62.0, p_images=0.9, images=Interval(-1, 2), seeds=(2, 2))
-    assert "with 2 trainings each, it says nothing about other" in sentence(found, "a", "b")
-
-
 def test_a_class_called_var_is_no_variance():
     found = compared("class/Var", 61.0, 63.0, p_images=0.01, images=Interval(1, 3))
     assert "2.00 points higher" in sentence(found, "a", "b")

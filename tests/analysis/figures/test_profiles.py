@@ -7,12 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.figures.profiles import Profile, draw_profiles, means_only, profile
-from analysis.figures.regions import draw_heat, map_of, region_heat, staircase
+from analysis.figures.profiles import (
+    Profile,
+    draw_heat,
+    draw_profiles,
+    map_of,
+    means_only,
+    profile,
+    staircase,
+)
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from tests.analysis.figures.drawn import counts, strips, texts
+from tests.analysis.counts import counts_of
+from tests.analysis.figures.drawn import strips, texts
 
 FAST = Resampling(resamples=200, blocks="none")
 
@@ -21,7 +29,7 @@ def method(seed: int = 0, regions: int = 2) -> Counts:
     """40 images of 2 classes with 20 pixels of each in every region: the same labels every time."""
     right = np.random.default_rng(seed).integers(1, 20, (40, regions, 2))
     matrices = np.stack([[right[..., 0], 20 - right[..., 0]], [20 - right[..., 1], right[..., 1]]])
-    return counts(np.moveaxis(matrices, (0, 1), (2, 3)), f"ring{regions}")
+    return counts_of(np.moveaxis(matrices, (0, 1), (2, 3)))
 
 
 def known(label: str, *means: float, partition: str = "ring2") -> Profile:
@@ -29,22 +37,12 @@ def known(label: str, *means: float, partition: str = "ring2") -> Profile:
 
 
 def test_means_by_hand_and_over_seeds() -> None:
-    first = counts(np.array([[[6, 2], [0, 2]], [[8, 0], [0, 2]]]))  # 62.5 and 100
-    second = counts(np.array([[[8, 0], [0, 2]], [[6, 2], [0, 2]]]))
+    first = counts_of(np.array([[[6, 2], [0, 2]], [[8, 0], [0, 2]]]))  # 62.5 and 100
+    second = counts_of(np.array([[[8, 0], [0, 2]], [[6, 2], [0, 2]]]))
     found = means_only("grbm", [first, second, second], "released")
     np.testing.assert_allclose(found.means, [(62.5 + 200) / 3, (100 + 125) / 3])
     assert found.miou == pytest.approx(50 * (14 / 16 + 4 / 6))
-    assert found.low is None
-
-
-def test_profile_and_heat_map_say_the_same() -> None:
-    seeds = [method(0), method(1)]
-    with_intervals, without = (
-        profile("m", seeds, FAST, "widest"),
-        means_only("m", seeds, "released"),
-    )
-    np.testing.assert_allclose(with_intervals.means, without.means)
-    assert with_intervals.miou == pytest.approx(without.miou)
+    assert found.bars is None
 
 
 @pytest.mark.parametrize(
@@ -59,10 +57,9 @@ def test_profile_and_heat_map_say_the_same() -> None:
 def test_intervals_are_over_what_was_asked(seeds: int, band: str, covers: str) -> None:
     found = profile("m", [method(seed) for seed in range(seeds)], FAST, band)
     assert found.covers == covers
-    assert found.low is not None
-    assert found.high is not None
-    assert (found.low < found.means).all()
-    assert (found.means < found.high).all()
+    low, high = found.bars
+    assert (low < found.means).all()
+    assert (found.means < high).all()
     assert (found.seeds, found.images, found.level) == (seeds, 40, 0.95)
 
 
@@ -74,7 +71,7 @@ def test_one_seed_says_nothing_about_seeds(band: str) -> None:
 
 def test_methods_over_different_regions_are_refused() -> None:
     other = known("b", 1, 2, 3, partition="ring3")
-    for draw in (draw_profiles, lambda profiles: region_heat(profiles, (48, 64))):
+    for draw in (draw_profiles, lambda profiles: draw_heat(profiles, (48, 64))):
         with pytest.raises(InputError, match="'a' was counted over ring2 but 'b' over ring3"):
             draw([known("a", 1, 2), other])
     with pytest.raises(InputError, match="seeds of 'm' were counted over ring2 and ring3"):
@@ -90,10 +87,11 @@ def test_partitions_by_name() -> None:
 
 
 def test_heat_maps_share_one_scale() -> None:
-    heat = region_heat([known("a", 10, 90), known("b", 50, 50)], (48, 64))
-    assert (heat.low, heat.high) == (10, 90)
-    values = heat.values(0)
-    np.testing.assert_array_equal(values, np.where(heat.region_map == 0, 10, 90))
+    figure = draw_heat([known("a", 10, 90), known("b", 50, 50)], (48, 64))
+    first, second = (axes.images[0] for axes in figure.axes[:2])
+    assert first.get_clim() == second.get_clim() == (10, 90)
+    inner = strips(2, "ring").map((48, 64)) == 0
+    np.testing.assert_array_equal(first.get_array(), np.where(inner, 10, 90))
 
 
 def test_values_of_rings_stand_apart_and_inside() -> None:
@@ -105,7 +103,7 @@ def test_values_of_rings_stand_apart_and_inside() -> None:
 
 
 def test_draws_values_names_and_what_the_intervals_cover(tmp_path: Path) -> None:
-    found = texts(draw_heat(region_heat([known("a", 12.3, 45.6)] * 4, (48, 64))), tmp_path)
+    found = texts(draw_heat([known("a", 12.3, 45.6)] * 4, (48, 64)), tmp_path)
     assert {"12.3", "45.6", "mIoU 50.0", "mIoU of the region (%)"} <= set(found)
     profiles = [profile(f"m{n}", [method(n)], FAST, "images") for n in range(3)]
     for number in (2, 3):
@@ -115,5 +113,5 @@ def test_draws_values_names_and_what_the_intervals_cover(tmp_path: Path) -> None
 
 
 def test_undefined_regions_are_drawn_as_a_dash(tmp_path: Path) -> None:
-    heat = region_heat([known("a", 12.3, float("nan"))], (48, 64))
-    assert "-" in texts(draw_heat(heat), tmp_path)
+    heat = draw_heat([known("a", 12.3, float("nan"))], (48, 64))
+    assert "-" in texts(heat, tmp_path)

@@ -1,0 +1,24 @@
+"""Counts of any shape for the tests of the analysis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rgbt.metrics.counts import Counts
+
+
+def counts_of(array: Any, **changed: Any) -> Counts:
+    """(N, R, K, K), or of one image (R, K, K), counts as `Counts`; `changed`: other attributes."""
+    counts = np.asarray(array)
+    counts = counts if counts.ndim == 4 else counts[None]
+    values: dict[str, Any] = {
+        "names": tuple(f"{index:05d}D" for index in range(len(counts))),
+        "night": None,
+        "classes": tuple(f"class{index}" for index in range(counts.shape[-1])),
+        "partition": f"ring{counts.shape[1]}",
+        "dataset": "fingerprint",
+        "split": "test",
+    }
+    return Counts(counts=counts, **(values | changed))
