@@ -19,8 +19,8 @@ from rgbt.checkpoints.layouts import (
     rtfnet,
     swin,
 )
+from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.read import Contents
-from rgbt.checkpoints.records import printable
 
 LAYOUTS: MappingProxyType[str, Layout] = MappingProxyType(
     {

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rgbt.checkpoints.layout import CLASS_PARTS, Facts
+from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.plan import Plan
-from rgbt.checkpoints.records import printable
 
 ANOTHER_SIZE = 0.05
 """Share of entries that do not fit, above which the network is of another size than the file."""

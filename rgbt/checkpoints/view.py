@@ -9,9 +9,9 @@ from rich.text import Text
 from torch import Tensor
 
 from rgbt.checkpoints.layout import Facts
+from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import Contents
-from rgbt.checkpoints.records import printable
 
 NOT_TRAINED = (
     *("running_mean", "running_var", "num_batches_tracked"),

@@ -291,7 +291,7 @@ RAW = {
         "torch.serialization.os.system",
     ),
     "a name that is no text": (b"\x80\x04]\x8c\x06system\x93.", "cut short"),
-    "registered class": (b"\x80\x02\x82\xf1U\x0ctouch MARKER\x85R.", "EXT1"),
+    "registered class": (b"\x80\x02\x82\xf1U\x0ctouch MARKER\x85R.", "cut short"),
     "state of a function": (
         b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\nN}U\x08__code__U\x01xs\x86b.",
         "cut short",
@@ -302,7 +302,7 @@ RAW = {
         "FloatStorage",
     ),
     "something outside": (b"\x80\x02U\x01xQ.", "cut short"),
-    "buffer outside": (b"\x80\x05\x97.", "NEXT_BUFFER"),
+    "buffer outside": (b"\x80\x05\x97.", "cut short"),
     "memory without end": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7fx.", "cut short"),
     "memo far away": (b"\x80\x02Nr\xff\xff\xff\x7f.", "holds a NoneType"),
     "many bytes": (b"\x80\x02cbuiltins\nbytearray\nJ\xff\xff\xff\x7f\x85R.", "cut short"),
