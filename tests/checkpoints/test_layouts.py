@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from rgbt.checkpoints import networks as mask2former
 from rgbt.checkpoints.layout import Facts
-from rgbt.checkpoints.layouts import mask2former
 from rgbt.checkpoints.load import load_weights, plan_for
 from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import read
