@@ -1,8 +1,10 @@
 """Pickles as data: Python's unpickler with a table of names in the place of its imports.
 
-A name in a file is never imported, looked up or called. It stays a `Name`, which knows what plain
-value or tensor it stands for; every other name is refused where it occurs, called or not. Python's
-unpickler in C is not used: a file of ten bytes makes it allocate gigabytes (a memo index of 2^31).
+A name in a file is never imported, looked up or called. It stays a `Name`; calling it gives what
+one of `BUILDERS` makes of the arguments, or an `Inert`. Others are refused where they occur.
+
+Python's unpickler in C is not used, because a memo index of 2^31, in a file of ten bytes, makes it
+allocate gigabytes. Neither is torch.load, which takes sizes of storages from the pickle.
 """
 
 from __future__ import annotations
@@ -25,12 +27,6 @@ Persistent = Callable[[Any], Any]
 
 GROWTH, SMALL = 8, 1_000_000
 """What may be copied while reading: so many times the bytes of the file, and a little more."""
-
-SENSELESS = (
-    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError),
-    *(MemoryError, RecursionError, EOFError, struct.error, pickle.UnpicklingError),
-)
-"""What opcodes in an order that nobody writes lead to."""
 
 UNKNOWN = b"".join(
     (pickle.EXT1, pickle.EXT2, pickle.EXT4)
@@ -63,6 +59,13 @@ class RefusedError(Exception):
 
 class DamagedError(Exception):
     """A file that is cut short, overwritten, or not what its beginning says."""
+
+
+DAMAGE = (
+    *(DamagedError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    *(RuntimeError, MemoryError, RecursionError, EOFError, struct.error, pickle.UnpicklingError),
+)
+"""What overwritten or invented bytes lead to, wherever they are made sense of."""
 
 
 def printable(text: str, limit: int = 100) -> str:
@@ -106,12 +109,9 @@ def unpickle(
 
     Raises:
         RefusedError: a name that is not among the known ones, or more memory than the file has.
-        DamagedError: not a pickle, cut short, or senseless.
+        Exception: one of `DAMAGE`.
     """
-    try:
-        return _Unpickler(stream, persistent, {**BUILDERS, **(extra or {})}).load()
-    except SENSELESS as error:
-        raise DamagedError from error
+    return _Unpickler(stream, persistent, {**BUILDERS, **(extra or {})}).load()
 
 
 PYTHONS: Any = pickle._Unpickler  # its stack and its steps are unknown to type checkers

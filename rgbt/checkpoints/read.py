@@ -68,16 +68,12 @@ def read(path: Path) -> Contents:
         InputError: missing, empty, cut short, of another kind, or asking for code.
     """
     with explained(path, "a file of weights", "copy or download it again"):
-        if _is_safetensors(beginning_of(path)):
+        beginning = beginning_of(path)
+        # A header of at most 100 MB, the limit of safetensors; a pickle that begins so says more.
+        if beginning[8:9] == b"{" and int.from_bytes(beginning[:8], "little") <= 100_000_000:
             return _read_safetensors(path)
         value, container = read_stored(path)
         return _unwrapped(path, value, container)
-
-
-def _is_safetensors(beginning: bytes) -> bool:
-    """Whether a header of at most 100 MB follows, the limit of the format; pickles say more."""
-    length = int.from_bytes(beginning[:8], "little")
-    return beginning[8:9] == b"{" and length <= 100_000_000
 
 
 def _read_safetensors(path: Path) -> Contents:

@@ -17,7 +17,7 @@ from typing import IO, Any, BinaryIO, cast
 import torch
 from torch import Tensor
 
-from rgbt.checkpoints.pickles import GROWTH, SMALL, DamagedError, RefusedError
+from rgbt.checkpoints.pickles import DAMAGE, GROWTH, SMALL, RefusedError
 from rgbt.checkpoints.torch_files import COMMENT, COMMENT_LENGTH, mapped, read_pickles, read_zip
 from rgbt.checks import InputError
 from rgbt.files.atomic import replacing
@@ -25,16 +25,18 @@ from rgbt.files.atomic import replacing
 ZIP = "torch.save"
 """Name of the format that checkpoints have."""
 
-DAMAGE = (
-    DamagedError,
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-)
-"""What overwritten or invented bytes lead to, wherever they are made sense of."""
+OTHERS = {
+    (b"version https://git-lfs",): (
+        "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
+    ),
+    (b"<!doctype", b"<html", b"<?xml", b"<head"): (
+        "is a web page, probably of the host's download button; download it again."
+    ),
+    (b"\x1f\x8b", b"bzh", b"\xfd7zxz", b"7z\xbc\xaf", b"rar!"): (
+        "is a compressed archive; unpack it and name the file of weights."
+    ),
+}
+"""First bytes, in lower case, of what is often saved or downloaded in the place of weights."""
 
 PLAIN = (str, int, float, bool, type(None))
 DEPTH = 20
@@ -72,14 +74,21 @@ def read_stored(path: Path) -> tuple[Any, str]:
     Objects of known classes of configurations are `pickles.Inert`.
 
     Raises:
-        RefusedError: it requests code, for far more memory than it has bytes, or is another kind of
-            file.
-        DamagedError: one of `DAMAGE`: it is cut short or overwritten.
+        RefusedError: it requests code, or too much memory, or is another kind of file.
+        Exception: one of `DAMAGE`: it is cut short or overwritten.
     """
     beginning = beginning_of(path)
     if beginning.startswith(b"PK\x03\x04"):
         return read_zip(path), ZIP
-    _refuse_others(beginning)
+    for others, what in OTHERS.items():
+        if beginning.lstrip().lower().startswith(others):
+            raise RefusedError(what)
+    if beginning[257:262] == b"ustar":
+        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
+    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
+        raise RefusedError(
+            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
+        )
     return read_pickles(mapped(path))
 
 
@@ -98,27 +107,6 @@ def beginning_of(path: Path) -> bytes:
     if not beginning:
         raise InputError(f"{path} is empty; copy or download it again.")
     return beginning
-
-
-def _refuse_others(beginning: bytes) -> None:
-    """Name what is often saved or downloaded in the place of weights."""
-    text = beginning.lstrip().lower()
-    if text.startswith(b"version https://git-lfs"):
-        raise RefusedError(
-            "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
-        )
-    if text.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
-        raise RefusedError(
-            "is a web page, probably of the host's download button; download it again."
-        )
-    if beginning[257:262] == b"ustar":
-        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
-    if beginning.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")):
-        raise RefusedError("is a compressed archive; unpack it and name the file of weights.")
-    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
-        raise RefusedError(
-            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
-        )
 
 
 def plain(value: Any, num_bytes: int) -> Any:
