@@ -52,7 +52,7 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     from rgbt.checkpoints.load import plan_for
     from rgbt.checkpoints.read import read
     from rgbt.checkpoints.recognise import recognise
-    from rgbt.checkpoints.view import PLAN_HEADER, facts_view, plan_rows
+    from rgbt.checkpoints.report import PLAN_HEADER, facts_view, plan_rows
     from rgbt.tracking.tables import TextTable
     from rgbt.tracking.terminal import print_rich, rich_table
 

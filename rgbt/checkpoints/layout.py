@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from torch import Tensor, nn
 
@@ -81,21 +80,21 @@ class Rule:
     remarks: tuple[str, ...] = ()
 
 
-class Layout(Protocol):
-    """A module of `rgbt.checkpoints.layouts`; files of whole networks fit their own family only."""
-
-    def recognise(self, contents: Contents) -> Facts | None:
-        """What the file is, None where it is of another layout."""
-        ...
-
-    def rule(self, family: str, model: nn.Module, facts: Facts) -> Rule | None:
-        """How a network of `family` is filled, None where the file is of no use to it."""
-        ...
+RuleOf = Callable[[str, nn.Module, Facts], Rule | None]
+"""(family, network, facts) -> how such a network is filled, None where the file is of no use."""
 
 
-def own_names(_family: str, _model: nn.Module, _facts: Facts) -> Rule:
-    """The rule of files whose names are the network's."""
-    return Rule()
+@dataclass(frozen=True)
+class Layout:
+    """A kind of file; files of whole networks fit their own family only.
+
+    Attributes:
+        recognise: what a file is, None where it is of another layout.
+        rule: see `RuleOf`.
+    """
+
+    recognise: Callable[[Contents], Facts | None]
+    rule: RuleOf
 
 
 def reason(reasons: Reasons, name: str) -> str | None:

@@ -70,7 +70,16 @@ def plan_for(
         InputError: the file is of no use to this network at all.
     """
     facts = recognise(contents)
-    rule = _rule(model, contents, facts)
+    family = family_of(type(model))
+    rule = None
+    of_any = not facts.family or (facts.layout == "own" and not family)
+    if facts.layout in LAYOUTS and (of_any or facts.family == family):
+        try:
+            rule = LAYOUTS[facts.layout].rule(family, model, facts)
+        except InputError as error:
+            raise InputError(f"{contents.path} is an {error}") from error
+    if rule is None and contents.tensors.keys() == model.state_dict().keys():
+        rule = Rule()  # with exactly its own names, any network takes the file
     if rule is None:
         raise InputError(_another_network(model, contents, facts))
     plan = make_plan(
@@ -80,21 +89,6 @@ def plan_for(
     short = [kind.removeprefix("torch.") for kind in kinds if kind.endswith("float16")]
     converted = (f"{' and '.join(short)} converted",) if short else ()
     return facts, plan, (*rule.remarks, *converted)
-
-
-def _rule(model: nn.Module, contents: Contents, facts: Facts) -> Rule | None:
-    """How the network takes the file; with exactly its own names, any network does."""
-    family = family_of(type(model))
-    found = None
-    of_any = not facts.family or (facts.layout == "own" and not family)
-    if facts.layout in LAYOUTS and (of_any or facts.family == family):
-        try:
-            found = LAYOUTS[facts.layout].rule(family, model, facts)
-        except InputError as error:
-            raise InputError(f"{contents.path} is an {error}") from error
-    if found is None and contents.tensors.keys() == model.state_dict().keys():
-        return Rule()
-    return found
 
 
 def _another_network(model: nn.Module, contents: Contents, facts: Facts) -> str:

@@ -1,269 +1,355 @@
-"""Pickles as data: a reader of the opcodes that has no way to call what a file names.
+"""Pickles as data: Python's unpickler with a table of names in the place of its imports.
 
-Python's own unpickler imports the objects that a file names and calls them. Here a name stays a
-`Name`; what a file wants called is looked up among the few builders of `rgbt.checkpoints.builders`,
-which put together inert values of ours. Every other name is refused where it occurs, called or not.
+A name in a file is never imported, looked up or called. It stays a `Name`; calling it gives what
+one of `BUILDERS` makes of the arguments, or an `Inert`. Others are refused where they occur.
+
+Python's unpickler in C is not used, because a memo index of 2^31, in a file of ten bytes, makes it
+allocate gigabytes. Neither is torch.load, which takes sizes of storages from the pickle.
 """
 
 from __future__ import annotations
 
 import os
-import pickletools
-from collections.abc import Callable, Mapping
-from typing import IO, Any
+import pickle
+import re
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import IO, Any, Literal
 
-from rgbt.checkpoints.builders import PLAIN_NAMES, STAND_INS, Builder
-from rgbt.checkpoints.records import (
-    Array,
-    DamagedError,
-    Inert,
-    Name,
-    NumberType,
-    RefusedError,
-    check_key,
-)
+import numpy as np
+import torch
+from torch import Tensor
+
+from rgbt.checkpoints.names import BUILTINS, DTYPES, PLAIN_NAMES, STAND_INS
 
 Persistent = Callable[[Any], Any]
 
 GROWTH, SMALL = 8, 1_000_000
 """What may be copied while reading: so many times the bytes of the file, and a little more."""
 
-SENSELESS = (
-    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
-    *(MemoryError, RecursionError),
+UNKNOWN = b"".join(
+    (pickle.EXT1, pickle.EXT2, pickle.EXT4)
+    + (pickle.NEWOBJ_EX, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER)
 )
-"""What opcodes in an order that nobody writes lead to."""
+"""Opcodes of Python's registry of classes, calls with keywords, memory outside the file."""
 
 SIZED = (str, bytes, bytearray, list, tuple, dict, set, frozenset)
 
 
-def unpickle(stream: IO[bytes], builders: Mapping[str, Builder], persistent: Persistent) -> Any:
+class RefusedError(Exception):
+    """A file wants what it does not get; the message continues the file's name."""
+
+    @classmethod
+    def code(cls, name: str) -> RefusedError:
+        """For a name outside the known ones."""
+        return cls(
+            f"asks for {printable(name)}, which would run code on reading, so nothing of it was "
+            "read; give a file that holds tensors and plain values only, such as a saved "
+            "state_dict()."
+        )
+
+    @classmethod
+    def greedy(cls) -> RefusedError:
+        """For content that would grow beyond all proportion."""
+        return cls(
+            "would take far more memory than it has bytes; it is damaged, or made to do harm."
+        )
+
+
+class DamagedError(Exception):
+    """A file that is cut short, overwritten, or not what its beginning says."""
+
+
+DAMAGE = (
+    *(DamagedError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    *(RuntimeError, MemoryError, RecursionError, EOFError, struct.error, pickle.UnpicklingError),
+)
+"""What overwritten or invented bytes lead to, wherever they are made sense of."""
+
+
+def printable(text: str, limit: int = 100) -> str:
+    """`text` from a file, for a terminal: no control characters, not endless."""
+    shown = text if text.isprintable() else text.encode("unicode_escape").decode("ascii")
+    return shown if len(shown) <= limit else f"{shown[: limit - 3]}..."
+
+
+@dataclass(frozen=True)
+class Name:
+    """A name in a file, such as ``torch.FloatStorage``."""
+
+    full: str
+
+
+class Inert(dict[Any, Any]):
+    """Stands for an object of a configuration class: its keys and attributes, and nothing else."""
+
+    def extend(self, items: object) -> None:
+        """Elements of lists of configurations are of no use here."""
+
+    append = extend
+
+
+@dataclass(eq=False)
+class NumberType:
+    """A NumPy dtype of plain numbers, whose state in a file gives the byte order."""
+
+    dtype: np.dtype[Any]
+
+
+def unpickle(
+    stream: IO[bytes], persistent: Persistent | None = None, extra: Mapping[str, Any] | None = None
+) -> Any:
     """The value of the next pickle in `stream`; the stream is left right behind it.
 
     Args:
         stream: bytes, read from its position.
-        builders: full name in the file -> what makes a value of the arguments.
-        persistent: makes a value of what the file refers to outside the pickle.
+        persistent: makes a value of what the file refers to outside the pickle; None: it may not.
+        extra: further names that the file may call -> what answers them.
 
     Raises:
-        RefusedError: a name or opcode that is not among the known ones.
-        DamagedError: not a pickle, cut short, or senseless.
+        RefusedError: a name that is not among the known ones, or more memory than the file has.
+        Exception: one of `DAMAGE`.
     """
-    start = stream.tell()
-    stream.seek(0, os.SEEK_END)
-    machine = Machine(builders, persistent, budget=GROWTH * stream.tell() + SMALL)
-    stream.seek(start)
-    try:
-        for opcode, argument, _ in pickletools.genops(stream):
-            step = STEPS.get(opcode.name)
-            if step is None:
-                raise RefusedError(
-                    f"uses the pickle opcode {opcode.name}, which no checkpoint needs."
-                )
-            step(machine, argument)
-        return machine.stack.pop()
-    except SENSELESS as error:
-        raise DamagedError from error
+    return _Unpickler(stream, persistent, {**BUILDERS, **(extra or {})}).load()
 
 
-class Machine:
-    """Stack, marks and memo of one pickle. Values on the stack are plain Python or `records`."""
+PYTHONS: Any = pickle._Unpickler  # its stack and its steps are unknown to type checkers
+
+
+class _Unpickler(PYTHONS):  # type: ignore[misc]
+    """What Python's does on each opcode, less what calls, imports, hashes or copies unchecked."""
 
     def __init__(
-        self, builders: Mapping[str, Builder], persistent: Persistent, *, budget: int
+        self, stream: IO[bytes], persistent: Persistent | None, builders: Mapping[str, Any]
     ) -> None:
+        # Text of Python 2 is bytes; latin1 keeps each of them.
+        super().__init__(stream, encoding="latin1")
+        start = stream.tell()
+        stream.seek(0, os.SEEK_END)
+        self.budget = GROWTH * stream.tell() + SMALL
+        stream.seek(start)
         self.builders = builders
-        self.persistent = persistent
-        self.budget = budget
-        self.stack: list[Any] = []
-        self.marks: list[list[Any]] = []
-        self.memo: dict[int, Any] = {}
+        if persistent is not None:
+            self.persistent_load = persistent
 
-    def push(self, value: Any) -> None:
-        """Onto the stack."""
-        self.stack.append(value)
-
-    def mark(self, _: object) -> None:
-        """Begin a new stack on top of this one."""
-        self.marks.append(self.stack)
-        self.stack = []
-
-    def since_mark(self) -> list[Any]:
-        """What lies above the last mark, which is taken away."""
-        items, self.stack = self.stack, self.marks.pop()
-        return items
-
-    def name(self, module: object, name: object) -> None:
-        """Push a name.
-
-        Raises:
-            RefusedError: unknown.
-        """
-        if not isinstance(module, str) or not isinstance(name, str):
-            raise TypeError("a name is text")
+    def find_class(self, module: str, name: str) -> Name:
         full = f"{module}.{name}"
         if full not in self.builders and full not in PLAIN_NAMES and full not in STAND_INS:
             raise RefusedError.code(full)
-        self.push(Name(full))
+        return Name(full)
 
-    def call(self, callee: object, arguments: object) -> None:
-        """Push what a builder of ours, or an inert stand-in, makes of the arguments.
+    def call(self) -> None:
+        """REDUCE and NEWOBJ: a name and a tuple of arguments."""
+        arguments, callee = self.stack.pop(), self.stack.pop()
+        if type(arguments) is not tuple:
+            raise TypeError("arguments are a tuple")
+        self._instantiate(callee, arguments)
 
-        Raises:
-            RefusedError: there is none for `callee`.
-        """
-        if not isinstance(callee, Name) or not isinstance(arguments, tuple):
-            raise TypeError("only names are called, with a tuple")
+    def _instantiate(self, callee: object, arguments: Iterable[Any]) -> None:
+        """Push what answers a call; INST and OBJ end here too."""
+        if type(callee) is not Name:
+            raise TypeError("only names are called")
+        arguments = tuple(arguments)
         self.spend(arguments)
         if callee.full in STAND_INS:
-            self.push(Inert(callee.full))
+            self.append(Inert())
         elif callee.full in self.builders:
-            self.push(self.builders[callee.full](*arguments))
+            self.append(self.builders[callee.full](*arguments))
         else:
             raise RefusedError.code(callee.full)
 
-    def build(self, _: object) -> None:
-        """Hand a state to the value below it; only our own records take one."""
+    def build(self) -> None:
+        """BUILD: hand a state to the value below it; few take one."""
         state, target = self.stack.pop(), self.stack[-1]
-        self.spend(state if isinstance(state, tuple) else (state,))
-        if isinstance(target, Inert | Array | NumberType):
-            target.build(state)
+        self.spend(state if type(state) is tuple else (state,))
+        if type(target) is Inert:
+            target.update(state if type(state) is dict else {})
+        elif type(target) is NumberType:
+            if state[1] in ("<", ">"):
+                target.dtype = target.dtype.newbyteorder(state[1])
+        elif isinstance(target, Tensor):
+            target.data = _array(*state[-4:])
         elif type(target) is not dict:  # attributes of an ordered dictionary mean nothing here
             raise TypeError(f"{type(target).__name__} takes no state")
 
-    def spend(self, values: tuple[Any, ...]) -> None:
-        """Count what is about to be copied, which a file may ask for over and over.
-
-        Raises:
-            RefusedError: it is far more than the file holds.
-        """
+    def spend(self, values: Iterable[Any]) -> None:
+        """Count what is about to be copied, which a file may ask for over and over."""
         self.budget -= sum(len(value) for value in values if isinstance(value, SIZED))
         if self.budget < 0:
             raise RefusedError.greedy()
 
-    def extend(self, items: list[Any]) -> None:
-        """Append to a list."""
-        target = self.stack[-1]
-        if type(target) is not list and not isinstance(target, Inert):
-            raise TypeError("only lists are appended to")
-        target.extend(items)
+    def dictionary(self) -> None:
+        """DICT: keys and values above the mark."""
+        items = self.pop_mark()  # before `append` is looked up, which it exchanges
+        self.append(_pairs(items))
 
-    def update(self, items: list[Any]) -> None:
-        """Set keys of a dictionary: key, value, key, value, ..."""
-        target = self.stack[-1]
-        if type(target) is not dict and not isinstance(target, Inert):
+    def set_item(self) -> None:
+        """SETITEM: one key and value."""
+        items = self.stack[-2:]
+        del self.stack[-2:]
+        self._update(items)
+
+    def set_items(self) -> None:
+        """SETITEMS: those above the mark."""
+        self._update(self.pop_mark())
+
+    def _update(self, items: list[Any]) -> None:
+        if type(self.stack[-1]) not in (dict, Inert):
             raise TypeError("only dictionaries have keys")
-        target.update(_pairs(items))
+        self.stack[-1].update(_pairs(items))
 
-    def add(self, _: object) -> None:
-        """Add to a set."""
-        items, target = self.since_mark(), self.stack[-1]
+    def add_items(self) -> None:
+        """ADDITEMS, to a set."""
+        items, target = self.pop_mark(), self.stack[-1]
         if type(target) is not set:
             raise TypeError("only sets are added to")
-        target.update(map(check_key, items))
+        target.update(_set(items))
 
-    def take(self, count: int) -> list[Any]:
-        """The topmost `count` values, taken away."""
-        if len(self.stack) < count:
-            raise IndexError("too few values")
-        items = self.stack[-count:]
-        del self.stack[-count:]
-        return items
+    def frozen_set(self) -> None:
+        """FROZENSET: what is above the mark."""
+        items = self.pop_mark()
+        self.append(frozenset(_set(items)))
+
+    def byte_array(self) -> None:
+        """BYTEARRAY8: as many bytes as there are, before memory is taken for them."""
+        (size,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(size)))
+
+    dispatch = {
+        **{code: step for code, step in PYTHONS.dispatch.items() if code not in UNKNOWN},
+        pickle.REDUCE[0]: call,
+        pickle.NEWOBJ[0]: call,
+        pickle.BUILD[0]: build,
+        pickle.DICT[0]: dictionary,
+        pickle.SETITEM[0]: set_item,
+        pickle.SETITEMS[0]: set_items,
+        pickle.ADDITEMS[0]: add_items,
+        pickle.FROZENSET[0]: frozen_set,
+        pickle.BYTEARRAY8[0]: byte_array,
+    }
+
+
+PLAIN_KEYS = (str, int, float, bool, bytes, type(None), Name)
+
+
+def _checked(key: Any) -> Any:
+    """`key` where hashing and printing it takes no time: nested tuples can take for ever."""
+    inner = key if type(key) is tuple else (key,)
+    if not all(type(each) in PLAIN_KEYS for each in inner):
+        raise TypeError("a key must be plain")
+    return key
 
 
 def _pairs(items: list[Any]) -> dict[Any, Any]:
-    return {check_key(k): v for k, v in zip(items[::2], items[1::2], strict=True)}
+    """Of key, value, key, value, ..."""
+    return {_checked(k): v for k, v in zip(items[::2], items[1::2], strict=True)}
 
 
-def _instance(machine: Machine, argument: str) -> None:
-    """INST: "module name" in the opcode, arguments above the mark."""
-    arguments = tuple(machine.since_mark())
-    machine.name(*argument.split(" ", 1))
-    machine.call(machine.stack.pop(), arguments)
+def _set(items: Iterable[Any] = ()) -> set[Any]:
+    return {_checked(item) for item in items}
 
 
-def _object(machine: Machine, _: object) -> None:
-    """OBJ: class and arguments above the mark."""
-    callee, *arguments = machine.since_mark()
-    machine.call(callee, tuple(arguments))
+def _dictionary(content: Any = ()) -> dict[Any, Any]:
+    pairs = content.items() if type(content) is dict else content
+    return {_checked(key): value for key, value in pairs}
 
 
-def _new_object_ex(machine: Machine, _: object) -> None:
-    callee, arguments, keywords = machine.take(3)
-    if keywords and not (isinstance(callee, Name) and callee.full in STAND_INS):
-        raise TypeError("no builder takes keywords")
-    machine.call(callee, arguments)
+def _sizes(values: Any) -> tuple[int, ...]:
+    if type(values) is not tuple or any(type(n) is not int or n < 0 for n in values):
+        raise TypeError("sizes must be whole numbers from 0")
+    return values
 
 
-def _pop(machine: Machine, _: object) -> None:
-    if machine.stack:
-        machine.stack.pop()
-    else:
-        machine.since_mark()
+def _tensor(storage: Any, offset: Any, size: Any, stride: Any, *_ignored: Any) -> Tensor:
+    """torch._utils._rebuild_tensor and _v2; gradients and hooks mean nothing here."""
+    if not isinstance(storage, Tensor) or type(offset) is not int or offset < 0:
+        raise TypeError("not a tensor")
+    steps = zip(_sizes(size), _sizes(stride), strict=True)
+    if 0 in size:
+        return torch.empty(size, dtype=storage.dtype)
+    if offset + sum((n - 1) * step for n, step in steps) >= len(storage):
+        raise DamagedError("a tensor reaches outside its storage")
+    return storage.as_strided(size, stride, storage.storage_offset() + offset)
 
 
-Step = Callable[[Machine, Any], object]
+def _tensor_v3(*arguments: Any) -> Tensor:
+    """The same for a storage of bytes; the dtype is the seventh argument."""
+    storage, *others, kind = arguments[:7]
+    return _tensor(storage.view(DTYPES[kind.full]), *others)
 
 
-def _makes(make: Callable[[], object]) -> Step:
-    return lambda machine, _: machine.push(make())
+def _parameter(data: Any, *_ignored: Any) -> Tensor:
+    if not isinstance(data, Tensor):
+        raise TypeError("not a parameter")
+    return data
 
 
-def _collects(make: Callable[[list[Any]], object]) -> Step:
-    return lambda machine, _: machine.push(make(machine.since_mark()))
+def _number_type(code: Any, *_ignored: Any) -> NumberType:
+    if type(code) is not str or not re.fullmatch(r"[<>=|]?([iu][1248]|f[248]|b1)", code):
+        raise RefusedError("holds an array of something else than plain numbers.")
+    return NumberType(np.dtype(code))
 
 
-def _tuple_of(count: int) -> Step:
-    return lambda machine, _: machine.push(tuple(machine.take(count)))
+def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> Tensor:
+    """The numbers of a NumPy array, a copy."""
+    if type(data) is list:
+        raise RefusedError("holds an array of Python objects; only arrays of numbers are read.")
+    if type(data) is str:  # Python 2 knew no bytes
+        data = data.encode("latin1")
+    if type(kind) is not NumberType or type(data) not in (bytes, bytearray):
+        raise TypeError("not the state of an array")
+    order: Literal["C", "F"] = "F" if fortran in (True, "F") else "C"
+    array = np.frombuffer(data, kind.dtype).reshape(_sizes(shape), order=order)
+    return torch.from_numpy(np.array(array, kind.dtype.newbyteorder("="), order="C"))
 
 
-def _put(machine: Machine, index: int) -> None:
-    machine.memo[index] = machine.stack[-1]
+def _encoded(text: Any, encoding: Any) -> bytes:
+    """How protocols before 3 write bytes."""
+    if type(text) is not str or encoding not in ("latin1", "latin-1"):
+        raise TypeError("not bytes")
+    return text.encode("latin1")
 
 
-LITERALS = (
-    *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
-    *("STRING", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
-    *("BYTEARRAY8", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
-)
+def _bytes(content: Any = b"", *encoding: Any) -> bytearray:
+    if type(content) is str:
+        return bytearray(_encoded(content, *encoding))
+    if type(content) is not bytes:
+        raise TypeError("not bytes")
+    return bytearray(content)
 
-STEPS: dict[str, Step] = {
-    **dict.fromkeys(LITERALS, Machine.push),
-    "NONE": _makes(lambda: None),
-    "NEWTRUE": _makes(lambda: True),
-    "NEWFALSE": _makes(lambda: False),
-    "EMPTY_LIST": _makes(list),
-    "EMPTY_DICT": _makes(dict),
-    "EMPTY_SET": _makes(set),
-    "EMPTY_TUPLE": _makes(tuple),
-    "LIST": _collects(list),
-    "TUPLE": _collects(tuple),
-    "DICT": _collects(_pairs),
-    "FROZENSET": _collects(lambda items: frozenset(map(check_key, items))),
-    **{f"TUPLE{count}": _tuple_of(count) for count in (1, 2, 3)},
-    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda m, i: m.push(m.memo[i])),
-    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _put),
-    # These matter to Python's own unpickler only.
-    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda *_: None),
-    "MEMOIZE": lambda m, _: _put(m, len(m.memo)),
-    "MARK": Machine.mark,
-    "POP": _pop,
-    "POP_MARK": lambda m, _: m.since_mark(),
-    "DUP": lambda m, _: m.push(m.stack[-1]),
-    "APPEND": lambda m, _: m.extend(m.take(1)),
-    "APPENDS": lambda m, _: m.extend(m.since_mark()),
-    "SETITEM": lambda m, _: m.update(m.take(2)),
-    "SETITEMS": lambda m, _: m.update(m.since_mark()),
-    "ADDITEMS": Machine.add,
-    "GLOBAL": lambda m, a: m.name(*a.split(" ", 1)),
-    "STACK_GLOBAL": lambda m, _: m.name(*m.take(2)),
-    "REDUCE": lambda m, _: m.call(*m.take(2)),
-    "NEWOBJ": lambda m, _: m.call(*m.take(2)),
-    "NEWOBJ_EX": _new_object_ex,
-    "INST": _instance,
-    "OBJ": _object,
-    "BUILD": Machine.build,
-    "PERSID": lambda m, a: m.push(m.persistent(a)),
-    "BINPERSID": lambda m, _: m.push(m.persistent(m.stack.pop())),
+
+BUILDERS: Mapping[str, Callable[..., Any]] = {
+    **dict.fromkeys(("collections.OrderedDict", "collections.Counter"), _dictionary),
+    "collections.defaultdict": lambda *_: {},
+    "torch._utils._rebuild_tensor": _tensor,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_tensor_v3": _tensor_v3,
+    "torch._utils._rebuild_parameter": _parameter,
+    "torch._utils._rebuild_parameter_with_state": _parameter,
+    "torch.Size": lambda sizes=(): tuple(sizes),
+    "torch.device": lambda *_: Inert(),
+    "numpy.dtype": _number_type,
+    "_codecs.encode": _encoded,
+    **{
+        f"numpy.{core}.{name}": made
+        for core in ("core", "_core")
+        for name, made in (
+            # Declared first, filled by its state.
+            ("multiarray._reconstruct", lambda *_: torch.empty(0)),
+            ("multiarray.scalar", lambda *_: Inert()),
+            ("numeric._frombuffer", lambda data, kind, *form: _array(form[0], kind, form[1], data)),
+        )
+    },
+    **{
+        f"{module}.{name}": made
+        for module in BUILTINS
+        for name, made in (
+            ("bytearray", _bytes),
+            ("bytes", lambda: b""),
+            ("set", _set),
+            ("frozenset", lambda items=(): frozenset(_set(items))),
+        )
+    },
 }
-"""Opcode -> what it does. EXT* (Python's registry of classes) and *_BUFFER are not known."""
+"""Full name in a file -> what answers it: none imports, looks up or calls anything by name."""

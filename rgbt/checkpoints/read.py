@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from rgbt.checkpoints.records import Array, DamagedError, Inert, RefusedError, Strided, printable
+from rgbt.checkpoints.pickles import DamagedError, RefusedError, printable
 from rgbt.checkpoints.stored import beginning_of, explained, read_stored
 
 WRAPPERS = ("state_dict", "model", "module")
@@ -68,16 +68,12 @@ def read(path: Path) -> Contents:
         InputError: missing, empty, cut short, of another kind, or asking for code.
     """
     with explained(path, "a file of weights", "copy or download it again"):
-        if _is_safetensors(beginning_of(path)):
+        beginning = beginning_of(path)
+        # A header of at most 100 MB, the limit of safetensors; a pickle that begins so says more.
+        if beginning[8:9] == b"{" and int.from_bytes(beginning[:8], "little") <= 100_000_000:
             return _read_safetensors(path)
         value, container = read_stored(path)
         return _unwrapped(path, value, container)
-
-
-def _is_safetensors(beginning: bytes) -> bool:
-    """Whether a header of at most 100 MB follows, the limit of the format; pickles say more."""
-    length = int.from_bytes(beginning[:8], "little")
-    return beginning[8:9] == b"{" and length <= 100_000_000
 
 
 def _read_safetensors(path: Path) -> Contents:
@@ -97,8 +93,8 @@ def _read_safetensors(path: Path) -> Contents:
 
 def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     """The tensors in what a file holds: they lie at the top, or under one known key."""
-    if not isinstance(value, dict):
-        kind = "one tensor" if _is_tensor(value) else f"a {type(value).__name__}"
+    if type(value) is not dict:
+        kind = "one tensor" if isinstance(value, Tensor) else f"a {type(value).__name__}"
         raise RefusedError(
             f"holds {kind}, not tensors by name; give a file that holds a state_dict()."
         )
@@ -112,9 +108,9 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
         raise RefusedError(f"holds no tensors by name; its keys are: {keys or 'none'}.")
     where = inner[0] if inner else ""
     state = value[where] if inner else value
-    tensors = {name: found.tensor() for name, found in state.items() if _is_tensor(found)}
+    tensors = {name: found for name, found in state.items() if isinstance(found, Tensor)}
     outside = [key for key in value if key != where] if inner else []
-    inside = [key for key, found in state.items() if not _is_tensor(found)]
+    inside = [key for key in state if key not in tensors]
     # Texts by name; anything else that a stranger's file may hold there is left alone.
     own = value.get(NOTE) if inner else None
     items = own.items() if isinstance(own, dict) else ()
@@ -131,15 +127,11 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     return _without_prefixes(contents, tensors)
 
 
-def _is_tensor(value: object) -> bool:
-    return isinstance(value, Strided | Array)
-
-
 def _is_state(value: object) -> bool:
     """Whether a dictionary is tensors by name."""
     return (
-        isinstance(value, dict)
-        and any(map(_is_tensor, value.values()))
+        type(value) is dict
+        and any(isinstance(each, Tensor) for each in value.values())
         and all(type(key) is str for key in value)
     )
 
@@ -162,10 +154,9 @@ def _settings(value: dict[Any, Any]) -> dict[str, Any]:
     for _ in range(5):
         children = []
         for path, node in level:
-            items = node.items if isinstance(node, Inert) else node
-            if isinstance(items, dict) and id(items) not in seen:
-                seen.add(id(items))
-                children += [(f"{path}.{key}".lstrip("."), items[key]) for key in items]
+            if isinstance(node, dict) and id(node) not in seen:
+                seen.add(id(node))
+                children += [(f"{path}.{key}".lstrip("."), node[key]) for key in node]
         found |= {where: child for where, child in children if isinstance(child, PLAIN)}
         level = children
     return found

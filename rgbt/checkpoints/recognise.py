@@ -7,34 +7,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+from rgbt.checkpoints.backbones import BACKBONES
 from rgbt.checkpoints.layout import Facts, Layout
-from rgbt.checkpoints.layouts import (
-    cmx,
-    heatnet,
-    mask2former,
-    mfnet,
-    mit,
-    own,
-    resnet,
-    rtfnet,
-    swin,
-)
+from rgbt.checkpoints.networks import NETWORKS
+from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.read import Contents
-from rgbt.checkpoints.records import printable
 
-LAYOUTS: MappingProxyType[str, Layout] = MappingProxyType(
-    {
-        "own": own,
-        "mask2former": mask2former,
-        "cmx": cmx,
-        "rtfnet": rtfnet,
-        "mfnet": mfnet,
-        "heatnet": heatnet,
-        "mit": mit,
-        "swin": swin,
-        "resnet": resnet,
-    }
-)
+LAYOUTS: Mapping[str, Layout] = MappingProxyType(NETWORKS | BACKBONES)
 """By name, in the order they are tried: whole networks before backbones."""
 
 UNKNOWN = Facts("unknown", "file of weights in no layout known here")

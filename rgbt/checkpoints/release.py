@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,10 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rgbt.checkpoints import networks
 from rgbt.checkpoints.layout import FAMILIES
-from rgbt.checkpoints.layouts import cmx, heatnet, mask2former, mfnet, rtfnet
 from rgbt.checkpoints.read import NOTE
 from rgbt.checks import InputError, check_choice
+from rgbt.files.atomic import replacing
 
 FORMATS = ("safetensors", "released", "released_temporal")
 
@@ -29,23 +29,23 @@ RELEASED: Mapping[str, Container] = {
         "epoch": 0,
         "global_step": int(note.get("step", 0)),
         "pytorch-lightning_version": "1.9.2",
-        "state_dict": mask2former.released(state),
+        "state_dict": networks.released_mask2former(state),
         NOTE: dict(note),
     },
     "cmx": lambda state, note: {"model": OrderedDict(state), NOTE: dict(note)},
     "rtfnet": lambda state, _: OrderedDict(state),
     "mfnet": lambda state, _: OrderedDict(state),
-    "pspnet": lambda state, _: heatnet.released(state),
+    "pspnet": lambda state, _: networks.released_heatnet(state),
 }
 """Family -> what its release's torch.load gives."""
 
 CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
-    ("released", "cmx"): cmx.RELEASED,
-    ("released_temporal", "cmx"): cmx.TEMPORAL,
-    ("released", "rtfnet"): rtfnet.CONVENTION,
-    ("released", "mfnet"): mfnet.CONVENTION,
-    ("released", "pspnet"): heatnet.CONVENTION,
+    ("released", "cmx"): networks.CMX_RELEASED,
+    ("released_temporal", "cmx"): networks.CMX_TEMPORAL,
+    ("released", "rtfnet"): networks.RTFNET_RELEASED,
+    ("released", "mfnet"): networks.MFNET_RELEASED,
+    ("released", "pspnet"): networks.HEATNET_RELEASED,
 }
 """Format and family -> how the authors' code feeds and evaluates the network."""
 
@@ -79,7 +79,7 @@ def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -
                 f"format={layout} is the temporal release's CMX; this network is "
                 f"{FAMILIES.get(family, 'none of rgbt.models')}; take another format."
             )
-        return cmx.released_temporal(state)
+        return networks.released_temporal(state)
     if family not in RELEASED:
         raise InputError(
             f"there is no release of {FAMILIES.get(family, 'this network')} whose layout could be "
@@ -111,24 +111,18 @@ def save(
         raise InputError(f"out={path} exists already; remove it or name another file.")
     content = None if layout == "safetensors" else payload(layout, family, state, note)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
+    with replacing(path) as file:
         if layout == "safetensors":
-            _save_safetensors(temporary, state, note)
+            file.write(_safetensors(state, note))
         else:
-            torch.save(content, temporary)
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+            torch.save(content, file)
     return SAID.get((layout, family))
 
 
-def _save_safetensors(path: Path, state: Mapping[str, Tensor], note: Note) -> None:
-    from safetensors.torch import save_file
+def _safetensors(state: Mapping[str, Tensor], note: Note) -> bytes:
+    from safetensors.torch import save as serialised
 
     # The format knows no shared memory: what two branches share is written for each.
     separate = {key: value.detach().clone().contiguous() for key, value in state.items()}
     metadata = {"format": "pt", **{f"{NOTE}.{key}": value for key, value in note.items()}}
-    save_file(separate, path, metadata=metadata)
+    return serialised(separate, metadata=metadata)

@@ -15,26 +15,28 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
 
 import torch
+from torch import Tensor
 
-from rgbt.checkpoints.archives import COMMENT_LENGTH, comment_of, mapped
-from rgbt.checkpoints.pickles import GROWTH, SMALL
-from rgbt.checkpoints.records import DamagedError, RefusedError, Strided
-from rgbt.checkpoints.torch_files import read_pickles, read_zip
+from rgbt.checkpoints.pickles import DAMAGE, GROWTH, SMALL, RefusedError
+from rgbt.checkpoints.torch_files import COMMENT, COMMENT_LENGTH, mapped, read_pickles, read_zip
 from rgbt.checks import InputError
+from rgbt.files.atomic import replacing
 
 ZIP = "torch.save"
 """Name of the format that checkpoints have."""
 
-DAMAGE = (
-    DamagedError,
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-)
-"""What overwritten or invented bytes lead to, wherever they are made sense of."""
+OTHERS = {
+    (b"version https://git-lfs",): (
+        "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
+    ),
+    (b"<!doctype", b"<html", b"<?xml", b"<head"): (
+        "is a web page, probably of the host's download button; download it again."
+    ),
+    (b"\x1f\x8b", b"bzh", b"\xfd7zxz", b"7z\xbc\xaf", b"rar!"): (
+        "is a compressed archive; unpack it and name the file of weights."
+    ),
+}
+"""First bytes, in lower case, of what is often saved or downloaded in the place of weights."""
 
 PLAIN = (str, int, float, bool, type(None))
 DEPTH = 20
@@ -69,17 +71,24 @@ def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
 def read_stored(path: Path) -> tuple[Any, str]:
     """The value of a file of torch.save or pickle, and the name of its format.
 
-    Tensors are `Strided` or `Array`, objects of known classes `Inert`.
+    Objects of known classes of configurations are `pickles.Inert`.
 
     Raises:
-        RefusedError: it requests code, for far more memory than it has bytes, or is another kind of
-            file.
-        DamagedError: one of `DAMAGE`: it is cut short or overwritten.
+        RefusedError: it requests code, or too much memory, or is another kind of file.
+        Exception: one of `DAMAGE`: it is cut short or overwritten.
     """
     beginning = beginning_of(path)
     if beginning.startswith(b"PK\x03\x04"):
         return read_zip(path), ZIP
-    _refuse_others(beginning)
+    for others, what in OTHERS.items():
+        if beginning.lstrip().lower().startswith(others):
+            raise RefusedError(what)
+    if beginning[257:262] == b"ustar":
+        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
+    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
+        raise RefusedError(
+            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
+        )
     return read_pickles(mapped(path))
 
 
@@ -100,27 +109,6 @@ def beginning_of(path: Path) -> bytes:
     return beginning
 
 
-def _refuse_others(beginning: bytes) -> None:
-    """Name what is often saved or downloaded in the place of weights."""
-    text = beginning.lstrip().lower()
-    if text.startswith(b"version https://git-lfs"):
-        raise RefusedError(
-            "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
-        )
-    if text.startswith((b"<!doctype", b"<html", b"<?xml", b"<head")):
-        raise RefusedError(
-            "is a web page, probably of the host's download button; download it again."
-        )
-    if beginning[257:262] == b"ustar":
-        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
-    if beginning.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")):
-        raise RefusedError("is a compressed archive; unpack it and name the file of weights.")
-    if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
-        raise RefusedError(
-            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
-        )
-
-
 def plain(value: Any, num_bytes: int) -> Any:
     """A value of ours with its tensors copied out of the file.
 
@@ -131,44 +119,34 @@ def plain(value: Any, num_bytes: int) -> Any:
     Raises:
         RefusedError: the tensors would take far more.
         TypeError: anything but dictionaries, lists and tuples of plain values and tensors.
-        DamagedError: a tensor reaches outside its storage.
     """
-    return _Copies(GROWTH * num_bytes + SMALL).of(value, DEPTH)
+    budget = GROWTH * num_bytes + SMALL
+    known: dict[int, Any] = {}  # one container in many places is copied once
 
-
-class _Copies:
-    """Copies within a budget of bytes; one container in many places is copied once."""
-
-    def __init__(self, budget: int) -> None:
-        self.budget = budget
-        self.known: dict[int, Any] = {}
-
-    def of(self, value: Any, depth: int) -> Any:
+    def copied(value: Any, depth: int) -> Any:
+        nonlocal budget
         if type(value) is str:
             # One object for equal texts, as in a program: what is saved again has the same bytes.
             return sys.intern(value)
-        if type(value) in PLAIN:
-            return value
-        if id(value) not in self.known:
-            self.known[id(value)] = self._made(value, depth)
-        return self.known[id(value)]
-
-    def _made(self, value: Any, depth: int) -> Any:
+        if type(value) in PLAIN or id(value) in known:
+            return known.get(id(value), value)
         if depth == 0:
             raise TypeError("too many levels")
-        if isinstance(value, Strided):
-            self.budget -= value.num_bytes
-            if self.budget < 0:
+        if isinstance(value, Tensor):
+            budget -= value.nbytes
+            if budget < 0:
                 raise RefusedError.greedy()
-            return value.tensor().clone()
-        if type(value) is dict:
-            if not all(type(key) in (str, int) for key in value):
-                raise TypeError("not a plain key")
+            known[id(value)] = value.clone()
+        elif type(value) is dict and all(type(key) in (str, int) for key in value):
             pairs = value.items()
-            return {self.of(key, depth): self.of(each, depth - 1) for key, each in pairs}
-        if type(value) in (list, tuple):
-            return type(value)(self.of(each, depth - 1) for each in value)
-        raise TypeError("not a plain value")
+            known[id(value)] = {copied(k, depth): copied(each, depth - 1) for k, each in pairs}
+        elif type(value) in (list, tuple):
+            known[id(value)] = type(value)(copied(each, depth - 1) for each in value)
+        else:
+            raise TypeError("not a plain value")
+        return known[id(value)]
+
+    return copied(value, DEPTH)
 
 
 class _Hashing:
@@ -192,18 +170,10 @@ def save(path: Path, value: Any) -> None:
     Raises:
         OSError: the file cannot be written; an older one of this name is left as it was.
     """
-    # One name: what a killed process left half written is overwritten, never piled up.
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        with temporary.open("wb") as file:
-            hashing = _Hashing(file)
-            torch.save(value, cast(IO[bytes], hashing))
-            # torch ends the archive without a comment: its length is the last two bytes.
-            file.seek(-2, os.SEEK_CUR)
-            file.write(struct.pack("<H", COMMENT_LENGTH))
-            file.write(comment_of(hashing.digest.hexdigest()))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file:
+        hashing = _Hashing(file)
+        torch.save(value, cast(IO[bytes], hashing))
+        # torch ends the archive without a comment: its length is the last two bytes.
+        file.seek(-2, os.SEEK_CUR)
+        file.write(struct.pack("<H", COMMENT_LENGTH))
+        file.write(COMMENT % hashing.digest.hexdigest().encode())

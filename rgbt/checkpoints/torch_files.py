@@ -1,13 +1,25 @@
 """Files of torch.save: the zip archive since 1.6 and the sequence of pickles before.
 
-Tensors are views of the mapped file, so that nothing is copied until it is put somewhere. The
-mapping is private: writing to a tensor does not reach the file.
+A zip archive is checked before anything in it is made sense of. One of ours ends with its digest,
+in the comment that every zip archive may have:
+
+    sha256 = SHA-256 of the file as torch.save wrote it, that is without the comment
+
+so that a copy carries it. Files without one (older ones, foreign ones) are held against the CRC-32
+of every entry. torch compresses nothing: what an entry declares lies in the file, or is refused.
+
+Tensors of an archive are views of the mapped file. The mapping is private: writing to a tensor does
+not reach the file.
 """
 
 from __future__ import annotations
 
+import hashlib
 import mmap
 import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, cast
@@ -15,102 +27,48 @@ from typing import IO, Any, cast
 import torch
 from torch import Tensor
 
-from rgbt.checkpoints.archives import listed_in, mapped, verified
-from rgbt.checkpoints.builders import BUILDERS, STORAGES, UNTYPED
-from rgbt.checkpoints.pickles import unpickle
-from rgbt.checkpoints.records import DamagedError, Name, RefusedError, Storage
+from rgbt.checkpoints.names import STORAGES, UNTYPED
+from rgbt.checkpoints.pickles import DamagedError, Name, RefusedError, unpickle
+
+COMMENT = b"rgbt sha256 %s"
+COMMENT_LENGTH = len(COMMENT % bytes(64))
+END = struct.Struct("<4s16xH")
+"""Last record of a zip archive: its mark, and the length of the comment behind it."""
+
+END_MARK = b"PK\x05\x06"
+LOCAL_HEADER = struct.Struct("<26xHH")
+"""Of a zip entry: lengths of name and extra field, behind which the content begins."""
+
+ENCRYPTED = 1
+UNREADABLE = (zipfile.BadZipFile, NotImplementedError, ValueError, EOFError, OSError, struct.error)
+"""What zipfile raises for a table of contents that is cut short or overwritten."""
 
 MAGIC = 0x1950A86A20F9469CFC6C
 """Value of the first pickle of a file from before 1.6."""
 
 PROTOCOL = 1001
+ALIGNED = 8
+"""Bytes of the largest number, at a multiple of which numbers are read where they lie."""
+
+BIG_ENDIAN = "was written on a big-endian machine, which is not supported."
 Buffer = mmap.mmap | bytes
 
 
-class References:
-    """Storages that a pickle refers to, by their key."""
-
-    def __init__(self) -> None:
-        self.storages: dict[str, Storage] = {}
-        self.views: dict[str, tuple[str, int]] = {}
-
-    def __call__(self, reference: Any) -> Storage:
-        """The storage of ("storage", class, key, device, count[, view of another storage]).
-
-        Raises:
-            RefusedError: a whole module with its source, which torch kept before 1.0.
-        """
-        if not isinstance(reference, tuple) or reference[:1] not in (("storage",), ("module",)):
-            raise TypeError("not a storage")
-        if reference[0] == "module":
-            raise RefusedError(
-                "holds a whole network with its source code, which would have to run; give a file "
-                "that holds its state_dict()."
-            )
-        kind, key, _, count, *view = reference[1:]
-        if not isinstance(kind, Name) or type(key) is not str or type(count) is not int:
-            raise TypeError("not a storage")
-        if count < 0:
-            raise ValueError("a storage of negative size")
-        announced = Storage(STORAGES[kind.full], count)
-        storage = self.storages.setdefault(key, announced)
-        same = announced.dtype == storage.dtype or kind.full == UNTYPED
-        if not same or announced.num_bytes != storage.num_bytes:
-            raise TypeError("one storage of two types")
-        if view and view[0] is not None:
-            return self._view(storage, view[0])
-        return storage
-
-    def _view(self, whole: Storage, view: Any) -> Storage:
-        """A part of a storage, as files from before 0.4 have them: (key, offset, count)."""
-        key, offset, count = view
-        if type(key) is not str or type(offset) is not int or type(count) is not int:
-            raise TypeError("not a view")
-        part = self.storages.setdefault(f"view {key}", Storage(whole.dtype, count))
-        self.views[f"view {key}"] = next(k for k, s in self.storages.items() if s is whole), offset
-        return part
-
-    def locate(self, places: dict[str, Tensor]) -> None:
-        """Give every storage its numbers.
-
-        Args:
-            places: key -> (n,) bytes or numbers, as they lie in the file.
-        """
-        for key, storage in self.storages.items():
-            if key not in self.views:
-                storage.data = places[key]
-        for key, (whole, offset) in self.views.items():
-            part, data = self.storages[key], self.storages[whole].data
-            if data is None or offset < 0 or part.count < 0 or offset + part.count > len(data):
-                raise DamagedError("a view reaches outside its storage")
-            part.data = data[offset : offset + part.count]
-
-
-def numbers(buffer: Buffer, start: int, storage: Storage) -> Tensor:
-    """The numbers of a storage at a place in the file.
-
-    Raises:
-        DamagedError: the file ends before.
-    """
-    end = start + storage.num_bytes
-    if end > len(buffer):
-        raise DamagedError("the file ends within a tensor")
-    if storage.count == 0:
-        return torch.empty(0, dtype=storage.dtype)
-    if start % storage.dtype.itemsize or isinstance(buffer, bytes):
-        return torch.frombuffer(bytearray(buffer[start:end]), dtype=storage.dtype)
-    return torch.frombuffer(buffer, dtype=storage.dtype, count=storage.count, offset=start)
+def mapped(path: Path) -> mmap.mmap:
+    """The file as memory that is read where it is touched; writing to it leaves the file alone."""
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
 
 
 def read_zip(path: Path) -> Any:
-    """The value that torch.save wrote into a zip archive, tensors as `Strided`.
+    """The value that torch.save wrote into a zip archive.
 
     Raises:
         RefusedError: another zip archive, a program, another byte order.
         DamagedError: cut short, overwritten.
     """
     buffer = mapped(path)
-    listed = listed_in(path)
+    listed = _listed(path)
     root = next((name[:-8] for name in listed if name.endswith("data.pkl")), None)
     if root is None:
         raise RefusedError(
@@ -121,21 +79,142 @@ def read_zip(path: Path) -> Any:
             "is a TorchScript program, which would have to run; give a file that holds its "
             "state_dict()."
         )
-    entries = verified(buffer, listed)
-    start, end = entries.get(f"{root}byteorder", (0, 0))
+    spans = _verified(buffer, listed)
+    start, end = spans.get(f"{root}byteorder", (0, 0))
     if buffer[start:end] not in (b"", b"little"):
-        raise RefusedError("was written on a big-endian machine, which is not supported.")
-    references = References()
-    start, end = entries[f"{root}data.pkl"]
-    value = unpickle(BytesIO(buffer[start:end]), FULL, references)
-    places = {}
-    for key, storage in references.storages.items():
-        start, end = entries[f"{root}data/{key}"]
-        if end - start < storage.num_bytes:
+        raise RefusedError(BIG_ENDIAN)
+
+    def locate(key: str, dtype: torch.dtype, count: int) -> Tensor:
+        start, end = spans[f"{root}data/{key}"]
+        if end - start < count * dtype.itemsize:
             raise DamagedError("a tensor is longer than its entry")
-        places[key] = numbers(buffer, start, storage)
-    references.locate(places)
-    return value
+        return _numbers(buffer, start, dtype, count)
+
+    start, end = spans[f"{root}data.pkl"]
+    return unpickle(BytesIO(buffer[start:end]), _Storages(locate), NESTED)
+
+
+def _listed(path: Path) -> dict[str, zipfile.ZipInfo]:
+    """The table of contents of a zip archive; nothing of it is verified."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except UNREADABLE as error:
+        raise DamagedError("no table of contents") from error
+    listed = {entry.filename: entry for entry in entries}
+    if len(listed) < len(entries):
+        raise DamagedError("two entries have one name")
+    return listed
+
+
+def _verified(
+    buffer: mmap.mmap, listed: Mapping[str, zipfile.ZipInfo]
+) -> dict[str, tuple[int, int]]:
+    """Where the content of every entry begins and ends, by name; all of it is as it was written.
+
+    Raises:
+        RefusedError: compressed, encrypted, or made to take far more time than it has bytes.
+        DamagedError: digest, checksum or layout are not what was written.
+    """
+    spans = {name: _span(buffer, entry) for name, entry in listed.items()}
+    if sum(end - start for start, end in spans.values()) > len(buffer):
+        raise RefusedError.greedy()
+    # torch writes no checksums where they are disabled (set_crc32_options).
+    if _check_digest(buffer) or not any(entry.CRC for entry in listed.values()):
+        return spans
+    for name, entry in listed.items():
+        with memoryview(buffer) as content, content[slice(*spans[name])] as part:
+            if zlib.crc32(part) != entry.CRC:
+                raise DamagedError("an entry is not what its checksum says")
+    return spans
+
+
+def _span(buffer: mmap.mmap, entry: zipfile.ZipInfo) -> tuple[int, int]:
+    """Where the content of a zip entry lies."""
+    if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & ENCRYPTED:
+        raise RefusedError(
+            "was packed again with compression; unpack it and pack it with torch.save, or store it "
+            "uncompressed."
+        )
+    header = buffer[entry.header_offset : entry.header_offset + LOCAL_HEADER.size]
+    if len(header) < LOCAL_HEADER.size:
+        raise DamagedError("an entry lies outside the file")
+    start = entry.header_offset + LOCAL_HEADER.size + sum(LOCAL_HEADER.unpack(header))
+    if start + entry.file_size > len(buffer):
+        raise DamagedError("an entry reaches outside the file")
+    return start, start + entry.file_size
+
+
+def _check_digest(buffer: mmap.mmap) -> bool:
+    """Whether the file has a digest, which then fits."""
+    for length in (0, COMMENT_LENGTH):
+        start = len(buffer) - END.size - length
+        if start >= 0 and END.unpack(buffer[start : start + END.size]) == (END_MARK, length):
+            break
+    else:
+        raise DamagedError("no end")
+    if not length:
+        return False
+    with memoryview(buffer) as content, content[: -length - 2] as written:
+        digest = hashlib.sha256(written)
+    digest.update(bytes(2))  # the length of the comment, before there was one
+    if buffer[-length:] != COMMENT % digest.hexdigest().encode():
+        raise DamagedError("the content is not what its digest says")
+    return True
+
+
+def _numbers(buffer: Buffer, start: int, dtype: torch.dtype, count: int) -> Tensor:
+    """(count,) numbers at a place in the file."""
+    end = start + count * dtype.itemsize
+    if end > len(buffer):
+        raise DamagedError("the file ends within a tensor")
+    if count == 0:
+        return torch.empty(0, dtype=dtype)
+    if start % ALIGNED or isinstance(buffer, bytes):
+        return torch.frombuffer(bytearray(buffer[start:end]), dtype=dtype)
+    return torch.frombuffer(buffer, dtype=dtype, count=count, offset=start)
+
+
+class _Storages:
+    """Storages that a pickle refers to, by key.
+
+    Args:
+        locate: (key, dtype, count) -> (count,) numbers.
+    """
+
+    def __init__(self, locate: Callable[[str, torch.dtype, int], Tensor]) -> None:
+        self.locate = locate
+        self.found: dict[str, Tensor] = {}
+
+    def __call__(self, reference: Any) -> Tensor:
+        """The storage of ("storage", class, key, device, count[, view of another storage]).
+
+        Raises:
+            RefusedError: a whole module with its source, which torch kept before 1.0.
+        """
+        if reference[0] == "module":
+            raise RefusedError(
+                "holds a whole network with its source code, which would have to run; give a file "
+                "that holds its state_dict()."
+            )
+        word, kind, key, _, count, *view = reference
+        types = type(kind), type(key), type(count)
+        if word != "storage" or types != (Name, str, int) or count < 0:
+            raise TypeError("not a storage")
+        dtype = STORAGES[kind.full]
+        if key not in self.found:
+            self.found[key] = self.locate(key, dtype, count)
+        storage = self.found[key]
+        is_same = storage.dtype == dtype or kind.full == UNTYPED
+        if not is_same or storage.nbytes != count * dtype.itemsize:
+            raise TypeError("one storage of two types")
+        if not view or view[0] is None:
+            return storage
+        # A part of a storage, as files from before 0.4 have them.
+        _, start, length = view[0]
+        if min(start, length) < 0 or start + length > len(storage):
+            raise DamagedError("a view reaches outside its storage")
+        return storage[start : start + length]
 
 
 def read_pickles(buffer: Buffer) -> tuple[Any, str]:
@@ -145,55 +224,53 @@ def read_pickles(buffer: Buffer) -> tuple[Any, str]:
         the value, and the name of the format.
     """
     stream = cast(IO[bytes], buffer) if isinstance(buffer, mmap.mmap) else BytesIO(buffer)
-    first = unpickle(stream, FULL, _no_reference)
+    first = unpickle(stream, extra=NESTED)
     if first != MAGIC or type(first) is not int:
         return first, "pickle"
-    return read_sequence(buffer, stream, nested=False), "torch.save before 1.6"
+    return _sequence(buffer, stream, NESTED), "torch.save before 1.6"
 
 
-def read_sequence(buffer: Buffer, stream: IO[bytes], *, nested: bool) -> Any:
+def _sequence(buffer: Buffer, stream: IO[bytes], extra: Mapping[str, Any]) -> Any:
     """What follows the magic number: protocol, machine, value, keys, numbers."""
-    protocol = unpickle(stream, {}, _no_reference)
-    machine = unpickle(stream, {}, _no_reference)
+    protocol, machine = unpickle(stream), unpickle(stream)
     if protocol != PROTOCOL or not isinstance(machine, dict):
         raise DamagedError("another protocol")
     if machine.get("little_endian") is not True:
-        raise RefusedError("was written on a big-endian machine, which is not supported.")
-    references = References()
-    value = unpickle(stream, BUILDERS if nested else FULL, references)
-    keys = unpickle(stream, {}, _no_reference)
-    places = {}
-    for key in keys if isinstance(keys, list) else ():
-        storage = references.storages[key]
+        raise RefusedError(BIG_ENDIAN)
+    left = len(buffer)
+
+    def reserve(_: str, dtype: torch.dtype, count: int) -> Tensor:
+        """Memory for numbers that are read later, never more than the file holds."""
+        nonlocal left
+        left -= count * dtype.itemsize
+        if left < 0:
+            raise DamagedError("the file ends within a tensor")
+        return torch.empty(count, dtype=dtype)
+
+    storages = _Storages(reserve)
+    value = unpickle(stream, storages, extra)
+    keys = unpickle(stream)
+    if type(keys) is not list or sorted(keys) != sorted(storages.found):
+        raise DamagedError("other storages than the pickle names")
+    for storage in (storages.found[key] for key in keys):
         start = stream.tell() + 8
-        places[key] = numbers(buffer, start, storage)
-        if struct.unpack("<q", buffer[start - 8 : start]) != (storage.count,):
+        if int.from_bytes(buffer[start - 8 : start], "little") != len(storage):
             raise DamagedError("a storage is not as long as announced")
-        stream.seek(start + storage.num_bytes)
-    references.locate(places)
+        storage.copy_(_numbers(buffer, start, storage.dtype, len(storage)))
+        stream.seek(start + storage.nbytes)
     return value
 
 
-def _nested(content: Any) -> Storage:
-    """A storage that lies as a whole file in a pickle: tensors written by plain pickle.
-
-    Raises:
-        TypeError: something else lies there.
-    """
-    if not isinstance(content, bytes):
-        raise TypeError("not a file")
+def _nested(content: Any) -> Tensor:
+    """A storage that lies as a whole file in a pickle: tensors written by plain pickle."""
     stream = BytesIO(content)
-    if unpickle(stream, {}, _no_reference) != MAGIC:
+    if unpickle(stream) != MAGIC:
         raise TypeError("not a file of torch.save")
-    storage = read_sequence(content, stream, nested=True)
-    if not isinstance(storage, Storage):
+    storage = _sequence(content, stream, {})
+    if not isinstance(storage, Tensor):
         raise TypeError("not a storage")
     return storage
 
 
-def _no_reference(_: object) -> None:
-    raise TypeError("refers to something outside")
-
-
-FULL = {**BUILDERS, "torch.storage._load_from_bytes": _nested}
-"""Builders of a whole file; a file inside it has only `BUILDERS`, so that there is one level."""
+NESTED = {"torch.storage._load_from_bytes": _nested}
+"""What a whole file may call besides; a file inside it may not, so that there is one level."""

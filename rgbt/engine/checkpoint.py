@@ -96,7 +96,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     with explained(path, "a checkpoint", advice):
         value, container = read_stored(path)
         payload = plain(value, path.stat().st_size) if container == ZIP else None
-    if not isinstance(payload, dict) or not _is_state_dict(payload.get("model")):
+    weights = payload.get("model") if isinstance(payload, dict) else None
+    if not isinstance(weights, dict) or not all(
+        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
+    ):
         raise InputError(
             f"{path} holds no weights under 'model'; give a checkpoint written by rgbt.run."
         )
@@ -114,13 +117,6 @@ def step_of(payload: Mapping[str, Any], source: Path) -> int:
     if not isinstance(step, int):
         raise InputError(f"{source} does not say its step; give a checkpoint written by rgbt.run.")
     return step
-
-
-def _is_state_dict(value: object) -> bool:
-    """Whether a value is tensors by name."""
-    return isinstance(value, dict) and all(
-        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in value.items()
-    )
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
@@ -158,7 +154,5 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
 
 
 def _some(what: str, keys: list[str]) -> str:
-    shown = ", ".join(keys[:2])
-    return f"{len(keys)} keys {what}" + (
-        f" ({shown}{', ...' if len(keys) > 2 else ''})" if keys else ""
-    )
+    shown = ", ".join(keys[:2] + ["..."] * (len(keys) > 2))
+    return f"{len(keys)} keys {what}" + (f" ({shown})" if keys else "")

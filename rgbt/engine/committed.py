@@ -70,7 +70,6 @@ class Checkpoints:
         if self.last.exists():
             _link(self.last, self.previous)
         save(self.last, payload)
-        _sync(self.folder)
         self._publish(state.best_step)
         kept = {str(self._best_step), str(state.best_step)}
         for folder in self._by_step.glob("*"):
@@ -182,12 +181,3 @@ def _link(source: Path, target: Path) -> None:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _sync(folder: Path) -> None:
-    """Bring the names in a folder to the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

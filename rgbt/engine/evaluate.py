@@ -83,22 +83,18 @@ def label_scores(
         label_hw = batch.label.shape[-2:]
         if scores.shape[-2:] != label_hw:
             scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
-        _check_finite(scores, batch.name)
+        # One fast pass: a sum is not finite if any score is not. Only then is looked at which.
+        if bool(scores.sum().isfinite()):
+            return scores
+        finite = scores.isfinite().flatten(1).all(1).tolist()
+    for name, is_finite in zip(batch.name, finite, strict=True):
+        if not is_finite:
+            raise RunError(
+                f"image '{name}': the network's class scores are NaN or infinite, so that nothing "
+                "can be counted; use a checkpoint of an earlier step or other weights, or train "
+                "again with a lower optimizer.lr."
+            )
     return scores
-
-
-def _check_finite(scores: Tensor, names: Sequence[str]) -> None:
-    # One fast pass: a sum is not finite if any score is not. Only then is looked at which.
-    if bool(scores.sum().isfinite()):
-        return
-    finite = scores.isfinite().flatten(1).all(1).tolist()
-    broken = [name for name, is_finite in zip(names, finite, strict=True) if not is_finite]
-    if broken:
-        raise RunError(
-            f"image '{broken[0]}': the network's class scores are NaN or infinite, so that nothing "
-            "can be counted; use a checkpoint of an earlier step or other weights, or train again "
-            "with a lower optimizer.lr."
-        )
 
 
 def class_scores(

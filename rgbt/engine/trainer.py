@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -186,7 +185,11 @@ class Trainer:
     def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
         """One optimiser step of every phase; what to record of it."""
         started = time.perf_counter()
-        rates = self._set_rates(step)
+        factor = self.schedule(step, self.settings.max_steps, self.steps_per_epoch)
+        rates = {}
+        for name, optimizer in self.optimizers.items():
+            for index, group in enumerate(optimizer.param_groups):
+                group["lr"] = rates[f"lr/{name}_{index}"] = group["base_lr"] * factor
         micro = [next(batches) for _ in range(self.settings.accumulate)]
         waited = time.perf_counter() - started
         device = self.fabric.device
@@ -197,18 +200,23 @@ class Trainer:
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
-        with _naming(step):
+        try:
             for phase in parts[0]:
                 # A phase of all batches ends before the next one of any begins: that one may
                 # read, or clear, what this one stepped.
                 _add(values, self._run_phase(phase, parts[1:]))
+        except RunError as error:
+            raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
         elapsed = time.perf_counter() - started
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+        if device.type == "cuda":
+            peak = torch.cuda.max_memory_allocated(device) / 2**20
         return {
             **values,
             **rates,
             "images_per_s": sum(len(batch.name) for batch in micro) / elapsed,
             WAIT_SHARE: waited / elapsed,
-            "peak_memory_mib": _peak_memory_mib(device),
+            "peak_memory_mib": peak,
         }
 
     def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
@@ -220,9 +228,10 @@ class Trainer:
         for phases in others:
             _add(logged, self._backward(next(phases)))
         stepped = [self.optimizers[name] for name in phase.optimizers]
+        groups = [group["params"] for optimizer in stepped for group in optimizer.param_groups]
         # Once for all of them: what two optimisers share is clipped as one gradient.
-        limit = self.settings.clip_norm or math.inf
-        norm = nn.utils.clip_grad_norm_(_parameters(stepped), limit)
+        parameters = list({id(each): each for group in groups for each in group}.values())
+        norm = nn.utils.clip_grad_norm_(parameters, self.settings.clip_norm or math.inf)
         names = "+".join(phase.optimizers)
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
         logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
@@ -238,21 +247,6 @@ class Trainer:
         logged = {f"loss/{name}": value * share for name, value in values.items()}
         logged["loss"] = sum(values.values()) * share
         return logged
-
-    def _set_rates(self, step: int) -> dict[str, float]:
-        factor = self.schedule(step, self.settings.max_steps, self.steps_per_epoch)
-        rates = {}
-        for name, optimizer in self.optimizers.items():
-            for index, group in enumerate(optimizer.param_groups):
-                group["lr"] = group["base_lr"] * factor
-                rates[f"lr/{name}_{index}"] = group["lr"]
-        return rates
-
-
-def _parameters(optimizers: Sequence[torch.optim.Optimizer]) -> list[nn.Parameter]:
-    """Parameters of all optimisers, each once."""
-    groups = (group["params"] for optimizer in optimizers for group in optimizer.param_groups)
-    return list({id(each): each for group in groups for each in group}.values())
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
@@ -282,14 +276,6 @@ def torch_generator_of(
     return torch_generator(seed, purpose, index, device=device)
 
 
-@contextmanager
-def _naming(step: int) -> Iterator[None]:
-    try:
-        yield
-    except RunError as error:
-        raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
-
-
 def _add(values: dict[str, float], more: dict[str, float]) -> None:
     for name, value in more.items():
         values[name] = values.get(name, 0.0) + value
@@ -303,9 +289,3 @@ def _finite_values(parts: dict[str, Tensor]) -> dict[str, float]:
         if not math.isfinite(value):
             raise RunError(f"{name} is {value}.")
     return values
-
-
-def _peak_memory_mib(device: torch.device) -> float:
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10

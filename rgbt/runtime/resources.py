@@ -56,7 +56,12 @@ def _sentence(error: BaseException) -> str | None:
         if isinstance(cause, OSError) and cause.errno in DISK:
             return _disk_sentence(error, cause)
         if _is_memory(cause):
-            return _memory_sentence(cause)
+            device = "the GPU" if "CUDA" in str(cause) else "this machine"
+            reason = one_line(str(cause).partition("\n")[0]) or type(cause).__name__
+            return (
+                f"the memory of {device} is exhausted ({reason}); lower scale.batch_size, "
+                f"scale.eval_batch_size, scale.crop_hw or data.num_workers; {RESUME}."
+            )
         hidden = cause.__suppress_context__  # raised "from None": the sentence says it all
         cause = cause.__cause__ or (None if hidden else cause.__context__)
     return None
@@ -64,19 +69,17 @@ def _sentence(error: BaseException) -> str | None:
 
 def _disk_sentence(error: BaseException, cause: OSError) -> str:
     file = cause.filename
-    path = _existing(Path(file)) if isinstance(file, str) else _fullest()
+    if isinstance(file, str):
+        path = _existing(Path(file))
+    else:  # of the folders that the command may write to, the one with least space left
+        named = [word.partition("=")[2] for word in sys.argv[1:] if "=" in word]
+        places = [Path(), Path(tempfile.gettempdir()), *(Path(each).expanduser() for each in named)]
+        path = min(map(_existing, places), key=_free).resolve()
     free = f"{_free(path) / 1e6:.1f} MB free, after the unfinished file was removed"
     left = f"the disk of {path} {DISK[cause.errno or 0]} ({free})"
     if isinstance(error, InputError):  # says itself what cannot be written, and what to set
         return f"{str(error).rstrip('.')}; {left}."
     return f"{left}; free some space, or name a folder on another disk; {RESUME}."
-
-
-def _fullest() -> Path:
-    """Of the folders that the command may write to, the one whose disk has least space left."""
-    named = [word.partition("=")[2] for word in sys.argv[1:] if "=" in word]
-    folders = [Path(), Path(tempfile.gettempdir()), *(Path(name).expanduser() for name in named)]
-    return min(map(_existing, folders), key=_free).resolve()
 
 
 def _existing(path: Path) -> Path:
@@ -101,12 +104,3 @@ def _is_memory(error: BaseException) -> bool:
         return error.errno == errno.ENOMEM
     is_of_library = isinstance(error, RuntimeError) or type(error).__module__.startswith("cv2")
     return is_of_library and MEMORY.search(str(error)) is not None
-
-
-def _memory_sentence(error: BaseException) -> str:
-    device = "the GPU" if "CUDA" in str(error) else "this machine"
-    reason = one_line(str(error).partition("\n")[0]) or type(error).__name__
-    return (
-        f"the memory of {device} is exhausted ({reason}); lower scale.batch_size, "
-        f"scale.eval_batch_size, scale.crop_hw or data.num_workers; {RESUME}."
-    )

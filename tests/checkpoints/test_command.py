@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,18 +12,8 @@ import yaml
 from rgbt.weights import entry
 from tests.checkpoints.files import like, network, saved
 from tests.checkpoints.imagenet import resnet_file
+from tests.commands import Call
 from tests.models.golden import SHARED
-
-Captured = pytest.CaptureFixture[str]
-
-
-def called(monkeypatch: pytest.MonkeyPatch, capsys: Captured, *words: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr."""
-    monkeypatch.setattr(sys, "argv", ["rgbt.weights", *words])
-    with pytest.raises(SystemExit) as left:
-        entry()
-    out, err = capsys.readouterr()
-    return int(left.value.code or 0), out, err
 
 
 @pytest.fixture
@@ -46,11 +35,11 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def test_inspect_a_released_file(monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
+def test_inspect_a_released_file(call: Call) -> None:
     path = SHARED / "realdata/mfnet_weights/final.pth"
     if not path.exists():
         pytest.skip("reference material is not here")
-    code, out, err = called(monkeypatch, capsys, "inspect", str(path))
+    code, out, err = call(entry, "inspect", str(path))
     assert (code, err) == (0, "")
     lines = {line.split("  ")[0]: line for line in out.splitlines() if line[:1].isalpha()}
     assert lines["what"].endswith("MFNet checkpoint (9 classes)")
@@ -64,11 +53,9 @@ def test_inspect_a_released_file(monkeypatch: pytest.MonkeyPatch, capsys: Captur
     assert any(row[:4] == ["begin", "at", "0", "38"] for row in rows)
 
 
-def test_inspect_a_backbone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_inspect_a_backbone(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, resnet_file(18))
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(path))
+    code, out, _ = call(entry, "inspect", str(path))
     assert code == 0
     assert "ImageNet ResNet (ResNet-18)" in out
     assert "into model=rtfnet_18" in out
@@ -77,81 +64,69 @@ def test_inspect_a_backbone(
     assert "stay fresh" in out
 
 
-def test_inspect_for_a_network_that_does_not_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_inspect_for_a_network_that_does_not_fit(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, resnet_file(18))
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(path), "model=rtfnet_tiny")
+    code, out, _ = call(entry, "inspect", str(path), "model=rtfnet_tiny")
     assert code == 1
     assert "DIFFERENT" in out
-    code, _, err = called(monkeypatch, capsys, "inspect", str(path), "model=mfnet_tiny")
+    code, _, err = call(entry, "inspect", str(path), "model=mfnet_tiny")
     assert code == 2
     assert "is no file for MFNet" in err
 
 
-def test_inspect_a_part_that_is_named_fresh(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_inspect_a_part_that_is_named_fresh(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, like(network("mfnet_tiny", 9).state_dict()))
     words = ("model=mfnet_tiny", "model.num_classes=5")
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(path), *words)
+    code, out, _ = call(entry, "inspect", str(path), *words)
     assert (code, "DIFFERENT" in out) == (1, True)
     fresh = "model.fresh=[decode1]"
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(path), *words, fresh)
+    code, out, _ = call(entry, "inspect", str(path), *words, fresh)
     assert code == 0
     assert "named in model.fresh" in out
 
 
-def test_inspect_an_unknown_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_inspect_an_unknown_file(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, {"layer.weight": torch.zeros(2, 3), "[bold]\x1b[2J": torch.zeros(1)})
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(path))
+    code, out, _ = call(entry, "inspect", str(path))
     assert code == 0
     assert "in no layout known here" in out
     assert "layer.weight, [bold]\\x1b[2J" in out
 
 
-def test_inspect_the_checkpoint_of_a_run(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
-    code, out, _ = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
+def test_inspect_the_checkpoint_of_a_run(run: Path, call: Call) -> None:
+    code, out, _ = call(entry, "inspect", str(run / "best.pt"))
     assert code == 0
     assert "checkpoint of a run, MFNet (9 classes)" in out
     assert f"into {run / 'config.yaml'}" in out
 
 
-def test_a_configuration_beside_a_file_runs_nothing(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_a_configuration_beside_a_file_runs_nothing(run: Path, call: Call) -> None:
     marker = run / "marker"
     evil = {"_target_": "os.system", "command": f"touch {marker}"}
     imported = {**evil, "_target_": "rgbt.models.inputs.torch.os.system"}
     part = {"_target_": "rgbt.models.mfnet.MFNet"}
     for model in (evil, imported, {**part, "inputs": evil}, {**part, "inputs": imported}, 3):
         (run / "config.yaml").write_text(json.dumps({"model": model}))
-        code, out, err = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
+        code, out, err = call(entry, "inspect", str(run / "best.pt"))
         assert code == 2
         assert "checkpoint of a run, MFNet" in out
         assert "'model" in err
         assert not marker.exists()
 
 
-def test_export_and_inspect(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_export_and_inspect(run: Path, tmp_path: Path, call: Call) -> None:
     for layout, name in (("safetensors", "a.safetensors"), ("released", "final.pth")):
         words = (f"run={run.name}", f"runs_dir={run.parent}", f"format={layout}")
         out_file = tmp_path / name
-        code, out, _ = called(monkeypatch, capsys, "export", *words, f"out={out_file}")
+        code, out, _ = call(entry, "export", *words, f"out={out_file}")
         assert (code, out) == (0, f"{out_file}\n")
-        code, _, err = called(monkeypatch, capsys, "export", *words, f"out={out_file}")
+        code, _, err = call(entry, "export", *words, f"out={out_file}")
         assert code == 2
         assert "exists already" in err
-        code, out, _ = called(monkeypatch, capsys, "inspect", str(out_file), "model=mfnet_tiny")
+        code, out, _ = call(entry, "inspect", str(out_file), "model=mfnet_tiny")
         assert code == 0
         assert "MFNet" in out
-    out = called(monkeypatch, capsys, "inspect", str(tmp_path / "a.safetensors"))[1]
+    out = call(entry, "inspect", str(tmp_path / "a.safetensors"))[1]
     lines = dict(line.rsplit("  ", 1) for line in out.splitlines() if line.startswith("note "))
     said = {name.strip(): value for name, value in lines.items()}
     assert said["note step"] == "240"
@@ -172,46 +147,30 @@ def test_export_and_inspect(
         (("export", "run=x", "format=released", "out=y", "checkpoint=first"), "checkpoint"),
     ],
 )
-def test_usage_errors(
-    words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
-    code, out, err = called(monkeypatch, capsys, *words)
+def test_usage_errors(words: tuple[str, ...], said: str, call: Call) -> None:
+    code, out, err = call(entry, *words)
     assert (code, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
 
 
-def test_help(monkeypatch: pytest.MonkeyPatch, capsys: Captured) -> None:
-    said = {
-        ("--help",): "rgbt weights inspect FILE",
-        ("inspect", "--help"): "file   of weights",
-        ("export", "--help"): "released_temporal (CMX",
-    }
-    for words, sentence in said.items():
-        code, out, _ = called(monkeypatch, capsys, *words)
-        assert code == 0
-        assert sentence in out
-
-
-def test_a_broken_configuration_beside_a_file_is_named(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
-) -> None:
+def test_a_broken_configuration_beside_a_file_is_named(run: Path, call: Call) -> None:
     for text in ("[1, 2]", "model: [", "model: {a: '${b}'}"):
         (run / "config.yaml").write_text(text)
-        code, _, err = called(monkeypatch, capsys, "inspect", str(run / "best.pt"))
+        code, _, err = call(entry, "inspect", str(run / "best.pt"))
         assert code == 2
         assert f"rgbt: {run / 'config.yaml'}" in err
 
 
 def test_an_export_that_the_authors_code_feeds_otherwise_is_said(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+    run: Path, tmp_path: Path, call: Call
 ) -> None:
     words = (f"run={run}", "format=released")
-    _, _, err = called(monkeypatch, capsys, "export", *words, f"out={tmp_path / 'a.pth'}")
+    _, _, err = call(entry, "export", *words, f"out={tmp_path / 'a.pth'}")
     assert "authors' code" not in err
     stored = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(
         stored.replace("final_activation: true", "final_activation: false")
     )
-    _, _, err = called(monkeypatch, capsys, "export", *words, f"out={tmp_path / 'b.pth'}")
+    _, _, err = call(entry, "export", *words, f"out={tmp_path / 'b.pth'}")
     assert "authors' code does model.final_activation=true, this run did something else" in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checkpoints.layout import family_of
-from rgbt.checkpoints.layouts.mask2former import position_index
 from rgbt.checkpoints.load import load_weights
+from rgbt.checkpoints.networks import position_index
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.release import save
 from rgbt.checks import InputError
@@ -202,8 +203,8 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
 def test_a_file_that_could_not_be_written_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        (tmp_path / ".file.partial").write_bytes(b"half")
+    def full(_: object, file: IO[bytes]) -> None:
+        file.write(b"half")
         raise OSError("disk full")
 
     monkeypatch.setattr(torch, "save", full)

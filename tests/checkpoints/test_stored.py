@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
+import struct
 import zipfile
 from copy import copy
 from io import BytesIO
@@ -18,7 +20,8 @@ from rgbt.checkpoints.read import read
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, training_payload
 from rgbt.engine.committed import Checkpoints
-from tests.checkpoints.damaging import damaged
+from tests.checkpoints.test_read import Calls
+from tests.damage import damaged
 
 
 def payload() -> dict[str, Any]:
@@ -63,11 +66,68 @@ def test_what_is_saved_is_loaded_by_us_and_by_torch(tmp_path: Path) -> None:
     assert read(tmp_path / "copy.pt").tensors.keys() == content["model"].keys()
 
 
-@pytest.mark.parametrize("count", [108, pytest.param(1000, marks=pytest.mark.slow)])
+def headers(draw: random.Random, content: bytes) -> bytes:
+    """A byte of a local header, of the table of contents or of the end."""
+    changed = bytearray(content)
+    marks = [b"PK\x03\x04", b"PK\x01\x02", b"PK\x05\x06"]
+    mark = draw.choice(marks)
+    places = [n for n in range(len(content)) if content.startswith(mark, n)]
+    changed[(draw.choice(places) + draw.randrange(46)) % len(changed)] = draw.randrange(256)
+    return bytes(changed)
+
+
+def swapped(draw: random.Random, content: bytes) -> bytes:
+    """Two entries of one length that have changed their names, checksums and all."""
+    changed = bytearray(content)
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        entries = [entry for entry in archive.infolist() if "/data/" in entry.filename]
+    one = draw.choice(entries)
+    like = [
+        e for e in entries if (e.file_size, len(e.filename)) == (one.file_size, len(one.filename))
+    ]
+    other = draw.choice([entry for entry in like if entry is not one] or [one])
+    table = content.index(b"PK\x01\x02")
+    for entry, name in ((one, other.filename), (other, one.filename)):
+        listed = content.index(entry.filename.encode(), table)
+        changed[listed : listed + len(name)] = name.encode()
+    return bytes(changed)
+
+
+def repacked(draw: random.Random, content: bytes) -> bytes:
+    """Written anew by zipfile with two entries' contents swapped: every checksum fits."""
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+        comment = archive.comment
+    names = [name for name in entries if "/data/" in name]
+    one = draw.choice(names)
+    like = [name for name in names if len(entries[name]) == len(entries[one]) and name != one]
+    other = draw.choice(like or [one])
+    entries[one], entries[other] = entries[other], entries[one]
+    made = BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, value in entries.items():
+            archive.writestr(name, value)
+        archive.comment = comment
+    return made.getvalue()
+
+
+def commented(draw: random.Random, content: bytes) -> bytes:
+    """Another length of the comment at the end."""
+    place = content.rindex(b"PK\x05\x06") + 20
+    length = draw.choice((0, 1, 75, 77, 65535, draw.randrange(65536)))
+    return content[:place] + struct.pack("<H", length) + content[place + 2 :]
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(80, marks=pytest.mark.slow)])
 def test_a_damaged_file_is_refused_in_one_sentence(tmp_path: Path, count: int) -> None:
-    path = tmp_path / "last.pt"
+    path, draw = tmp_path / "last.pt", random.Random(17)
     stored.save(path, payload())
-    for kind, content in damaged(path.read_bytes(), count):
+    whole = path.read_bytes()
+    kinds = (headers, swapped, repacked, commented)
+    variants = [(kind.__name__, kind(draw, whole)) for kind in kinds for _ in range(count)]
+    for kind, content in [*damaged(whole, 9 * count), *variants]:
+        if content == whole:
+            continue
         path.write_bytes(content)
         with pytest.raises(InputError) as refused:
             pytest.fail(f"{kind}: {load_checkpoint(path)}")
@@ -89,14 +149,6 @@ def test_an_old_file_is_held_against_its_checksums(tmp_path: Path) -> None:
             load_checkpoint(path)
         with pytest.raises(InputError, match="cut short, damaged"):
             read(path)
-
-
-class Calls:
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 @pytest.mark.parametrize("name", ["last.pt", "best.pt"])

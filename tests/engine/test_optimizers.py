@@ -8,11 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.config.component import build
 from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
-from rgbt.models.critic import Critic
 from rgbt.requirements import Record
-from tests.models.golden import compose, network
 
 ADAMW: dict[str, Any] = {
     "lr": 0.1,
@@ -86,14 +83,6 @@ def test_heads_learn_ten_times_as_fast_as_the_backbone_that_they_share() -> None
         assert names_in(model, optimizer) == [linear("backbone"), linear(f"heads.{head}")]
 
 
-def test_two_heads_of_the_network_itself() -> None:
-    model = network("deeplabv2_tiny", 14, heads="[source,target]")
-    names = {name for name, _ in model.named_parameters()}
-    optimizer = BUILDERS[1](model, without=("heads.source.",))
-    found = set().union(*names_in(model, optimizer))
-    assert names - found == {name for name in names if name.startswith("heads.source.")}
-
-
 def test_frozen_and_shared_parameters_come_never_and_once() -> None:
     model = TwoHeads()
     model.heads["target"].weight = model.heads["source"].weight
@@ -138,17 +127,30 @@ def test_adam_steps_as_written() -> None:
         assert weight.item() == pytest.approx(value, rel=1e-5)
 
 
-def test_a_critic_has_one_group() -> None:
-    critic = Critic(in_channels=3, base_width=2, upsample=False, align_corners=False)
-    for builder in BUILDERS[2:]:
-        optimizer = builder(critic)
-        assert names_in(critic, optimizer) == [{name for name, _ in critic.named_parameters()}]
+@pytest.mark.parametrize("decay_biases", [True, False])
+def test_adamw_decays_weights_and_neither_norms_nor_embeddings(
+    decay_biases: bool,
+) -> None:
+    model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
+    model["query"] = nn.Embedding(3, 2)
+    model.record = Record(pretrained_parts=("backbone.",))
+    settings = {"lr": 1.0, "backbone_multiplier": 0.1, "weight_decay": 0.5}
+    groups = AdamW(**{**ADAMW, **settings, "decay_biases": decay_biases})(model).param_groups
+    found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}
+    bias = {} if decay_biases else {(0.1, 0.0): 2}
+    assert found == {(0.1, 0.5): 6 - sum(bias.values()), (1.0, 0.0): 4 + 6, **bias}
 
 
-def test_configurations_hold_the_published_numbers() -> None:
-    rates = ("scale.lr=2.5e-3", "scale.backbone_multiplier=0.1")
-    sgd = build(compose("optimizer=sgd_thesis", *rates).optimizer)
-    assert sgd == SGD(lr=2.5e-3, backbone_multiplier=0.1, momentum=0.9, weight_decay=5e-4)
-    node = compose("optimizer=rmsprop_heatnet", "scale.lr=1e-4").optimizer
-    defaults = torch.optim.RMSprop(nn.Linear(1, 1).parameters()).defaults
-    assert build(node) == RMSprop(lr=1e-4, alpha=defaults["alpha"], eps=defaults["eps"])
+def test_sgd_steps_as_written_and_decays_everything() -> None:
+    model = nn.ModuleDict({"backbone": nn.Linear(1, 1), "norm": nn.BatchNorm1d(1)})
+    model.record = Record(pretrained_parts=("backbone.",))
+    for parameter in model.parameters():
+        nn.init.constant_(parameter, 2.0)
+        parameter.grad = torch.ones_like(parameter)
+    optimizer = SGD(lr=0.1, backbone_multiplier=0.5, momentum=0.9, weight_decay=0.25)(model)
+    optimizer.step()
+    # 2 - lr (1 + 0.25 * 2): 0.05 for the backbone, 0.1 for the rest.
+    for parameter in model["backbone"].parameters():
+        assert parameter.item() == pytest.approx(2 - 0.05 * 1.5)
+    assert model["norm"].weight.item() == pytest.approx(2 - 0.1 * 1.5)
+    assert sorted(g["base_lr"] for g in optimizer.param_groups) == [0.05, 0.1]

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.config.component import build
-from rgbt.engine.schedules import LatePoly, Poly, Steps, ThesisPoly
-from tests.models.golden import compose
+from rgbt.engine.schedules import Exponential, LatePoly, Poly, Steps, ThesisPoly
 
 LR = 6e-5
 STEPS = 200 * 1568  # temporal release
@@ -92,26 +90,6 @@ def test_fewer_counted_steps_than_an_epoch_has_are_refused() -> None:
         temporal(counted_steps=1567)
 
 
-def test_configurations_hold_the_released_numbers() -> None:
-    node = compose("schedule=poly_temporal_released").schedule
-    assert (node.power, node.epochs, node.epoch_steps) == (0.9, 200, 2 * 784)
-    assert node.counted_steps == 1873 // 1 + 1
-    node = compose("schedule=poly_cmx_released").schedule
-    assert (node.power, node.epochs) == (0.9, 500)
-    assert node.epoch_steps == node.counted_steps == 784 // 8 + 1
-
-
-def test_the_recipe_of_cmx_as_released() -> None:
-    config = compose("+experiment=cmx_released", "scale=paper", "dataset.root=unused")
-    adamw = config.optimizer
-    assert (adamw.lr, adamw.weight_decay, adamw.decay_biases) == (6e-5, 0.01, False)
-    assert (adamw.backbone_multiplier, config.trainer.clip_norm) == (1.0, None)
-    assert (config.data.batch_size, config.trainer.max_steps) == (8, 500 * 99)
-    assert config.schedule.warmup_steps == 10 * 99
-    assert (config.model.decoder_norm_eps, config.model.decoder_norm_eps_eval) == (1e-3, 1e-5)
-    assert config.model.inputs.rgb_order == "bgr"
-
-
 def test_thesis_poly_counts_from_one_and_ends_at_zero() -> None:
     """Rates of the thesis at a quarter, half, three quarters and nine tenths of the run."""
     schedule = ThesisPoly(power=0.9)
@@ -151,6 +129,17 @@ def test_shares_are_counted_as_they_are_written(every: float, steps: int) -> Non
         assert schedule(step, steps, 1) == 0.5 ** (100 * step // (hundredths * steps))
 
 
-def test_configurations_of_domain_adaptation() -> None:
-    assert build(compose("schedule=steps_heatnet").schedule) == Steps(factor=0.5, every=60 / 200)
-    assert build(compose("schedule=poly_thesis").schedule) == ThesisPoly(power=0.9)
+def test_poly_values() -> None:
+    iteration = Poly(power=1.0, per="iteration", warmup_steps=0)
+    assert [iteration(s, 4, 2) for s in range(4)] == [1.0, 0.75, 0.5, 0.25]
+    # As released: 312 epochs of 112 iterations against a total of 35000 iterations.
+    released = Poly(power=0.9, per="epoch", warmup_steps=0)
+    assert released(34999, 35000, 112) == pytest.approx(0.992, abs=5e-4)
+    warm = Poly(power=0.9, per="iteration", warmup_steps=4)
+    assert [warm(step, 10**9, 1) for step in (0, 3)] == pytest.approx([0.25, 1.0])
+
+
+def test_exponential_falls_by_the_epoch() -> None:
+    own, longer = (Exponential(factor=0.5, epoch_steps=steps) for steps in (None, 6))
+    assert [own(step, 100, 3) for step in range(7)] == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
+    assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]

@@ -14,12 +14,12 @@ from rgbt.checkpoints.stored import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.optimizers import SGD, Adam, AdamW
-from rgbt.engine.schedules import Exponential, Poly
+from rgbt.engine.schedules import Poly
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
-from rgbt.requirements import Record
 from rgbt.types import Batch, GeneratorOf, Phase
+from tests.checkpoints.test_stored import same
 
 SETTINGS = {
     "max_steps": 6,
@@ -149,25 +149,6 @@ def halves() -> Iterator[Batch]:
             )
 
 
-def test_accumulated_halves_equal_the_whole_batch(tmp_path: Path) -> None:
-    whole, _ = make(tmp_path / "whole", max_steps=1)
-    split, _ = make(tmp_path / "split", max_steps=1, accumulate=2)
-    for trainer, source in ((whole, batches(0)), (split, halves())):
-        trainer.scheme.phases = quiet(trainer.model)
-        trainer.fit(source, State(seed=0))
-    for a, b in zip(whole.model.parameters(), split.model.parameters(), strict=True):
-        torch.testing.assert_close(a, b)
-
-
-def quiet(model: nn.Module):
-    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        guess = model(batch.rgb.mean((2, 3)))
-        target = batch.rgb.mean((1, 2, 3))[:, None]
-        yield Phase(("main",), {"fit": (guess - target).square().mean()})
-
-    return phases
-
-
 def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path, poison=3)
     before = [p.clone() for p in trainer.model.parameters()]
@@ -175,75 +156,6 @@ def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tmp_path: Path) -
         trainer.fit(batches(0), State(seed=0))
     assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
     assert any(not torch.equal(a, b) for a, b in zip(before, trainer.model.parameters()))
-
-
-def test_schedule_values() -> None:
-    iteration = Poly(power=1.0, per="iteration", warmup_steps=0)
-    assert [iteration(s, 4, 2) for s in range(4)] == [1.0, 0.75, 0.5, 0.25]
-    # As released: 312 epochs of 112 iterations against a total of 35000 iterations.
-    released = Poly(power=0.9, per="epoch", warmup_steps=0)
-    assert released(34999, 35000, 112) == pytest.approx(0.992, abs=5e-4)
-    warm = Poly(power=0.9, per="iteration", warmup_steps=4)
-    assert warm(0, 10**9, 1) == pytest.approx(0.25)
-    assert warm(3, 10**9, 1) == pytest.approx(1.0)
-    # Temporal release: 6e-5 at the end of the warm-up, then 5.72931e-5 at step 18740 of 374800.
-    temporal = Poly(power=0.9, per="iteration", warmup_steps=18740)
-    assert 6e-5 * temporal(18739, 374800, 1) == pytest.approx(6e-5)
-    assert 6e-5 * temporal(18740, 374800, 1) == pytest.approx(5.72931e-5, rel=1e-5)
-
-
-def test_parameter_groups_decay_weights_and_biases_but_not_norms_and_embeddings() -> None:
-    model = nn.ModuleDict({"backbone": nn.Linear(2, 2), "norm": nn.LayerNorm(2)})
-    model["query"] = nn.Embedding(3, 2)
-    model.record = Record(pretrained_parts=("backbone.",))
-    builder = AdamW(
-        lr=1.0,
-        backbone_multiplier=0.1,
-        weight_decay=0.5,
-        decay_biases=True,
-        betas=(0.9, 0.999),
-        eps=1e-8,
-    )
-    groups = builder(model).param_groups
-    found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}
-    assert found == {(0.1, 0.5): 6, (1.0, 0.0): 4 + 6}
-
-
-def test_biases_are_left_undecayed_where_asked() -> None:
-    builder = AdamW(
-        lr=1.0,
-        backbone_multiplier=1.0,
-        weight_decay=0.5,
-        decay_biases=False,
-        betas=(0.9, 0.999),
-        eps=1e-8,
-    )
-    groups = builder(nn.Linear(3, 2)).param_groups
-    assert {g["weight_decay"]: [p.shape for p in g["params"]] for g in groups} == {
-        0.5: [(2, 3)],
-        0.0: [(2,)],
-    }
-
-
-def test_sgd_steps_as_written_and_decays_everything() -> None:
-    model = nn.ModuleDict({"backbone": nn.Linear(1, 1), "norm": nn.BatchNorm1d(1)})
-    model.record = Record(pretrained_parts=("backbone.",))
-    for parameter in model.parameters():
-        nn.init.constant_(parameter, 2.0)
-        parameter.grad = torch.ones_like(parameter)
-    optimizer = SGD(lr=0.1, backbone_multiplier=0.5, momentum=0.9, weight_decay=0.25)(model)
-    optimizer.step()
-    # 2 - lr (1 + 0.25 * 2): 0.05 for the backbone, 0.1 for the rest.
-    assert model["backbone"].weight.item() == pytest.approx(2 - 0.05 * 1.5)
-    assert model["backbone"].bias.item() == pytest.approx(2 - 0.05 * 1.5)
-    assert model["norm"].weight.item() == pytest.approx(2 - 0.1 * 1.5)
-    assert sorted(g["base_lr"] for g in optimizer.param_groups) == [0.05, 0.1]
-
-
-def test_exponential_falls_by_the_epoch() -> None:
-    own, longer = (Exponential(factor=0.5, epoch_steps=steps) for steps in (None, 6))
-    assert [own(step, 100, 3) for step in range(7)] == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
-    assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]
 
 
 @pytest.mark.parametrize(("poisoned", "value"), [(2, "nan"), (3, "inf")])
@@ -275,15 +187,6 @@ def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) ->
         restore_weights(nn.Linear(2, 4), weights, path)
     with pytest.raises(InputError, match=r"1 keys unexpected \(bias\)"):
         restore_weights(nn.Linear(2, 3, bias=False), weights, path)
-
-
-def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.pt"
-    broken.write_bytes(b"not a checkpoint")
-    with pytest.raises(InputError, match="is no file of weights"):
-        load_checkpoint(broken)
-    with pytest.raises(InputError, match="no such checkpoint"):
-        load_checkpoint(tmp_path / "missing.pt")
 
 
 class Alternating:
@@ -329,7 +232,7 @@ def test_others_are_resumed_with_their_statistics_and_moments(tmp_path: Path) ->
     second.fit(batches(4), state)
     ends = [load_checkpoint(tmp_path / where / "last.pt") for where in ("a", "b")]
     for part in ("model", "others", "optimizers"):
-        assert_equal(ends[0][part], ends[1][part])
+        assert same(ends[0][part], ends[1][part])
     assert set(ends[0]["others"]) == {"judge"}
     assert "1.running_mean" in ends[0]["others"]["judge"]
     assert [v["loss"] for _, v in straight.log[4:]] == [v["loss"] for _, v in second.log]
@@ -339,21 +242,6 @@ def test_others_are_resumed_with_their_statistics_and_moments(tmp_path: Path) ->
     assert straight.log[0][1]["loss"] == pytest.approx(
         straight.log[0][1]["loss/fit"] + straight.log[0][1]["loss/judge"]
     )
-
-
-def assert_equal(one: object, other: object) -> None:
-    if isinstance(one, torch.Tensor):
-        assert torch.equal(one, other)
-    elif isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for key in one:
-            assert_equal(one[key], other[key])
-    elif isinstance(one, list):
-        assert len(one) == len(other)
-        for a, b in zip(one, other, strict=True):
-            assert_equal(a, b)
-    else:
-        assert one == other
 
 
 def test_a_checkpoint_keeps_no_critic_from_before_there_was_one(tmp_path: Path) -> None:
@@ -469,70 +357,54 @@ def test_every_accumulated_batch_has_draws_of_its_own(tmp_path: Path) -> None:
 
 
 class Heads(nn.Module):
-    """Parameters with the gradients 3 (shared), 4 and 4, whatever is seen."""
+    """Parameters at 0, the first of which two optimisers may share."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shared, self.one, self.other = (nn.Parameter(torch.zeros(1)) for _ in range(3))
 
-    def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        del batch, generator_of
-        yield Phase(self.named, {"fit": (3 * self.shared + 4 * self.one + 4 * self.other).sum()})
+
+AT_ONCE = (("a", "b"), (3, 4, 4))
+IN_TURN = ((("a",), (3, 4, 4)), (("b",), (12, 0, 5)))
+ROOT = 41**0.5
 
 
-def make_heads(folder: Path, named: tuple[str, ...], **changes: object) -> tuple[Heads, list]:
-    trainer, log = make(folder, max_steps=1, **changes)
-    model = Heads()
-    model.named = named
-    parts = {"a": [model.shared, model.one], "b": [model.shared, model.other]}
-    if len(named) == 1:
-        parts = {"main": list(model.parameters())}
-    trainer.model, trainer.scheme = model, model
-    groups = {name: [{"params": part, "base_lr": 1.0}] for name, part in parts.items()}
-    trainer.optimizers = {name: torch.optim.SGD(each, lr=1.0) for name, each in groups.items()}
-    trainer.fit(batches(0), State(seed=0))
-    return model, log
-
-
-@pytest.mark.parametrize(("limit", "factor"), [(1.0, 1 / 41**0.5), (None, 1.0), (7.0, 1.0)])
-def test_what_two_optimisers_step_is_clipped_once(
-    tmp_path: Path, limit: float | None, factor: float
+@pytest.mark.parametrize(
+    ("phases", "limit", "ends", "norms"),
+    [
+        # The norm of 3, 4 and 4 is the root of 41; the shared parameter is stepped twice with it.
+        ((AT_ONCE,), 1.0, (-6 / ROOT, -4 / ROOT, -4 / ROOT), {"/a+b": ROOT}),
+        ((AT_ONCE,), None, (-6, -4, -4), {"/a+b": ROOT}),
+        ((AT_ONCE,), 7.0, (-6, -4, -4), {"/a+b": ROOT}),
+        # 3 and 4 of 5; then 12 and 5 of 13, what "a" left of the other head being cleared.
+        (IN_TURN, 1.0, (-3 / 5 - 12 / 13, -4 / 5, -5 / 13), {"/a": 5, "/b": 13}),
+        # The only optimiser clips all it has.
+        (((("all",), (3, 4, 4)),), 1.0, (-3 / ROOT, -4 / ROOT, -4 / ROOT), {"": ROOT}),
+    ],
+)
+def test_gradients_are_clipped_once_per_phase(
+    tmp_path: Path,
+    phases: tuple[tuple[tuple[str, ...], tuple[int, ...]], ...],
+    limit: float | None,
+    ends: tuple[float, ...],
+    norms: dict[str, float],
 ) -> None:
-    """The norm of 3, 4 and 4 is the root of 41; the shared parameter is stepped twice with it."""
-    model, log = make_heads(tmp_path, ("a", "b"), clip_norm=limit)
-    assert model.shared.item() == pytest.approx(-2 * 3 * factor, rel=1e-5)
-    assert model.one.item() == pytest.approx(-4 * factor, rel=1e-5)
-    assert model.other.item() == pytest.approx(-4 * factor, rel=1e-5)
-    norms = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
-    assert norms == {"grad_norm/a+b": pytest.approx(41**0.5)}
-
-
-def test_what_one_optimiser_of_two_steps_is_its_own_norm(tmp_path: Path) -> None:
-    trainer, log = make(tmp_path, max_steps=1, clip_norm=1.0)
+    trainer, log = make(tmp_path, max_steps=1, clip_norm=limit)
     model = Heads()
-
-    def phases(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
-        del batch, generator_of
-        yield Phase(("a",), {"fit": (3 * model.shared + 4 * model.one + 4 * model.other).sum()})
-        yield Phase(("b",), {"fit": (12 * model.shared + 5 * model.other).sum()})
-
-    model.phases = phases
-    trainer.model, trainer.scheme = model, model
     parts = {"a": [model.shared, model.one], "b": [model.shared, model.other]}
+    if phases[0][0] == ("all",):
+        parts = {"all": list(model.parameters())}
     groups = {name: [{"params": part, "base_lr": 1.0}] for name, part in parts.items()}
     trainer.optimizers = {name: torch.optim.SGD(each, lr=1.0) for name, each in groups.items()}
+    trainer.model = model
+
+    def scheme(batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
+        for names, gradients in phases:
+            pairs = zip(gradients, model.parameters(), strict=True)
+            yield Phase(names, {"fit": sum(factor * each for factor, each in pairs).sum()})
+
+    trainer.scheme.phases = scheme
     trainer.fit(batches(0), State(seed=0))
-    # 3 and 4 of 5; then 12 and 5 of 13, what "a" left of the other head being cleared.
-    assert model.shared.item() == pytest.approx(-3 / 5 - 12 / 13, rel=1e-5)
-    assert model.one.item() == pytest.approx(-4 / 5, rel=1e-5)
-    assert model.other.item() == pytest.approx(-5 / 13, rel=1e-5)
-    assert log[0][1]["grad_norm/a"] == pytest.approx(5)
-    assert log[0][1]["grad_norm/b"] == pytest.approx(13)
-
-
-def test_the_only_optimiser_clips_all_it_has(tmp_path: Path) -> None:
-    model, log = make_heads(tmp_path, ("main",), clip_norm=1.0)
-    found = [each.item() for each in (model.shared, model.one, model.other)]
-    assert found == pytest.approx([-each / 41**0.5 for each in (3, 4, 4)], rel=1e-5)
-    norms = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
-    assert norms == {"grad_norm": pytest.approx(41**0.5)}
+    assert [each.item() for each in model.parameters()] == pytest.approx(list(ends), rel=1e-5)
+    found = {name: value for name, value in log[0][1].items() if name.startswith("grad_norm")}
+    assert found == {f"grad_norm{name}": pytest.approx(norm) for name, norm in norms.items()}

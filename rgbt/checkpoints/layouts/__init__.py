@@ -1,1 +1,0 @@
-"""One module per kind of file, each with `recognise` and `rule` (see `rgbt.checkpoints.layout`)."""
