@@ -141,14 +141,19 @@ class CachedDataset(DatasetWrapper):
             with _alone(cache):
                 # Once more: another process may have written it meanwhile.
                 for path, (stale, size) in self._stale(cache, names, on_progress).items():
-                    self._warn_of_others(cache, about)
                     _check_space(cache, size * len(stale))
+                    self._warn_of_others(cache, about)
                     write_atomic(cache / ABOUT, json.dumps(sealed(about)).encode())
                     write_map(path, self._decoded(stale, on_progress))
                     held = SampleMap(path)
                     self._cached |= {name: held for name in names if name in held.records}
         except OSError as error:
-            raise InputError(_refusal(cache, error)) from error
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            raise InputError(
+                f"data.cache: {f'the disk of {cache} is full' if full else f'cannot write {cache}'}"
+                f" ({error.strerror or error}); {'free some space, ' * full}name a writable folder "
+                f"with data.cache=FOLDER, {WAYS_OUT}"
+            ) from error
 
     def read(self, name: str) -> Sample:
         """The sample as `source.read` returns it, with its InputError.
@@ -347,15 +352,3 @@ def _check_space(cache: Path, needed: int) -> None:
             f"disk has {gigabytes(free)} left; free some space, name a folder on another disk with "
             f"data.cache=FOLDER, {WAYS_OUT}"
         )
-
-
-def _refusal(cache: Path, error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return (
-            f"data.cache: the disk of {cache} is full ({error.strerror}); free some space, name "
-            f"another folder with data.cache=FOLDER, {WAYS_OUT}"
-        )
-    return (
-        f"data.cache: cannot write {cache} ({error.strerror or error}); name a writable "
-        f"folder with data.cache=FOLDER, {WAYS_OUT}"
-    )

@@ -12,8 +12,7 @@ from rgbt.data.synth import materials
 from rgbt.data.synth.camera import Floats, SynthCamera, floats
 from rgbt.data.synth.facets import Facets
 from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.lamps import Lamp, headlight, lamplight
-from rgbt.data.synth.light import Light
+from rgbt.data.synth.light import Lamp, Light, headlight, lamplight
 from rgbt.data.synth.raster import average
 from rgbt.data.synth.surface import Surface, sample_tile
 

@@ -12,9 +12,8 @@ from rgbt.data.synth import rgb, thermal
 from rgbt.data.synth.camera import Floats, SynthCamera, camera_of, flow_between
 from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.lamps import Lamp, lamps_of
 from rgbt.data.synth.layout import place_objects
-from rgbt.data.synth.light import Light, draw_light
+from rgbt.data.synth.light import Lamp, Light, draw_light, lamps_of
 from rgbt.data.synth.placement import Placed
 from rgbt.data.synth.raster import draw
 from rgbt.data.synth.road import draw_road, ground_quads
