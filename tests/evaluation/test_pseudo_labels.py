@@ -70,17 +70,18 @@ class Fixed(nn.Module):
         return Output(found.log() + self.shift, {})
 
 
-class Masks(nn.Module):
-    """What a network of queries returns in evaluation: sums, not normalised."""
+class Constant(nn.Module):
+    """The same class scores for every pixel; `outputs` is of its record."""
 
-    record = Record(outputs="masks")
+    num_classes = 9
 
-    def __init__(self, scores: list[float]) -> None:
+    def __init__(self, scores: list[float], outputs: str) -> None:
         super().__init__()
+        self.record = Record(outputs=outputs, views=("rgbt", "thermal"))
         self.scores = torch.tensor(scores)
 
-    def forward(self, rgb: Tensor, thermal: Tensor) -> Output:
-        del thermal
+    def forward(self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = ()) -> Output:
+        del thermal, views
         return Output(self.scores[None, :, None, None].expand(len(rgb), -1, *rgb.shape[2:]), {})
 
 
@@ -173,23 +174,12 @@ def test_threshold_zero_keeps_all_and_one_out_of_range_is_refused(
             written(session, tmp_path / "never", threshold=wrong)
 
 
-class Half(nn.Module):
-    """Two of nine classes with one half each, to the last digit."""
-
-    num_classes = 9
-    record = Record(views=("rgbt", "thermal"))
-
-    def forward(self, rgb: Tensor, thermal: Tensor, views: tuple[View, ...] = ()) -> Output:
-        del thermal, views
-        scores = torch.full((len(rgb), 9, *rgb.shape[2:]), -1e4)
-        scores[:, 3] = scores[:, 5] = 0
-        return Output(scores, {})
-
-
 def test_a_confidence_of_the_threshold_is_kept_and_rounded(
     session: Session, tmp_path: Path
 ) -> None:
-    session = replace(session, model=Half())
+    # Two of nine classes with one half each, to the last digit.
+    scores = [0.0 if number in (3, 5) else -1e4 for number in range(9)]
+    session = replace(session, model=Constant(scores, "scores"))
     for threshold, kept in ((0.5, 3), (0.5000001, 255)):
         out = tmp_path / str(threshold)
         written(session, out, threshold=threshold, view="rgbt")
@@ -451,20 +441,13 @@ def test_probabilities_at_the_size_of_the_label(session: Session, batch: Any) ->
 
 def test_masks_of_queries_give_shares(session: Session, batch: Any) -> None:
     full = next(batch).to("cpu")
-    found = probabilities(Masks([0.6, 0.2, 0.0]), full, session.fabric)
+    found = probabilities(Constant([0.6, 0.2, 0.0], "masks"), full, session.fabric)
     assert torch.allclose(found[1, :, 2, 3], torch.tensor([0.75, 0.25, 0.0]))
-    nothing = probabilities(Masks([0.0, 0.0, 0.0]), full, session.fabric)
+    nothing = probabilities(Constant([0.0] * 3, "masks"), full, session.fabric)
     assert nothing.max() == 0
 
 
 def test_heads_are_asked_by_image(session: Session, batch: Any) -> None:
-    class Heads(nn.Module):
-        def forward(self, rgb: Tensor, thermal: Tensor, head: str) -> Output:
-            del thermal
-            scores = torch.zeros(len(rgb), 3, *rgb.shape[2:])
-            scores[:, 1 if head == "night" else 2] = 5
-            return Output(scores, {})
-
     full = next(batch).to("cpu")
-    found = probabilities(Heads(), full, session.fabric, heads=("day", "night"))
-    assert found.argmax(1)[:, 0, 0].tolist() == [2, 1]
+    found = probabilities(Heads(), full, session.fabric, heads=("day", "dark"))
+    assert found.argmax(1)[:, 0, 0].tolist() == [1, 2]

@@ -69,9 +69,12 @@ def draw_light(seed: int, index: int, night_share: float) -> Light:
     """The light of one scene. Both day and night are drawn, so the share changes nothing else."""
     u = numpy_generator(seed, "synth/light", index).random(16).tolist()
     dark = floats([0, 0, 0])
+    angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
+    flat = math.cos(height)
+    lamp = floats([1.0, 0.72, 0.38] if u[8] < 0.5 else [0.85, 1.0, 0.85])
     common = Light(
         is_night=is_night(seed, index, night_share),
-        sun=_sun(u[2], u[3]),
+        sun=floats([math.sin(angle) * flat, math.sin(height), math.cos(angle) * flat]),
         direct=0.0,
         ambient=0.0,
         zenith=dark,
@@ -80,23 +83,12 @@ def draw_light(seed: int, index: int, night_share: float) -> Light:
         exposure=1.6 ** (u[12] - 0.5),
         tint=floats([0.96 + 0.08 * u[0], 1.0, 0.96 + 0.08 * u[1]]),
         headlight=0.5 + 0.8 * u[4],
-        lamp=_lamp_colour(u[7], u[8]),
+        # Street lamps are off in a quarter of the streets, and of any strength in the others.
+        lamp=lamp * (0.25 + 0.87 * u[7] if u[7] < 0.75 else 0.0),
         lit_windows=0.06 + 0.4 * u[5] ** 2,
         visibility_m=140 + 300 * u[6],
     )
     return (_night if common.is_night else _day)(common, u)
-
-
-def _sun(azimuth: float, elevation: float) -> Floats:
-    angle, height = 2 * math.pi * azimuth, math.radians(22 + 43 * elevation)
-    flat = math.cos(height)
-    return floats([math.sin(angle) * flat, math.sin(height), math.cos(angle) * flat])
-
-
-def _lamp_colour(on: float, warm: float) -> Floats:
-    """Street lamps are off in a quarter of the streets, and of any strength in the others."""
-    colour = floats([1.0, 0.72, 0.38] if warm < 0.5 else [0.85, 1.0, 0.85])
-    return colour * (0.25 + 0.87 * on if on < 0.75 else 0.0)
 
 
 def _day(light: Light, u: list[float]) -> Light:

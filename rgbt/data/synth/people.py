@@ -27,7 +27,18 @@ def person(kind: int) -> Shape:
     stride = (0.02, 0.16, 0.24)[kind % 3]
     from_behind = kind >= NUM_WALKERS // 2
     parts = [*_leg(-0.08, -0.06 - stride), *_leg(0.08, 0.06 + stride)]
-    parts += [*_arm(-1, stride), *_arm(1, stride), *_torso(), *_head(from_behind)]
+    parts += [*_arm(-1, stride), *_arm(1, stride)]
+    # Two halves that meet in an edge towards the camera, so that the sun shades one of them.
+    for side in (-1, 1):
+        torso = [(0.0, 0.84, -0.12), (side * 0.18, 0.84, 0.0), (side * 0.24, 1.36, 0.0)]
+        torso += [(side * 0.15, 1.46, 0.0), (0.0, 1.46, -0.12)]
+        parts.append(thin(torso, "cloth", PERSON, 1))
+    cap = [(-0.125, 1.61), (0.125, 1.61), (0.09, 1.70), (0.0, 1.735), (-0.09, 1.70)]
+    parts += [
+        thin(upright(rectangle(-0.05, 1.42, 0.05, 1.52)), "skin", PERSON),
+        thin(upright(disc(0.0, 1.60, 0.125)), "hair" if from_behind else "skin", PERSON),
+        thin(upright(cap, -0.01), "hair", PERSON),
+    ]
     if kind in (1, 5):
         parts.append(thin(upright(rectangle(-0.17, 0.98, 0.17, 1.40), -0.16), "bag", PERSON))
     return shape_of(parts)
@@ -48,23 +59,6 @@ def _arm(side: int, stride: float) -> list[Face]:
         thin(upright(tube((side * 0.22, 1.40), hand, 0.11)), "cloth", PERSON, 1),
         thin(upright(disc(*hand, 0.055, 6)), "skin", PERSON),
     ]
-
-
-def _torso() -> list[Face]:
-    """Two halves that meet in an edge towards the camera, so that the sun shades one of them."""
-    halves = []
-    for side in (-1, 1):
-        outline = [(0.0, 0.84, -0.12), (side * 0.18, 0.84, 0.0), (side * 0.24, 1.36, 0.0)]
-        outline += [(side * 0.15, 1.46, 0.0), (0.0, 1.46, -0.12)]
-        halves.append(thin(outline, "cloth", PERSON, 1))
-    return halves
-
-
-def _head(from_behind: bool) -> list[Face]:
-    face = thin(upright(disc(0.0, 1.60, 0.125)), "hair" if from_behind else "skin", PERSON)
-    neck = thin(upright(rectangle(-0.05, 1.42, 0.05, 1.52)), "skin", PERSON)
-    cap = [(-0.125, 1.61), (0.125, 1.61), (0.09, 1.70), (0.0, 1.735), (-0.09, 1.70)]
-    return [neck, face, thin(upright(cap, -0.01), "hair", PERSON)]
 
 
 @cache
