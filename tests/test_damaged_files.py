@@ -388,51 +388,30 @@ def read_names(path: Path) -> Any:
     return plain(read(path, "dataset.splits"))
 
 
-CACHE_ABOUT = {"class": "MFNet", "fingerprint": "0123", "root": "/data"}
-
-
 def cache(folder: Path) -> Path:
-    from rgbt.data.cache.folder import CacheFolder, NewSample
-    from rgbt.data.cache.sample_file import crc_of
-    from rgbt.types import Sample
+    from rgbt.data.cache.sample_map import NewSample, write_map
 
-    rgb = picture((10, 12), 3)
-    samples = [Sample(rgb // n, rgb[..., 0] // n, None, name=f"{n}") for n in (1, 2, 3)]
-    made = CacheFolder(folder / "cache", CACHE_ABOUT, 1)
-    with made.building():
-        made.add(iter([NewSample(sample, crc_of(sample), ()) for sample in samples]))
-
-    (path,) = (folder / "cache").glob("*.frames")
-    return path
+    write_map(folder / "cache.frames", (NewSample(each, ()) for each in cached_samples()))
+    return folder / "cache.frames"
 
 
 def read_cache(path: Path) -> Any:
-    """Every intact sample; damaged ones are decoded again, and count as refused here."""
-    from rgbt.data.cache.folder import CacheFolder
+    from rgbt.data.cache.sample_map import SampleMap
 
-    opened = CacheFolder(path.parent, CACHE_ABOUT, 1)
-    opened.load(lambda *_: None)
-    samples = {name: plain(at.file.read(at.record)) for name, at in sorted(opened.samples.items())}
-    intact = cached_samples()
-    assert samples.items() <= intact.items(), "a sample with other pixels"
-    if len(samples) < len(intact):
-        raise InputError("samples are left out.")
-    return plain(samples)
+    try:
+        held = SampleMap(path)
+    except ValueError as error:  # what is damaged is decoded again
+        raise InputError(f"{error}.") from error
+    if not held.is_intact(1, lambda *_: None):
+        raise InputError("a sample is damaged.")
+    return plain([held.read(name) for name in held.records])
 
 
-def cached_samples() -> dict[str, Any]:
+def cached_samples() -> list[Any]:
     from rgbt.types import Sample
 
     rgb = picture((10, 12), 3)
-    samples = [Sample(rgb // n, rgb[..., 0] // n, None, name=f"{n}") for n in (1, 2, 3)]
-    return {sample.name: plain(sample) for sample in samples}
-
-
-def in_cache(name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        return cache(folder).with_name(name)
-
-    return make
+    return [Sample(rgb // n, rgb[..., 0] // n, None, name=f"{n}") for n in (1, 2, 3)]
 
 
 def journal(folder: Path) -> Path:
@@ -541,8 +520,6 @@ KINDS = {
         Kind("confidence", lambda f: pseudo(f).parent / "confidence" / "a.png", read_pseudo),
         Kind("split list", split_list, read_names, anything),
         Kind("image cache", cache, read_cache),
-        Kind("about.json of image cache", in_cache("about.json"), read_cache),
-        Kind("verified.json of image cache", in_cache("verified.json"), read_cache),
         Kind("journal of studies", journal, read_journal, anything),
         Kind("robustness.json", robustness, read_robustness),
         Kind("angles of views", angles, read_angles, anything),

@@ -49,7 +49,16 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
         InputError: images or labels differ in size, naming the first two that do; labels of some
             examples alone carry confidences.
     """
-    _check_sizes(examples, advice)
+    first = examples[0]
+    for example in examples[1:]:
+        for what in ("rgb", "label"):
+            expected, found = getattr(first, what).shape[:2], getattr(example, what).shape[:2]
+            if found != expected:
+                raise InputError(
+                    f"all {what} images of one batch must have one size, got "
+                    f"{expected[0]}x{expected[1]} ('{first.name}') and {found[0]}x{found[1]} "
+                    f"('{example.name}'){advice}."
+                )
     confidences = _confidences(examples)
     positions = [example.position for example in examples if example.position is not None]
     rgb_BHWC = torch.from_numpy(np.stack([example.rgb for example in examples]))
@@ -81,16 +90,3 @@ def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
             "whole split again."
         )
     return found
-
-
-def _check_sizes(examples: Sequence[Example], advice: str) -> None:
-    first = examples[0]
-    for example in examples[1:]:
-        for what in ("rgb", "label"):
-            expected, found = getattr(first, what).shape[:2], getattr(example, what).shape[:2]
-            if found != expected:
-                raise InputError(
-                    f"all {what} images of one batch must have one size, got "
-                    f"{expected[0]}x{expected[1]} ('{first.name}') and {found[0]}x{found[1]} "
-                    f"('{example.name}'){advice}."
-                )

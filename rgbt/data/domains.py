@@ -192,19 +192,16 @@ class Domains:
                     "for all images; omit it."
                 )
             return heads[0] if heads else None
-        if choice == "own":
-            choice = self._domain_of(view, night)
+        if choice == "own" and self.target_is == "view":
+            choice = "target" if view == self.named["target"].view else "source"
+        elif choice == "own":
+            if night is None:
+                raise InputError(
+                    "domains.target_is=night: the data set does not say which images were taken "
+                    "at night, so no head can be chosen; set head=source or head=target."
+                )
+            choice = "target" if night else "source"
         return self.named[choice].head
-
-    def _domain_of(self, view: View, night: bool | None) -> TestedHead:
-        if self.target_is == "view":
-            return "target" if view == self.named["target"].view else "source"
-        if night is None:
-            raise InputError(
-                "domains.target_is=night: the data set does not say which images were taken at "
-                "night, so no head can be chosen; set head=source or head=target."
-            )
-        return "target" if night else "source"
 
     def _own_heads(self) -> tuple[str | None, ...]:
         return tuple(domain.head for domain in self.named.values())

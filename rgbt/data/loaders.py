@@ -126,36 +126,30 @@ class Batches(Iterator[Kind]):
             RunError: a worker process died.
         """
         while True:
-            loaded = self._wait()
-            self._report(loaded.skipped)
+            try:
+                loaded = next(self._loaded)
+            except RuntimeError as error:
+                if not DEAD_WORKER.search(str(error)):
+                    raise
+                raise RunError(
+                    f"A loader process died ({str(error).splitlines()[0].rstrip('. ')}), most "
+                    "often because memory ran out. Lower data.num_workers, data.prefetch or "
+                    "data.batch_size, and rerun the command to resume."
+                ) from error
+            for name, reason in loaded.skipped.items():
+                if name not in self.skipped:
+                    LOG.warning("skipped '%s': %s", name, reason)
+            self.skipped.update(loaded.skipped)
             if loaded.error:
                 self.close()
                 raise InputError(loaded.error)
             if loaded.batch is not None:
                 return cast(Kind, loaded.batch)
 
-    def _wait(self) -> LoadedBatch:
-        try:
-            return next(self._loaded)
-        except RuntimeError as error:
-            if not DEAD_WORKER.search(str(error)):
-                raise
-            raise RunError(
-                f"A loader process died ({str(error).splitlines()[0].rstrip('. ')}), most often "
-                "because memory ran out. Lower data.num_workers, data.prefetch or "
-                "data.batch_size, and rerun the command to resume."
-            ) from error
-
     def close(self) -> None:
         """Stop the worker processes; no batch can be read afterwards."""
         # Workers end when the loader's iterator is deleted, and a traceback may keep it alive.
         self._loaded = iter(())
-
-    def _report(self, skipped: dict[str, str]) -> None:
-        for name, reason in skipped.items():
-            if name not in self.skipped:
-                LOG.warning("skipped '%s': %s", name, reason)
-        self.skipped.update(skipped)
 
 
 def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:

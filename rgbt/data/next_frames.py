@@ -10,8 +10,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,28 +72,22 @@ class NextFrames:
         Raises:
             InputError: no flow, one of another size, or one that leads out of the image.
         """
-        flow = self._flow(name, image_hw)
-        rows, columns = np.indices(image_hw)
-        grid = np.stack([rows, columns], axis=-1)
-        seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
-        first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
-        if (first_yx < 0).any() or (first_yx >= image_hw).any():
-            raise InputError(
-                f"{self._path(name)} leads out of the first frame of {image_hw[0]}x{image_hw[1]} "
-                "pixels; points that were not visible there must be NaN."
-            )
-        first_yx[~seen] = -1
-        return first_yx[..., 0], first_yx[..., 1]
-
-    def _flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
-        path = self._path(name)
+        path = self.dataset.root / "flow" / f"{name}.npy"
         flow = read_array(path, "one array of rows and columns")
         if flow.dtype.kind != "f" or flow.shape != (*image_hw, 2):
             raise InputError(
                 f"{path} must be an array of {image_hw[0]} x {image_hw[1]} x 2 real numbers (rows, "
                 f"columns) like its frame, got {' x '.join(map(str, flow.shape))} {flow.dtype}."
             )
-        return np.asarray(flow, np.float32)
-
-    def _path(self, name: str) -> Path:
-        return self.dataset.root / "flow" / f"{name}.npy"
+        flow = np.asarray(flow, np.float32)
+        rows, columns = np.indices(image_hw)
+        grid = np.stack([rows, columns], axis=-1)
+        seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
+        first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
+        if (first_yx < 0).any() or (first_yx >= image_hw).any():
+            raise InputError(
+                f"{path} leads out of the first frame of {image_hw[0]}x{image_hw[1]} "
+                "pixels; points that were not visible there must be NaN."
+            )
+        first_yx[~seen] = -1
+        return first_yx[..., 0], first_yx[..., 1]

@@ -60,7 +60,17 @@ class CorruptedDataset(DatasetWrapper):
         if not self.severity:
             return sample
         if isinstance(self.corruption, OfTime):
-            return self._with_thermal_of(self.shown(name), sample)
+            other = self.shown(name)
+            thermal = sample.thermal if other == name else self.source.read(other).thermal
+            if thermal.shape != sample.thermal.shape:
+                own, its = (
+                    f"{each.shape[0]}x{each.shape[1]}" for each in (sample.thermal, thermal)
+                )
+                raise InputError(
+                    f"'{name}' ({own} pixels) cannot show the thermal image of '{other}' ({its} "
+                    "pixels); images of one split must have one size for frozen and delayed."
+                )
+            return replace(sample, thermal=thermal)
 
         def rng_of(purpose: str) -> np.random.Generator:
             # The word is part of the seed: another one draws other blocks.
@@ -109,19 +119,6 @@ class CorruptedDataset(DatasetWrapper):
             for index, name in enumerate(frames):
                 found[name] = frames[self.corruption.shown(index, self.severity)]
         return found
-
-    def _with_thermal_of(self, other: str, sample: Sample) -> Sample:
-        if other == sample.name:
-            return sample
-        thermal = self.source.read(other).thermal
-        if thermal.shape != sample.thermal.shape:
-            sizes = [f"{image.shape[0]}x{image.shape[1]}" for image in (sample.thermal, thermal)]
-            raise InputError(
-                f"'{sample.name}' ({sizes[0]} pixels) cannot show the thermal image of '{other}' "
-                f"({sizes[1]} pixels); images of one split must have one size for frozen and "
-                "delayed."
-            )
-        return replace(sample, thermal=thermal)
 
 
 def settings_of(corruption: Corruption) -> dict[str, Any]:

@@ -124,6 +124,6 @@ def decode_ahead(session: Session, *splits: str) -> None:
                 display.append(shown.enter_context(progress()))
             if what not in tasks:
                 tasks[what] = display[0].add_task(what, total=total, note="images")
-            display[0].update(tasks[what], completed=done)
+            display[0].update(tasks[what], completed=done, total=total)
 
         dataset.ensure(names, advance)

@@ -7,6 +7,7 @@ of a sample without a label, all pixels are ignored.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,10 +48,15 @@ def viewed(  # noqa: PLR0913 - three of one kind
         of_image: how RGB and thermal are resized.
         of_label: how the label is resized.
     """
-    confidence = None if sample.confidence is None else view.nearest(sample.confidence)
-    images = of_image(view, sample.rgb, dtype), of_image(view, sample.thermal, dtype)
-    return _example(
-        sample, view, images, of_label(view, _label(sample)), confidence, track_position
+    return Example(
+        rgb=of_image(view, sample.rgb, dtype),
+        thermal=of_image(view, sample.thermal, dtype),
+        label=of_label(view, _label(sample)),
+        centre_yx=view.centre_yx(),
+        position=view.position() if track_position else None,
+        original_hw=view.source_hw,
+        name=sample.name,
+        confidence=None if sample.confidence is None else view.nearest(sample.confidence),
     )
 
 
@@ -78,28 +84,8 @@ def evaluated(
     if short_edge is not None:
         resized_hw = short_edge_hw(source_hw, short_edge, max_size)
     view = whole_view(source_hw, resized_hw)
-    images = of_image(view, sample.rgb, dtype), of_image(view, sample.thermal, dtype)
-    return _example(sample, view, images, _label(sample), sample.confidence, track_position)
-
-
-def _example(
-    sample: Sample,
-    view: View,
-    images: tuple[NDArray[Any], NDArray[Any]],
-    label: NDArray[np.uint8],
-    confidence: NDArray[np.float32] | None,
-    track_position: bool,
-) -> Example:
-    return Example(
-        rgb=images[0],
-        thermal=images[1],
-        label=label,
-        centre_yx=view.centre_yx(),
-        position=view.position() if track_position else None,
-        original_hw=view.source_hw,
-        name=sample.name,
-        confidence=confidence,
-    )
+    example = viewed(sample, view, dtype, track_position=track_position, of_image=of_image)
+    return replace(example, label=_label(sample), confidence=sample.confidence)
 
 
 def _label(sample: Sample) -> NDArray[np.uint8]:

@@ -172,7 +172,12 @@ class DrawnBatch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The augmented batch on `device`, images as float32 in [0, 1]."""
-        there = self._moved(device)
+        moved: dict[str, Any] = {
+            each.name: getattr(self, each.name).to(device, non_blocking=True)
+            for each in fields(self)
+            if isinstance(getattr(self, each.name), Tensor)
+        }
+        there = replace(self, **moved)
         images = there._resized()
         rgb = there._coloured(images[..., :3])
         thermal = there._looked_up(3, images[..., 3])
@@ -187,14 +192,6 @@ class DrawnBatch:
             original_hw=there.original_hw,
             confidence=None if there.confidence is None else _at(there.confidence, rows, columns),
         )
-
-    def _moved(self, device: torch.device | str) -> DrawnBatch:
-        moved: dict[str, Any] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, Tensor):
-                moved[each.name] = value.to(device, non_blocking=True)
-        return replace(self, **moved)
 
     def _resized(self) -> Tensor:
         """(B, h, w, 4) int64: bilinear, rounded as `View.bilinear` rounds uint8 images."""

@@ -108,16 +108,16 @@ def read_angles(name: str) -> Tensor:
             f"consistency.sets: {path} must begin with the line '{HEADER}', then one triple of "
             f"degrees per line, got '{one_line(header)}' and {len(lines)} lines."
         )
-    return torch.tensor([_triple(path, line) for line in lines], dtype=torch.float64)
-
-
-def _triple(path: Path, line: str) -> list[float]:
-    try:
-        triple = [float(word) for word in line.split(",")]
-    except ValueError:
-        triple = []
-    if len(triple) != 3 or not all(map(math.isfinite, triple)):
-        raise InputError(
-            f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got '{one_line(line)}'."
-        )
-    return triple
+    triples = []
+    for line in lines:
+        try:
+            triple = [float(word) for word in line.split(",")]
+        except ValueError:
+            triple = []
+        if len(triple) != 3 or not all(map(math.isfinite, triple)):
+            raise InputError(
+                f"consistency.sets: {path}: expected yaw,pitch,roll in degrees, got "
+                f"'{one_line(line)}'."
+            )
+        triples.append(triple)
+    return torch.tensor(triples, dtype=torch.float64)

@@ -78,7 +78,14 @@ class VirtualView:
     def __post_init__(self) -> None:
         self.outside_label = IGNORE if self.outside == "ignore" else 0
         self.ranges = {"yaw": self.yaw, "pitch": self.pitch, "roll": self.roll}
-        self._check_ranges()
+        for name, (low, high) in self.ranges.items():
+            whole = float(low).is_integer() and float(high).is_integer()
+            if self.angles == "integer" and not (whole and low < high):
+                raise InputError(
+                    f"view.{name} must be (low, high) with whole degrees, low < high, got "
+                    f"{low, high}; see view.angles=integer."
+                )
+        self._check_turns()
 
     @property
     def record(self) -> Record:
@@ -107,7 +114,9 @@ class VirtualView:
         """
         turn = self._turn(angles, image_hw)
         if self.mode == "rotation":
-            rectangle = _whole(turn, image_hw)
+            height, width = image_hw
+            whole = turn.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
+            rectangle = whole.expand(len(turn), 4)
         else:
             rectangle = inner_rectangle(turn, image_hw, self.rectangle)
         if self.mode == "translation":
@@ -174,16 +183,6 @@ class VirtualView:
     def _turn(self, angles: Tensor, image_hw: tuple[int, int]) -> Tensor:
         return homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
 
-    def _check_ranges(self) -> None:
-        for name, (low, high) in self.ranges.items():
-            whole = float(low).is_integer() and float(high).is_integer()
-            if self.angles == "integer" and not (whole and low < high):
-                raise InputError(
-                    f"view.{name} must be (low, high) with whole degrees, low < high, got "
-                    f"{low, high}; see view.angles=integer."
-                )
-        self._check_turns()
-
     def _check_turns(self) -> None:
         """A grid of turns over the ranges, looked at here so that no step has to wait for it."""
         steps = [torch.linspace(low, high, 5).tolist() for low, high in self.ranges.values()]
@@ -197,10 +196,3 @@ class VirtualView:
                 f"{100 * float(share.min()):.2g} % of the frame, at least {100 * LEAST:g} % is "
                 "needed; choose smaller ranges of angles."
             )
-
-
-def _whole(turn: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """(B, 4): the edges of the whole frame."""
-    height, width = image_hw
-    edges = turn.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
-    return edges.expand(len(turn), 4)

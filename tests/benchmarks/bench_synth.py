@@ -14,9 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rgbt.data.synth.dataset import LAYOUT
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.scene import render_scene
-from rgbt.data.synth.writer import SynthPlan, write_index
+from rgbt.data.synth.writer import Plan, write_shot
 from tests.benchmarks.timing import in_turns
 
 WANTED = 100.0
@@ -37,14 +38,15 @@ def main(num_scenes: int) -> None:
     factors = SceneFactors()
     for index in range(20):
         render_scene(0, index, factors)
-    plan = SynthPlan(seed=0, num_train=num_scenes, num_val=1, num_test=1, factors=factors)
+    plan = Plan(seed=0, numbers={"num_train": num_scenes}, factors=factors)
+    shots = LAYOUT.shots(plan)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        (folder / "images").mkdir()
-        (folder / "labels").mkdir()
         rows = {
             "render": rate(lambda index: render_scene(0, index, factors), num_scenes),
-            "render + PNG": rate(lambda index: write_index(plan, folder, index), num_scenes),
+            "render + PNG": rate(
+                lambda index: write_shot(LAYOUT, plan, folder, shots[index]), num_scenes
+            ),
         }
     print(f"{factors.height} x {factors.width}, one thread, {num_scenes} scenes, CPU time")
     print(f"{'':<14}{'median':>10}{'best':>10}   scenes/s")

@@ -29,52 +29,57 @@ def two(target_is: str, **changes: Any) -> Domains:
     )
 
 
-@pytest.mark.parametrize("labels", ["given", "none", "/some/folder"])
-@pytest.mark.parametrize("setting", [{"threshold": 0.5}, {"teacher_view": "thermal"}])
-def test_teacher_settings_without_teacher_are_refused(labels: str, setting: dict) -> None:
-    with pytest.raises(InputError, match=f"with labels={labels} they have no effect"):
+PREDICTED = ("experiment:x/best.pt", "/some/folder")
+REFUSED_DOMAINS = [
+    *((labels, {"threshold": 0.5}, "no effect") for labels in ("given", "none", "/a/folder")),
+    *((labels, {"teacher_view": "rgb"}, "no effect") for labels in ("given", "none", "/a/folder")),
+    *((labels, {"confidence": True}, "confidence=true") for labels in ("given", "none")),
+]
+
+
+@pytest.mark.parametrize(("labels", "setting", "word"), REFUSED_DOMAINS)
+def test_setting_without_effect_on_labels_is_refused(
+    labels: str, setting: dict[str, Any], word: str
+) -> None:
+    with pytest.raises(InputError, match=f"{word}.*") as raised:
         domain(labels=labels, **setting)
-    assert domain(labels="experiment:x/best.pt", **setting).labels.startswith("experiment:")
+    assert f"labels={labels}" in str(raised.value)
+    assert domain(labels=PREDICTED[0], **setting).labels == PREDICTED[0]
+    assert domain(labels=PREDICTED[1], confidence=True).confidence
 
 
-@pytest.mark.parametrize("labels", ["given", "none"])
-def test_confidence_needs_pseudo_labels(labels: str) -> None:
-    with pytest.raises(InputError, match=f"confidence=true needs pseudo-labels, but .*={labels}"):
-        domain(labels=labels, confidence=True)
-    for fine in ("/some/folder", "experiment:x/best.pt"):
-        assert domain(labels=fine, confidence=True).confidence
+def heads(source: str | None, target: str | None, **changes: Any) -> dict[str, Any]:
+    return {"source": domain(head=source), "target": domain(head=target), **changes}
 
 
-@pytest.mark.parametrize(("source", "target"), [("day", None), (None, "dark")])
-def test_single_head_is_refused(source: str | None, target: str | None) -> None:
-    with pytest.raises(InputError, match=f"got {source or 'null'} and {target or 'null'}"):
-        domains(source=domain(head=source), target=domain(head=target))
-
-
-def test_target_is_requires_two_heads() -> None:
-    with pytest.raises(InputError, match="domains.target_is=null with 2 heads"):
-        domains(source=domain(head="a"), target=domain(head="b"))
-    for named in ("view", "night"):
-        with pytest.raises(InputError, match=f"domains.target_is={named} with 0 heads"):
-            domains(target=domain(), target_is=named)
-        with pytest.raises(InputError, match=f"domains.target_is={named} with 1 heads"):
-            domains(source=domain(head="a"), target=domain(head="a"), target_is=named)
-
-
-@pytest.mark.parametrize("head", [None, "a"])
-def test_a_choice_of_heads_needs_two(head: str | None) -> None:
-    with pytest.raises(InputError, match="tested_head=source chooses between two heads"):
-        domains(source=domain(head=head), target=domain(head=head), tested_head="source")
-
-
-@pytest.mark.parametrize("view", [None, "rgb"])
-def test_target_is_view_requires_two_views(view: View | None) -> None:
-    with pytest.raises(InputError, match="target_is=view"):
-        domains(
-            source=domain(view="rgb", head="a"),
-            target=domain(view=view, head="b"),
-            target_is="view",
-        )
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"source": domain(labels="none")}, "domains.source.labels=none"),
+        (heads("day", None), "got day and null"),
+        (heads(None, "dark"), "got null and dark"),
+        (heads("a", "b"), "domains.target_is=null with 2 heads"),
+        (heads(None, None, target_is="view"), "domains.target_is=view with 0 heads"),
+        (heads(None, None, target_is="night"), "domains.target_is=night with 0 heads"),
+        (heads("a", "a", target_is="night"), "domains.target_is=night with 1 heads"),
+        (heads(None, None, tested_head="source"), "tested_head=source chooses between two heads"),
+        (heads("a", "a", tested_head="source"), "tested_head=source chooses between two heads"),
+        (heads("a", "b", target_is="view"), "target_is=view"),
+        (
+            {
+                "source": domain(view="rgb", head="a"),
+                "target": domain(view="rgb", head="b"),
+                "target_is": "view",
+            },
+            "target_is=view",
+        ),
+    ],
+)
+def test_domains_that_cannot_be_distinguished_are_refused(
+    changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        domains(**changes)
 
 
 def test_names_and_heads() -> None:

@@ -6,7 +6,6 @@ import logging
 import multiprocessing
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,27 +19,13 @@ from rgbt.data.mfnet import MFNet
 from rgbt.data.reader import LoadedBatch
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
+from tests.transforms import recipes
 
 NAMES = [f"{number:05d}{'DN'[number % 2]}" for number in range(1, 11)]
 
 
 def crm(**changes: object) -> CrmTransform:
-    values: dict[str, object] = {
-        "sizes": (16, 24, 40),
-        "max_size": 1920,
-        "crop_hw": (12, 16),
-        "flip_probability": 0.5,
-        "colour": "intended",
-        "colour_probability": 0.5,
-        "brightness_delta": 32.0,
-        "contrast_range": (0.5, 1.5),
-        "saturation_range": (0.5, 1.5),
-        "hue_delta": 18,
-        "thermal_contrast_range": (0.5, 1.5),
-        "test_short_edge": None,
-        "track_position": True,
-    }
-    return CrmTransform(**{**values, **changes})  # type: ignore[arg-type]
+    return recipes.crm(**{"sizes": (16, 24, 40), "crop_hw": (12, 16), **changes})
 
 
 def settings(**changes: object) -> LoaderSettings:
@@ -81,13 +66,6 @@ def test_shapes_and_dtypes(dataset: MFNet) -> None:
     assert batch.rgb.is_contiguous()
 
 
-def test_released_colours_are_float(dataset: MFNet) -> None:
-    transform = crm(colour="released", track_position=False)
-    batch = next(train_batches(dataset, "train", transform, settings(), 0, range(1)))
-    assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.float32, torch.float32)
-    assert batch.position is None
-
-
 def test_label_comes_from_the_position(dataset: MFNet, expected_pair) -> None:
     """Through the whole chain, batch and all: label[crop] == label of the file[position]."""
     for batch in train_batches(dataset, "train", crm(), settings(), 3, range(4)):
@@ -118,12 +96,6 @@ def test_same_batches_on_the_device(dataset: MFNet) -> None:
             assert not isinstance(other, Batch)
             assert one.name == other.name
             assert_equal(one.to("cpu"), other.to("cpu"))
-
-
-def test_evaluation_does_not_depend_on_the_workers(dataset: MFNet) -> None:
-    runs = [list(eval_batches(dataset, "train", crm(), settings(num_workers=n))) for n in (0, 2)]
-    for one, other in zip(*runs, strict=True):
-        assert_equal(one, other)
 
 
 def test_starting_later_gives_the_same_batches(dataset: MFNet) -> None:
@@ -322,16 +294,6 @@ def test_all_of_a_batch_is_pinned(
     assert empty.pin_memory() is empty
 
 
-def test_collate_stacks_in_order(dataset: MFNet) -> None:
-    examples = [crm().test(dataset.read(name)) for name in NAMES[:2]]
-    batch = collate(examples)
-    assert batch.name == tuple(NAMES[:2])
-    np.testing.assert_array_equal(batch.rgb[1].permute(1, 2, 0).numpy(), examples[1].rgb)
-    np.testing.assert_array_equal(batch.thermal[1, 0].numpy(), examples[1].thermal)
-    # The centre of a whole image is its own centre pixel.
-    assert batch.centre_yx.tolist() == [[12, 16], [12, 16]]
-
-
 def confident(sample: Sample, value: float | None) -> Sample:
     assert sample.label is not None
     full = None if value is None else np.full(sample.label.shape, value, np.float32)
@@ -390,34 +352,3 @@ def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPat
     batches = train_batches(dataset, "train", crm(), settings(num_workers=1), 0, range(2))
     with pytest.raises(RunError, match=r"loader process died .*memory.*data\.num_workers"):
         next(batches)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_batches_are_pinned(dataset: MFNet) -> None:
-    for workers in (0, 1):
-        changed = settings(num_workers=workers)
-        batch = next(train_batches(dataset, "train", crm(), changed, 0, range(1)))
-        assert batch.rgb.is_pinned()
-        assert batch.label.is_pinned()
-
-
-def test_datasets_need_no_files_here(tmp_path: Path) -> None:
-    """Anything with `name`, `names` and `read` is a data set."""
-    dataset = InMemory()
-    batch = next(eval_batches(dataset, "any", crm(), settings(eval_batch_size=1)))
-    assert batch.label.tolist() == [[[255, 255], [255, 255]]]
-    assert not any(tmp_path.iterdir())
-
-
-class InMemory:
-    name = "memory"
-
-    def names(self, split: str) -> tuple[str, ...]:
-        return (split,)
-
-    def read(self, name: str):  # noqa: ANN201
-        from rgbt.types import Sample
-
-        image = np.zeros((2, 2, 3), np.uint8)
-        return Sample(rgb=image, thermal=image[..., 0], label=None, name=name)

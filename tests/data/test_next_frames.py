@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,9 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
+from rgbt.data.synth.dataset import LAYOUT
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.writer import SynthPlan, write
+from rgbt.data.synth.writer import Plan
 from tests.conftest import write_data
 
 HW = (6, 8)
@@ -86,10 +88,9 @@ def test_flow_is_rows_columns_to_nearest_pixel(root: Path) -> None:
 
 def test_flow_of_synth_leads_to_same_class(tmp_path: Path) -> None:
     factors = replace(SceneFactors(), height=48, width=64)
-    plan = SynthPlan(
-        seed=0, num_train=1, num_val=1, num_test=3, factors=factors, motion=EgoMotion(0.5, 2.0)
-    )
-    write(plan, tmp_path / "synth")
+    numbers = {"num_train": 1, "num_val": 1, "num_test": 3}
+    plan = Plan(seed=0, numbers=numbers, factors=factors, motion=EgoMotion(0.5, 2.0))
+    LAYOUT.write(plan, tmp_path / "synth")
     first = reader(tmp_path / "synth")
     after = NextFrames(first)
     same = seen = 0
@@ -115,78 +116,42 @@ def test_data_set_of_single_frames_is_refused(tmp_path: Path) -> None:
         NextFrames(reader(tmp_path / "mf"))
 
 
-def too_small(root: Path) -> str:
-    save(root, NAMES[0], np.zeros((6, 7, 2), np.float32))
-    return "must be an array of 6 x 8 x 2 .* got 6 x 7 x 2"
-
-
-def one_channel(root: Path) -> str:
-    save(root, NAMES[0], np.zeros(HW, np.float32))
-    return "must be an array of 6 x 8 x 2"
-
-
-def out_of_the_image(root: Path) -> str:
+def moved(place: tuple[int, int], by: tuple[float, float]) -> np.ndarray:
     flow = still()
-    flow[0, 0] = (-1, 0)
-    save(root, NAMES[0], flow)
-    return "leads out of the first frame of 6x8 pixels"
+    flow[place] = by
+    return flow
 
 
-def below_the_image(root: Path) -> str:
-    flow = still()
-    flow[5, 7] = (0.6, 0)
-    save(root, NAMES[0], flow)
-    return "leads out of the first frame"
+def saved(flow: np.ndarray, write: Callable[..., None] = np.save) -> bytes:
+    file = io.BytesIO()
+    write(file, flow)
+    return file.getvalue()
 
 
-def missing(root: Path) -> str:
-    (root / "next" / "flow" / f"{NAMES[0]}.npy").unlink()
-    return "is missing"
+SPOILED: dict[str, tuple[bytes | None, str]] = {
+    "too small": (saved(still()[:, :7]), "must be an array of 6 x 8 x 2 .* got 6 x 7 x 2"),
+    "one channel": (saved(still()[..., 0]), "must be an array of 6 x 8 x 2"),
+    "above the image": (saved(moved((0, 0), (-1, 0))), "leads out of the first frame of 6x8"),
+    "below the image": (saved(moved((5, 7), (0.6, 0))), "leads out of the first frame"),
+    "missing": (None, "is missing"),
+    "cut short": (saved(still())[:100], "cannot be read"),
+    "empty": (b"", "cannot be read"),
+    "pickled": (saved(np.array([{}], object)), "cannot be read"),
+    "archive": (saved(still(), np.savez), "flow"),
+    "broken archive": (b"PK\x03\x04" + b"0" * 40, "flow"),
+    "words": (saved(np.full((*HW, 2), "far")), "flow"),
+}
 
 
-def cut_short(root: Path) -> str:
+@pytest.mark.parametrize("what", SPOILED)
+def test_invalid_flow_is_refused(root: Path, what: str) -> None:
+    content, sentence = SPOILED[what]
     path = root / "next" / "flow" / f"{NAMES[0]}.npy"
-    path.write_bytes(path.read_bytes()[:100])
-    return "cannot be read"
-
-
-def empty(root: Path) -> str:
-    (root / "next" / "flow" / f"{NAMES[0]}.npy").write_bytes(b"")
-    return "cannot be read"
-
-
-def pickled(root: Path) -> str:
-    np.save(root / "next" / "flow" / f"{NAMES[0]}.npy", np.array([{}], object), allow_pickle=True)
-    return "cannot be read"
-
-
-def archive(root: Path) -> str:
-    with (root / "next" / "flow" / f"{NAMES[0]}.npy").open("wb") as file:
-        np.savez(file, flow=still())
-    return "flow"
-
-
-def broken_archive(root: Path) -> str:
-    (root / "next" / "flow" / f"{NAMES[0]}.npy").write_bytes(b"PK\x03\x04" + b"0" * 40)
-    return "flow"
-
-
-def words(root: Path) -> str:
-    save(root, NAMES[0], np.full((*HW, 2), "far"))
-    return "flow"
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        *(too_small, one_channel, out_of_the_image, below_the_image, missing, cut_short, empty),
-        *(pickled, archive, broken_archive, words),
-    ],
-)
-def test_invalid_flow_is_refused(root: Path, spoil: Callable[[Path], str]) -> None:
-    sentence = spoil(root)
+    path.unlink()
+    if content is not None:
+        path.write_bytes(content)
     after = NextFrames(reader(root))
     with pytest.raises(InputError, match=sentence) as raised:
         after.source(NAMES[0], HW)
-    assert f"{NAMES[0]}.npy" in str(raised.value)
+    assert path.name in str(raised.value)
     assert after.source(NAMES[1], HW)[0].min() == 0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import json
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -104,20 +102,6 @@ def test_pseudo_labels_replace_labels(dataset: MFNet, folder: Path) -> None:
     assert sample.confidence is not None
     assert sample.confidence[1, 2] == pytest.approx(0.8)
     assert PseudoLabelled(dataset, folder, with_confidence=False).read(NAMES[0]).confidence is None
-
-
-def test_other_members_are_those_of_source(dataset: MFNet, folder: Path) -> None:
-    for wrapped in (PseudoLabelled(dataset, folder, with_confidence=True), Unlabelled(dataset)):
-        assert wrapped.name == "mfnet"
-        assert wrapped.names("train") == tuple(NAMES)
-        assert (wrapped.num_classes, wrapped.classes, wrapped.root) == (9, CLASSES, dataset.root)
-        assert wrapped.nights(tuple(NAMES)) == (False, True)
-        assert wrapped.fingerprint() == dataset.fingerprint()
-        with pytest.raises(AttributeError):
-            wrapped.nothing  # noqa: B018 - reading it is what fails
-        # As worker processes get them.
-        assert pickle.loads(pickle.dumps(wrapped)).names("train") == tuple(NAMES)
-        assert copy.deepcopy(wrapped).classes == CLASSES
 
 
 def test_unlabelled_samples_have_no_label(dataset: MFNet) -> None:

@@ -7,10 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.checks import InputError
-from rgbt.data.synth import cache, dataset, scene, sheet, writer
-from rgbt.data.synth.camera import SynthCamera, camera_of, flow_between, ground_homography
-from rgbt.data.synth.dataset import cached, synth
+from rgbt.data.synth import scene, sheet
+from rgbt.data.synth.camera import SynthCamera, camera_of, flow_between
 from rgbt.data.synth.facets import sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.layout import place_objects
@@ -21,17 +19,11 @@ from rgbt.data.synth.rgb import develop, squared_radius
 from rgbt.data.synth.road import draw_road
 from rgbt.data.synth.scene import Scene, render_pair, render_scene
 from rgbt.data.synth.shapes import CAR, PERSON, box, shape_of
-from rgbt.data.synth.writer import SynthPlan, write
 from rgbt.randomness import numpy_generator
 from tests.commands import code_of
 
 FACTORS = SceneFactors()
 DAY, NIGHT = replace(FACTORS, night_share=0.0), replace(FACTORS, night_share=1.0)
-
-
-def plan(**changes: object) -> SynthPlan:
-    small = replace(FACTORS, height=48, width=64)
-    return replace(SynthPlan(seed=3, num_train=4, num_val=2, num_test=4, factors=small), **changes)
 
 
 def images(scene: Scene) -> tuple[bytes, bytes, bytes]:
@@ -247,6 +239,17 @@ def test_flow_needs_equal_cameras() -> None:
         flow_between(np.ones((120, 160), np.float32), camera, replace(camera, focal=1.0))
 
 
+def ground_homography(source: SynthCamera, target: SynthCamera) -> np.ndarray:
+    """``K' (R' R^T + R' (C - C') n^T / d) K^-1``, n the downward normal and d the height."""
+    first, second = (
+        np.array([[each.focal, 0, each.centre[0]], [0, each.focal, each.centre[1]], [0, 0, 1.0]])
+        for each in (source, target)
+    )
+    shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
+    plane = np.outer(shift, source.rotation @ [0.0, -1.0, 0.0]) / source.position[1]
+    return second @ (target.rotation @ source.rotation.T + plane) @ np.linalg.inv(first)
+
+
 def test_ground_homography_agrees_with_flow() -> None:
     motion = EgoMotion(0.9, 2.0)
     pair = render_pair(0, 6, replace(FACTORS, num_objects=0, num_far_objects=0), motion)
@@ -299,151 +302,6 @@ def test_texture_moves_with_the_ground() -> None:
     apart = np.abs(warped - pair.second.rgb)[below].mean()
     unmoved = np.abs(pair.first.rgb.astype(float) - pair.second.rgb)[below].mean()
     assert apart < 0.6 * unmoved
-
-
-# ---- on disk --------------------------------------------------------------------------------
-
-
-def test_written_files_are_the_rendered_scenes(tmp_path: Path) -> None:
-    small = plan()
-    write(small, tmp_path)
-    names = [small.name(index) for index in range(small.num_scenes)]
-    splits = {s: (tmp_path / f"{s}.txt").read_text().split() for s in ("train", "val", "test")}
-    assert splits["train"] + splits["val"] + splits["test"] == names
-    assert [len(splits[s]) for s in ("train", "val", "test")] == [4, 2, 4]
-    day, night = ((tmp_path / f"test_{s}.txt").read_text().split() for s in ("day", "night"))
-    assert sorted(day + night) == splits["test"]
-    assert all(n.endswith("D") for n in day)
-    assert all(n.endswith("N") for n in night)
-    scene = render_scene(3, 5, small.factors)
-    stored = cv2.imread(str(tmp_path / "images" / f"{names[5]}.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(stored[..., 2::-1], scene.rgb)
-    assert np.array_equal(stored[..., 3], scene.thermal)
-    label = cv2.imread(str(tmp_path / "labels" / f"{names[5]}.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(label, scene.label)
-
-
-def test_a_pool_writes_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone, pooled = tmp_path / "alone", tmp_path / "pooled"
-    alone.mkdir()
-    write(plan(), alone)
-    monkeypatch.setattr(writer, "_WORTH_A_POOL", 1)
-    pooled.mkdir()
-    write(plan(), pooled)
-    files = sorted(path.relative_to(alone) for path in alone.rglob("*.*"))
-    assert files == sorted(path.relative_to(pooled) for path in pooled.rglob("*.*"))
-    assert all((alone / f).read_bytes() == (pooled / f).read_bytes() for f in files)
-
-
-def test_second_frames_form_data_set(tmp_path: Path) -> None:
-    moving = plan(motion=EgoMotion(0.5, 1.0))
-    write(moving, tmp_path)
-    name = moving.name(8)
-    pair = render_pair(3, 8, moving.factors, moving.motion)
-    stored = cv2.imread(str(tmp_path / "next/images" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(stored[..., 3], pair.second.thermal)
-    flow = np.load(tmp_path / "next/flow" / f"{name}.npy")
-    assert np.array_equal(np.isnan(flow[..., 0]), ~pair.visible)
-    assert np.array_equal(flow[pair.visible], pair.flow[pair.visible])
-    assert (tmp_path / "next/test.txt").read_text() == (tmp_path / "test.txt").read_text()
-
-
-def test_folder_is_reused_and_named_by_plan(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = cached(plan(), tmp_path)
-    monkeypatch.setattr(dataset, "write", lambda *_: pytest.fail("written twice"))
-    assert cached(plan(), tmp_path) == folder
-    others = [plan(seed=4), plan(num_val=3), plan(motion=EgoMotion(1.0))]
-    others.append(plan(factors=replace(plan().factors, rgb_noise=0.5)))
-    monkeypatch.setattr(dataset, "write", lambda *_: None)
-    assert len({cached(each, tmp_path) for each in [plan(), *others]}) == 5
-    monkeypatch.setattr(dataset, "VERSION", dataset.VERSION + 1)
-    assert cached(plan(), tmp_path) != folder
-
-
-def test_an_interrupted_generation_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = writer.write_index
-
-    def interrupted(made: SynthPlan, folder: Path, index: int) -> None:
-        if index == 3:
-            raise KeyboardInterrupt
-        real(made, folder, index)
-
-    monkeypatch.setattr(writer, "write_index", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        cached(plan(), tmp_path)
-    assert list(tmp_path.iterdir()) == []
-    monkeypatch.setattr(writer, "write_index", real)
-    assert (cached(plan(), tmp_path) / "test.txt").is_file()
-
-
-def test_first_of_two_generations_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache_dir = tmp_path / "cache"
-    other = cache_dir / cached(plan(), tmp_path / "elsewhere").name
-
-    def overtaken(made: SynthPlan, folder: Path) -> None:
-        write(made, folder)
-        other.mkdir()
-        (other / "first.txt").write_text("")
-
-    monkeypatch.setattr(dataset, "write", overtaken)
-    assert cached(plan(), cache_dir) == other
-    assert (other / "first.txt").is_file()
-    assert [path.name for path in cache_dir.iterdir()] == [other.name]
-
-
-def test_synth_returns_a_reader_of_its_folder(tmp_path: Path) -> None:
-    small = {"num_train": 3, "num_val": 1, "num_test": 2, "height": 48, "width": 64}
-    data = synth(cache_dir=str(tmp_path), **small)
-    assert (data.name, len(data.classes)) == ("synth", 9)
-    assert [len(data.names(split)) for split in ("train", "val", "test")] == [3, 1, 2]
-    sample = data.read(data.names("val")[0])
-    scene = render_scene(0, 3, replace(FACTORS, height=48, width=64))
-    assert np.array_equal(sample.rgb, scene.rgb)
-    assert np.array_equal(sample.label, scene.label)
-    assert data.is_night(data.names("val")[0]) == scene.is_night
-
-
-def test_the_cache_lies_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert cache.default_cache() == Path("/somewhere/rgbt")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache.default_cache() == Path.home() / ".cache/rgbt"
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"ego_yaw_deg": 2.0}, "ego_forward_m"),
-    ],
-)
-def test_wrong_settings_are_named(tmp_path: Path, wrong: dict, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        synth(cache_dir=str(tmp_path), **wrong)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_cache_dir_that_is_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="dataset.cache_dir"):
-        synth(cache_dir=str(tmp_path / "file"))
-
-
-def test_yaml_has_every_setting_with_default() -> None:
-    import inspect
-
-    from rgbt.config.compose import compose
-
-    node = dict(compose(["dataset=synth"]).dataset)
-    assert node.pop("absent") == "released"
-    assert node.pop("_target_") == "rgbt.data.synth.dataset.synth"
-    parameters = inspect.signature(synth).parameters
-    assert node == {name: parameter.default for name, parameter in parameters.items()}
-    factors = {name: node[name] for name in SceneFactors.__dataclass_fields__}
-    assert SceneFactors(**factors) == FACTORS
 
 
 def test_materials_start_with_the_sky() -> None:

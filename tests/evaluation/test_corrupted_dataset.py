@@ -12,7 +12,6 @@ from rgbt.checks import InputError
 from rgbt.corruptions.corruption import OfPixels, OfTime
 from rgbt.corruptions.late import Delayed, Frozen
 from rgbt.corruptions.pixels import Noise, Occluded, Removed
-from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
 from tests.corruptions.recorded import NAMES, Recorded, sample
 
@@ -26,28 +25,24 @@ def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
     return [known[data.read(name).thermal.tobytes()] for name in names]
 
 
-def test_frozen_is_renewed_every_n_frames() -> None:
+@pytest.mark.parametrize(
+    ("kind", "severity", "expected"),
+    [
+        (FROZEN, 3, [0, 0, 0, 3, 3, 3, 6]),
+        (FROZEN, 2, [0, 0, 2, 2, 4, 4, 6]),
+        (FROZEN, 20, [0] * 7),
+        (DELAYED, 1, [0, 0, 1, 2, 3, 4, 5]),
+        (DELAYED, 4, [0, 0, 0, 0, 0, 1, 2]),
+    ],
+)
+def test_late_thermal_is_of_earlier_frame(kind: OfTime, severity: int, expected: list[int]) -> None:
     names = tuple(f"{number:02d}" for number in range(7))
-    source = Recorded(names, by_night=False)
-    assert shown(CorruptedDataset(source, FROZEN, 3, split="test"), names) == [
-        *("00", "00", "00", "03", "03", "03", "06")
-    ]
-    assert shown(CorruptedDataset(source, FROZEN, 2, split="test"), names) == [
-        *("00", "00", "02", "02", "04", "04", "06")
-    ]
-    assert shown(CorruptedDataset(source, FROZEN, 20, split="test"), names) == ["00"] * 7
-
-
-def test_delayed_starts_with_the_first_frame() -> None:
-    names = tuple(f"{number:02d}" for number in range(6))
-    source = Recorded(names, by_night=False)
-    for n, expected in {
-        1: ["00", "00", "01", "02", "03", "04"],
-        4: ["00", "00", "00", "00", "00", "01"],
-    }.items():
-        data = CorruptedDataset(source, DELAYED, n, split="test")
-        assert shown(data, names) == expected
-        assert [data.shown(name) for name in names] == expected
+    data = CorruptedDataset(Recorded(names, by_night=False), kind, severity, split="test")
+    assert shown(data, names) == [names[number] for number in expected]
+    assert [data.shown(name) for name in names] == [names[number] for number in expected]
+    last = data.read(names[6])
+    np.testing.assert_array_equal(last.rgb, sample(names[6]).rgb)
+    np.testing.assert_array_equal(last.label, sample(names[6]).label)
 
 
 def test_frames_of_day_and_night_are_separate() -> None:
@@ -56,14 +51,6 @@ def test_frames_of_day_and_night_are_separate() -> None:
         **{"00001D": "00001D", "00003D": "00001D", "00004D": "00003D", "00006D": "00004D"},
         **{"00002N": "00002N", "00005N": "00002N"},
     }
-
-
-def test_only_thermal_is_of_another_frame() -> None:
-    found = CorruptedDataset(Recorded(), DELAYED, 1, split="test").read("00006D")
-    own = sample("00006D")
-    assert found.name == "00006D"
-    np.testing.assert_array_equal(found.rgb, own.rgb)
-    np.testing.assert_array_equal(found.label, own.label)
 
 
 def test_the_order_of_reading_does_not_matter() -> None:
@@ -97,19 +84,6 @@ def test_severity_0_is_the_sample_of_the_source(kind: OfPixels | OfTime) -> None
     np.testing.assert_array_equal(found.thermal, sample("00003D").thermal)
     assert source.reads == ["00003D"]
     assert data.files("00003D") == source.files("00003D")
-
-
-def test_is_a_data_set_like_its_source() -> None:
-    source = Recorded()
-    data: LabelledDataset = CorruptedDataset(source, NOISE, 8, split="test")
-    for name in ("root", "name", "num_classes", "classes", "palette", "unscored", "splits"):
-        assert getattr(data, name) == getattr(source, name)
-    assert data.names("val") == ("00009D",)
-    assert data.has("val")
-    assert not data.has("train")
-    assert data.fingerprint() == "fingerprint"
-    assert data.nights(NAMES) == source.nights(NAMES)
-    np.testing.assert_array_equal(data.label("00001D"), sample("00001D").label)
 
 
 def test_files_are_those_that_are_read() -> None:

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-import inspect
 import itertools
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from rgbt.config.component import build
 from rgbt.transforms.cmx import CmxTransform, draw_span, padded
@@ -18,7 +15,6 @@ from rgbt.transforms.joint import whole_view
 from rgbt.types import IGNORE, Example, Sample
 from tests.models.golden import compose
 
-CONF = Path(__file__).resolve().parents[2] / "conf" / "transform" / "cmx_released.yaml"
 RGB, THERMAL = np.array([124, 116, 104]), 114
 
 
@@ -186,34 +182,3 @@ def test_padding_is_zero_for_the_network(inputs: str) -> None:
     assert images.rgb[0][:, outside].abs().max() <= half_level * 1.001
     grey_levels = images.thermal[0][:, outside] * normalise.thermal_std.view(-1, 1) * 255
     assert grey_levels.mean(0).abs().max() <= 0.501
-
-
-def test_evaluation_leaves_the_file_as_it_is_or_resizes_images() -> None:
-    original = sample()
-    example = cmx().test(original)
-    np.testing.assert_array_equal(example.rgb, original.rgb)
-    np.testing.assert_array_equal(example.label, original.label)
-    smaller = cmx(test_short_edge=24).test(original)
-    assert (smaller.rgb.shape, smaller.label.shape) == ((24, 32, 3), (48, 64))
-
-
-def test_same_generator_same_example_and_no_other_draws() -> None:
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    one, other = (cmx().train(sample(), np.random.default_rng(9)) for _ in range(2))
-    np.testing.assert_array_equal(one.rgb, other.rgb)
-    np.testing.assert_array_equal(one.label, other.label)
-    assert one.centre_yx == other.centre_yx
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-
-
-def test_tracking_can_be_left_out() -> None:
-    example = cmx(track_position=False, factors=(0.5,)).train(sample(), np.random.default_rng(10))
-    assert example.position is None
-    assert image_part(example)[example.centre_yx]
-
-
-def test_configuration_names_every_setting_and_the_released_numbers() -> None:
-    node = yaml.safe_load(CONF.read_text())
-    assert set(node) == {"_target_", *inspect.signature(CmxTransform).parameters}
-    assert node["factors"] == [0.5, 0.75, 1, 1.25, 1.5, 1.75]
-    assert node["flip_probability"] == 0.5

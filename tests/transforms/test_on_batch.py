@@ -17,28 +17,14 @@ from rgbt.transforms.crm import CrmTransform
 from rgbt.transforms.hsv import to_hsv, to_rgb
 from rgbt.transforms.joint import View, bilinear_taps
 from rgbt.types import Batch, Sample
+from tests.transforms.recipes import crm
 
 SIZES = ((48, 64), (60, 50), (48, 64), (31, 77))
 """Of the originals; two of a kind."""
 
 
 def transform(**changes: Any) -> CrmTransform:
-    values: dict[str, Any] = {
-        "sizes": (24, 30, 48, 61, 96),
-        "max_size": 140,
-        "crop_hw": (22, 24),
-        "flip_probability": 0.5,
-        "colour": "intended",
-        "colour_probability": 0.5,
-        "brightness_delta": 32.0,
-        "contrast_range": (0.5, 1.5),
-        "saturation_range": (0.5, 1.5),
-        "hue_delta": 18,
-        "thermal_contrast_range": (0.5, 1.5),
-        "test_short_edge": None,
-        "track_position": True,
-    }
-    return CrmTransform(**{**values, **changes})
+    return crm(**{"max_size": 140, "crop_hw": (22, 24), **changes})
 
 
 def sample(number: int, *, labelled: bool = True, confident: bool = False) -> Sample:

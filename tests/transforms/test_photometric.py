@@ -12,17 +12,11 @@ from rgbt.transforms.photometric import (
     scale_saturation,
     shift_hue,
 )
+from tests.transforms.recipes import JITTER
 
 
 def jitter(**changes: Any) -> ColourJitter:
-    values: dict[str, Any] = {
-        "probability": 0.5,
-        "brightness_delta": 32.0,
-        "contrast_range": (0.5, 1.5),
-        "saturation_range": (0.5, 1.5),
-        "hue_delta": 18,
-        "thermal_contrast_range": (0.5, 1.5),
-    }
+    values = {"probability": 0.5, **JITTER}
     return ColourJitter(**{**values, **changes})
 
 

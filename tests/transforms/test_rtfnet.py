@@ -1,19 +1,14 @@
 from __future__ import annotations
 
-import inspect
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from rgbt.transforms.joint import Part, View, nearest_source
 from rgbt.transforms.rtfnet import RtfnetTransform, draw_ends
-from rgbt.types import IGNORE, Sample
-
-CONF = Path(__file__).resolve().parents[2] / "conf" / "transform" / "rtfnet_released.yaml"
+from rgbt.types import Sample
 
 
 def rtfnet(**changes: Any) -> RtfnetTransform:
@@ -120,15 +115,6 @@ def test_the_mirrored_image_is_cut(mirrored: bool) -> None:
     assert ends == ({(9, 0), (9, 1)} if mirrored else {(0, 9), (0, 8)})
 
 
-def test_shapes_and_dtypes() -> None:
-    example = rtfnet(crop_hw=(24, 40)).train(ramps(), np.random.default_rng(5))
-    assert (example.rgb.shape, example.rgb.dtype) == ((24, 40, 3), np.uint8)
-    assert (example.thermal.shape, example.thermal.dtype) == ((24, 40), np.uint8)
-    assert (example.label.shape, example.label.dtype) == ((24, 40), np.uint8)
-    assert (example.original_hw, example.name) == ((48, 64), "00001D")
-    assert rtfnet(track_position=False).train(ramps(), np.random.default_rng(5)).position is None
-
-
 def test_nothing_cut_and_nothing_mirrored_is_the_file() -> None:
     original = ramps()
     still = rtfnet(cut_share=0.0, flip_probability=0.0)
@@ -137,23 +123,3 @@ def test_nothing_cut_and_nothing_mirrored_is_the_file() -> None:
         np.testing.assert_array_equal(example.thermal, original.thermal)
         np.testing.assert_array_equal(example.label, original.label)
         assert example.centre_yx == (24, 32)
-
-
-def test_same_generator_same_example_and_no_other_draws() -> None:
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    one, other = (rtfnet().train(ramps(), np.random.default_rng(7)) for _ in range(2))
-    np.testing.assert_array_equal(one.rgb, other.rgb)
-    np.testing.assert_array_equal(one.label, other.label)
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-
-
-def test_without_a_label_everything_is_ignored() -> None:
-    full = ramps()
-    bare = Sample(rgb=full.rgb, thermal=full.thermal, label=None, name="x")
-    assert (rtfnet().train(bare, np.random.default_rng(8)).label == IGNORE).all()
-
-
-def test_configuration_names_every_setting_and_the_released_numbers() -> None:
-    node = yaml.safe_load(CONF.read_text())
-    assert set(node) == {"_target_", *inspect.signature(RtfnetTransform).parameters}
-    assert (node["flip_probability"], node["cut_share"]) == (0.5, 0.1)

@@ -180,13 +180,6 @@ def test_evaluation_keeps_the_label_of_the_file() -> None:
     np.testing.assert_array_equal(full.rgb, original.rgb)
 
 
-def test_same_generator_same_example() -> None:
-    transform = thesis(blur_probability=0.5)
-    one, other = (transform.train(sample(), np.random.default_rng(10)) for _ in range(2))
-    np.testing.assert_array_equal(one.rgb, other.rgb)
-    np.testing.assert_array_equal(one.confidence, other.confidence)
-
-
 def test_configurations_name_every_setting_and_differ_where_they_say() -> None:
     node = yaml.safe_load((conf_dir() / "transform" / "thesis.yaml").read_text())
     assert set(node) == {"_target_", *inspect.signature(ThesisTransform).parameters}

@@ -139,20 +139,6 @@ def test_the_homography_is_that_of_the_order(make: Any) -> None:
     assert np.abs(found - other).max() > 0.1
 
 
-def test_released_views_have_the_rectangles_of_the_release() -> None:
-    # yaw, pitch, roll -> first and last + 1 column, first and last + 1 row of what is cut.
-    cuts = {
-        (4, 7, 1): (63, 639, 0, 375),
-        (-9, 4, -1): (0, 512, 0, 409),
-        (9, 9, 4): (137, 639, 0, 335),
-        (-10, -10, -5): (0, 484, 148, 479),
-        (0, 0, 4): (17, 621, 22, 456),
-    }
-    found = released().warp(angles(*cuts), (480, 640)).rectangle
-    expected = [(x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5) for x0, x1, y0, y1 in cuts.values()]
-    assert found.tolist() == [list(each) for each in expected]
-
-
 def test_rotation_does_not_cut_and_translation_does_nothing_else() -> None:
     triple = angles((4, 7, 1))
     both, rotation, translation = (
@@ -306,49 +292,6 @@ def test_released_images_are_whole_bytes_and_those_of_the_paper_are_not(make: An
         assert off < 1e-3 if make is released else off > 0.4
 
 
-def test_labels_may_be_larger_than_images() -> None:
-    view = paper()
-    large = (2 * HW[0], 2 * HW[1])
-    batch = scene(label_hw=large)
-    triple = angles((-9, 4, -1))
-    found = view.batch(batch, view.warp(triple, HW))
-    assert found.rgb.shape[2:] == HW
-    assert found.label.shape[1:] == large
-    alone = view.warp(triple, large).nearest(batch.label, 255)
-    assert (found.label != alone).float().mean() < 1e-4  # equal but for rounding on an edge
-
-
-@pytest.mark.parametrize("triple", [(4, 7, 1), (-9, 4, -1), (9, 9, 4), (-10, -10, -5)])
-def test_released_views_are_those_of_opencv(triple: tuple[int, int, int]) -> None:
-    """Warp, cut and resize as OpenCV does them one after the other."""
-    hw, batch = (480, 640), scene(hw=(480, 640), label_hw=(480, 640))
-    view = released()
-    found = view.batch(batch, view.warp(angles(triple), hw))
-    homography = by_hand(*triple, "zxy")
-    left, top, right, bottom = (view.warp(angles(triple), hw).rectangle[0] + 0.5).int().tolist()
-
-    def plain(image: np.ndarray, flags: int) -> np.ndarray:
-        warped = cv2.warpPerspective(image, homography, hw[::-1], flags=flags)
-        return cv2.resize(warped[top:bottom, left:right], hw[::-1], interpolation=flags)
-
-    image = plain(batch.rgb[0].permute(1, 2, 0).numpy(), cv2.INTER_LINEAR)
-    difference = np.abs(found.rgb[0].permute(1, 2, 0).numpy() - image)
-    assert difference.max() < 0.02  # OpenCV rounds places to 1/32 pixel
-    label = plain(batch.label[0].numpy().astype(np.float32), cv2.INTER_NEAREST)
-    assert (found.label[0].numpy() != label).mean() < 0.005
-
-
-def test_the_gradient_of_a_prediction_passes_through_a_view() -> None:
-    logits = torch.rand(1, 3, *HW, requires_grad=True)
-    warped = paper().warp(angles((4, 7, 1)), HW).bilinear(logits)
-    warped.sum().backward()
-    assert logits.grad is not None
-    # Every pixel of the view is a mean of pixels: their weights add up to the number of pixels.
-    assert float(logits.grad.sum()) == pytest.approx(3 * HW[0] * HW[1], rel=1e-4)
-    assert not logits.grad[..., -5:].any()  # what moved out of the picture on the right
-    assert not logits.grad[..., :10, :].any()  # and at the top
-
-
 # ---- what is refused ------------------------------------------------------------------------
 
 LITTLE = (
@@ -392,13 +335,3 @@ def test_a_turn_that_shows_nothing_has_no_labels() -> None:
     warp = view.warp(angles((50, 0, 0)), HW)  # given, not drawn: nothing is refused
     assert not warp.inside().any()
     assert (view.batch(scene(), warp).label == 255).all()
-
-
-def test_a_camera_of_other_images_is_refused() -> None:
-    with pytest.raises(InputError, match="intrinsics of another image size"):
-        paper().warp(angles((0, 0, 0)), (96, 96))
-
-
-def test_a_single_angle_that_leaves_nothing_is_named() -> None:
-    with pytest.raises(InputError, match="yaw 80, pitch 2, roll 3 degrees"):
-        paper().check(angles((0, 0, 0), (80, 2, 3)))

@@ -19,8 +19,15 @@ from rich.progress import Progress, TaskID
 from rgbt.config.command import built
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.cache.dataset import CachedDataset, cached_dataset, check_cache
-from rgbt.data.cache.folder import OnProgress, gigabytes, remove, size_of
+from rgbt.data.cache.dataset import (
+    CachedDataset,
+    cached_dataset,
+    check_cache,
+    gigabytes,
+    remove,
+    size_of,
+)
+from rgbt.data.cache.sample_map import OnProgress
 from rgbt.dataset import LabelledDataset
 
 

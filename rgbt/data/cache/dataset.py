@@ -1,21 +1,30 @@
 """A data set whose images are decoded once and then read from memory-mapped files.
 
 Decoding a PNG of 480x640 pixels takes ten milliseconds; a view of the map takes almost no time, and
-a crop of it reads only its own pages. Nothing is augmented here. A sample is decoded again when one
-of its files changes, or when its bytes in the cache are damaged.
+a crop of it reads only its own pages. Nothing is augmented here.
+
+A cache is a sub-folder, named by the data set and a hash of all that decides what is decoded:
+
+    about.json   class, decoding settings, fingerprint and version, and the root then
+    *.frames     `rgbt.data.cache.sample_map`, one per call that found names in no other file
+    lock         held while files are written; the system releases it with the process
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
+import math
 import re
+import shutil
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +32,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.cache.file_state import are_unchanged, state_of
-from rgbt.data.cache.folder import (
-    FINGERPRINT,
-    ROOT,
-    CachedSample,
-    CacheFolder,
+from rgbt.data.cache.sample_map import (
     NewSample,
     OnProgress,
-    caches_like,
+    SampleMap,
+    are_unchanged,
+    state_of,
+    write_map,
 )
-from rgbt.data.cache.sample_file import bytes_of, crc_of
 from rgbt.data.synth.cache import default_cache
 from rgbt.dataset import DatasetWrapper, LabelledDataset, layers
+from rgbt.files.atomic import holder_of, holding, remove_left_behind, write_atomic
+from rgbt.files.budgets import read_json, sealed
 from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)
 
-FORMAT = 2
+FORMAT = 3
 """Version of the file format, a part of the cache's key."""
+
+ABOUT, LOCK = "about.json", "lock"
 
 NO_FOLDERS = ("", "none", "null", "true", "false", "yes", "no", "on", "off")
 """Words that are not accepted as the name of a folder."""
+
+WAYS_OUT = "or decode at every step with data.cache=null."
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -91,12 +103,9 @@ def cached_layer(dataset: LabelledDataset) -> CachedDataset | None:
 class CachedDataset(DatasetWrapper):
     """A data set whose samples are read from a cache after `ensure` has added them.
 
-    The cache is a sub-folder of `folder`, named by the class, `decoding()` and `fingerprint()` of
-    the data set and the version of the format. The cache keeps length, times and CRC-32 of each
-    file of a sample. If only the times differ the bytes are compared, so a copy of the data set
-    elsewhere uses the same cache. If files change so that the fingerprint changes, the new cache
-    takes the unchanged samples from the old one, which is kept until somebody removes it. The old
-    cache is the one with the same root; other data sets of the same name are never used.
+    The cache keeps length, times and CRC-32 of each file of a sample. If only the times differ the
+    bytes are compared, so a copy of the data set elsewhere uses the same cache. A file of the cache
+    in which a sample has changed, or which is damaged, is written anew as a whole.
 
     Args:
         dataset: is decoded; its samples must not carry confidences.
@@ -108,7 +117,7 @@ class CachedDataset(DatasetWrapper):
         super().__init__(dataset)
         self.folder = Path(folder)
         self.num_threads = num_threads
-        self._cached: dict[str, CachedSample] = {}
+        self._cached: dict[str, SampleMap] = {}
         self._unreadable: dict[str, str] = {}
 
     def ensure(self, names: tuple[str, ...], on_progress: OnProgress = _silent) -> None:
@@ -123,23 +132,28 @@ class CachedDataset(DatasetWrapper):
         Raises:
             InputError: the cache cannot be written, or the disk is too small.
         """
-        wanted = tuple(dict.fromkeys(names))
-        for name in wanted:
-            self._cached.pop(name, None)
-            self._unreadable.pop(name, None)
         about = self._about()
-        cache = CacheFolder(self.folder / _cache_name(about), about, self.num_threads)
-        cache.load(on_progress)
-        size = self._first_size(self._missing(cache, wanted))
-        if size is not None:
-            with cache.building():
-                self._adopt(cache)
-                cache.load(on_progress)
-                missing = self._missing(cache, wanted)
-                cache.check_space(size * len(missing))
-                with closing(self._decode_all(missing, on_progress)) as samples:
-                    cache.add(samples)
-        self._cached |= {name: cache.samples[name] for name in wanted if name in cache.samples}
+        cache = self.folder / _cache_name(about)
+        if not self._stale(cache, names, on_progress):
+            return
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            with _alone(cache):
+                # Once more: another process may have written it meanwhile.
+                for path, (stale, size) in self._stale(cache, names, on_progress).items():
+                    _check_space(cache, size * len(stale))
+                    self._warn_of_others(cache, about)
+                    write_atomic(cache / ABOUT, json.dumps(sealed(about)).encode())
+                    write_map(path, self._decoded(stale, on_progress))
+                    held = SampleMap(path)
+                    self._cached |= {name: held for name in names if name in held.records}
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            raise InputError(
+                f"data.cache: {f'the disk of {cache} is full' if full else f'cannot write {cache}'}"
+                f" ({error.strerror or error}); {'free some space, ' * full}name a writable folder "
+                f"with data.cache=FOLDER, {WAYS_OUT}"
+            ) from error
 
     def read(self, name: str) -> Sample:
         """The sample as `source.read` returns it, with its InputError.
@@ -149,9 +163,8 @@ class CachedDataset(DatasetWrapper):
         if name in self._unreadable:
             raise InputError(self._unreadable[name])
         if name in self._cached:
-            file, record = self._cached[name]
-            with suppress(OSError, ValueError):  # somebody removed the cache
-                return file.read(record)
+            with suppress(OSError, ValueError):  # somebody removed or replaced the file
+                return self._cached[name].read(name)
         return self.source.read(name)
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
@@ -159,8 +172,8 @@ class CachedDataset(DatasetWrapper):
         return self.read(name).label if name in self._cached else self.source.label(name)
 
     def caches(self) -> list[Path]:
-        """Caches in `folder` of this data set, and of former states of its files."""
-        return caches_like(self.folder, self._about())
+        """Caches in `folder` of this data set, of former states of its files, and of versions."""
+        return _caches_like(self.folder, self._about())
 
     def _about(self) -> dict[str, Any]:
         kind = type(self.source)
@@ -169,57 +182,73 @@ class CachedDataset(DatasetWrapper):
             "name": self.name,
             "class": f"{kind.__module__}.{kind.__qualname__}",
             "decoding": self.source.decoding(),
-            FINGERPRINT: self.source.fingerprint(),
-            ROOT: str(Path(self.root).resolve()),
+            "fingerprint": self.source.fingerprint(),
+            "root": str(Path(self.root).resolve()),
         }
         # As read from a file, where tuples are lists.
         return dict(json.loads(json.dumps(about)))
 
-    def _missing(self, cache: CacheFolder, names: tuple[str, ...]) -> list[str]:
-        """Names that are not in `cache`, or whose files have changed since."""
+    def _stale(
+        self, cache: Path, names: Iterable[str], on_progress: OnProgress
+    ) -> dict[Path, tuple[tuple[str, ...], int]]:
+        """Files to write -> all their names, and bytes of a sample; samples of others are used.
 
-        def is_missing(name: str) -> bool:
-            cached = cache.samples.get(name)
-            if cached is None:
-                return True
+        A file is written if one of its missing samples can be decoded.
+        """
+        left = dict.fromkeys(names)
+        for name in left:
+            self._cached.pop(name, None)
+            self._unreadable.pop(name, None)
+        stale = {}
+        for held in self._maps(cache, on_progress):
+            own = [name for name in left if name in held.records]
+            fresh = self._unchanged(held, own)
+            self._cached |= dict.fromkeys(fresh, held)
+            if size := self._first_size(name for name in own if name not in fresh):
+                stale[held.path] = (tuple(held.records), size)
+            left = {name: None for name in left if name not in held.records}
+        if size := self._first_size(left):
+            key = hashlib.sha256("\n".join(left).encode()).hexdigest()[:16]
+            stale[cache / f"{key}.frames"] = (tuple(left), size)
+        return stale
+
+    def _maps(self, cache: Path, on_progress: OnProgress) -> Iterator[SampleMap]:
+        for path in sorted(cache.glob("*.frames")):
+            with suppress(OSError, ValueError):  # damaged, not readable or just removed
+                held = SampleMap(path)
+                if held.is_intact(self.num_threads, on_progress):
+                    yield held
+
+    def _unchanged(self, held: SampleMap, names: list[str]) -> set[str]:
+        """Those of `names` whose files are as they were when `held` was written."""
+
+        def is_unchanged(name: str) -> bool:
             try:
-                return not are_unchanged(self.source.files(name), cached.record.sources)
+                return are_unchanged(self.source.files(name), held.records[name].sources)
             except InputError:  # `_decode` raises it again and keeps the message
-                return True
+                return False
 
         with ThreadPoolExecutor(self.num_threads) as pool:
-            results = pool.map(is_missing, names)
-            return [name for name, missing in zip(names, results, strict=True) if missing]
+            results = pool.map(is_unchanged, names)
+            return {name for name, unchanged in zip(names, results, strict=True) if unchanged}
 
-    def _first_size(self, names: list[str]) -> int | None:
-        """Bytes of the first of `names` that can be decoded; None if none can.
+    def _first_size(self, names: Iterable[str]) -> int:
+        """Bytes of the first of `names` that can be decoded; 0 if none can."""
+        found = (self._decode(name) for name in names)
+        return next((each.record.num_bytes for each in found if each is not None), 0)
 
-        A cache in which only undecodable samples are missing is not written to.
-        """
-        for result in self._results(names):
-            if result is not None:
-                return bytes_of(result.sample)
-        return None
-
-    def _decode_all(self, names: list[str], on_progress: OnProgress) -> Generator[NewSample]:
-        for done, result in enumerate(self._results(names), 1):
-            if result is not None:
-                yield result
-            on_progress("decoding", done, len(names))
-
-    def _results(self, names: list[str]) -> Iterator[NewSample | None]:
-        """Each of `names` decoded, in order; None for one that cannot be decoded."""
+    def _decoded(self, names: tuple[str, ...], on_progress: OnProgress) -> Iterator[NewSample]:
+        """Those of `names` that can be decoded, in order."""
         waiting: deque[Future[NewSample | None]] = deque()
-        pool = ThreadPoolExecutor(self.num_threads)
-        try:
-            for name in names:
-                waiting.append(pool.submit(self._decode, name))
-                if len(waiting) > 2 * self.num_threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with ThreadPoolExecutor(self.num_threads) as pool:
+            following = iter(names)
+            for done in range(1, len(names) + 1):
+                for name in islice(following, 1 + 2 * self.num_threads - len(waiting)):
+                    waiting.append(pool.submit(self._decode, name))
+                new = waiting.popleft().result()
+                if new is not None:
+                    yield new
+                on_progress("decoding", done, len(names))
 
     def _decode(self, name: str) -> NewSample | None:
         try:
@@ -234,20 +263,16 @@ class CachedDataset(DatasetWrapper):
             self._unreadable[name] = f"{error.filename or name}: {error.strerror or error}."
             return None
         assert sample.confidence is None, "pseudo-labels are added to the samples of the cache"
-        return NewSample(replace(sample, name=name), crc_of(sample), sources)
+        return NewSample(replace(sample, name=name), sources)
 
-    def _adopt(self, cache: CacheFolder) -> None:
-        """Start a new cache with the files of the most recent cache of the same data set."""
-        if cache.samples:
-            return
-        alike = [path for path in self.caches() if path != cache.folder]
-        if alike:
-            latest = max(alike, key=lambda path: path.stat().st_mtime_ns)
-            cache.adopt(latest)
+    def _warn_of_others(self, cache: Path, about: dict[str, Any]) -> None:
+        """Say once, when a cache is begun, that those of former states use space."""
+        others = [path for path in _caches_like(self.folder, about) if path != cache]
+        if others and not (cache / ABOUT).is_file():
             LOG.warning(
-                "%s has changed: %s takes the unchanged images from %s, which is kept; "
+                "%s has changed: %s is filled anew, and %s is kept; "
                 "rgbt cache ... remove=true removes such caches.",
-                *(self.name, cache.folder, latest),
+                *(self.name, cache, others[-1]),
             )
 
 
@@ -267,6 +292,63 @@ def _check_sample(sample: Sample) -> None:
 
 def _cache_name(about: dict[str, Any]) -> str:
     # Equal copies share one cache, whatever their root.
-    same = {key: value for key, value in about.items() if key != ROOT}
+    same = {key: value for key, value in about.items() if key != "root"}
     key = hashlib.sha256(json.dumps(same, sort_keys=True).encode()).hexdigest()[:16]
     return f"{re.sub(r'[^A-Za-z0-9_-]', '_', about['name'])}-{key}"
+
+
+def _caches_like(folder: Path, about: dict[str, Any]) -> list[Path]:
+    """Caches in `folder` of the same data set, decoded alike, by any version of the format.
+
+    The data set is the same if its files are equal, or if its root is.
+    """
+    alike = []
+    for path in sorted(folder.glob(f"*/{ABOUT}")):
+        with suppress(InputError):  # damaged or just removed
+            other = read_json(path, dict[str, Any], "")
+            differing = {key for key, value in about.items() if other.get(key) != value}
+            if differing - {"format"} in (set(), {"fingerprint"}, {"root"}):
+                alike.append(path.parent)
+    return alike
+
+
+def size_of(cache: Path) -> int:
+    """Bytes of the files of a cache."""
+    return sum(path.stat().st_size for path in cache.iterdir())
+
+
+def remove(cache: Path) -> None:
+    """Delete the files of a cache, of any version, and its folder if nothing else is in it."""
+    for pattern in ("*.frames", ".*.frames.*", ABOUT, "verified.json", LOCK):
+        for path in cache.glob(pattern):
+            path.unlink(missing_ok=True)
+    with suppress(OSError):
+        cache.rmdir()
+
+
+def gigabytes(num_bytes: int) -> str:
+    """A size in decimal units: 2410000000 -> "2.41 GB", 1500000 -> "1.5 MB"."""
+    return f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e8 else f"{num_bytes / 1e6:.1f} MB"
+
+
+@contextmanager
+def _alone(cache: Path) -> Iterator[None]:
+    """No other process writes to the cache meanwhile, unless its disk has no locks."""
+    with ExitStack() as locks:
+        with suppress(OSError):  # no locks: two processes may do the same work
+            writer = holder_of(cache / LOCK)
+            if locks.enter_context(holding(cache / LOCK)) is not None:
+                LOG.warning("waiting for another process that writes to %s", cache)
+                locks.enter_context(holding(cache / LOCK, wait_s=math.inf))
+            remove_left_behind(cache, writer)
+        yield
+
+
+def _check_space(cache: Path, needed: int) -> None:
+    free = shutil.disk_usage(cache).free
+    if free < needed:
+        raise InputError(
+            f"data.cache: the decoded images need about {gigabytes(needed)} in {cache}, but the "
+            f"disk has {gigabytes(free)} left; free some space, name a folder on another disk with "
+            f"data.cache=FOLDER, {WAYS_OUT}"
+        )

@@ -15,6 +15,7 @@ from rgbt.data.synth.shapes import (
     rectangle,
     shape_of,
     sideways,
+    thin,
     tube,
     upright,
 )
@@ -33,7 +34,7 @@ def building() -> Shape:
 @cache
 def vent() -> Shape:
     """A warm outlet on a wall: a distractor that only the thermal camera notices."""
-    return shape_of([Face(sideways(rectangle(-0.5, 0.0, 0.5, 0.7)), "vent", thin=True)])
+    return shape_of([thin(sideways(rectangle(-0.5, 0.0, 0.5, 0.7)), "vent")])
 
 
 @cache
@@ -52,11 +53,9 @@ def tree(kind: int, near: bool = True) -> Shape:
     Trees that are not `near` have no branches, and three blobs rather than six.
     """
     generator = numpy_generator(0, "synth/tree", kind)
-    parts = [Face(upright(tube((0, 0), (0.1, 2.8), 0.30)), "bark", thin=True)]
+    parts = [thin(upright(tube((0, 0), (0.1, 2.8), 0.30)), "bark")]
     if near:
-        parts += [
-            Face(upright(tube((0.08, 2.0), (x, 3.6), 0.12)), "bark", thin=True) for x in (-0.8, 0.9)
-        ]
+        parts += [thin(upright(tube((0.08, 2.0), (x, 3.6), 0.12)), "bark") for x in (-0.8, 0.9)]
     for level, material in enumerate(
         ("leaf_dark", "leaf_dark", "leaf", "leaf", "leaf_light", "leaf_light")
     ):
@@ -65,7 +64,7 @@ def tree(kind: int, near: bool = True) -> Shape:
         radius = float(generator.uniform(1.0, 1.5)) * (1.1 - 0.09 * level)
         blob = _blob(generator, x, y, radius)
         if near or level % 2 == 0:
-            parts.append(Face(upright(blob, -0.04 * level), material, thin=True))
+            parts.append(thin(upright(blob, -0.04 * level), material))
     return shape_of(parts)
 
 
@@ -85,10 +84,7 @@ def hedge() -> Shape:
     """A hedge of one cubic metre with a ragged end, scaled to the length of its plot."""
     generator = numpy_generator(0, "synth/hedge")
     parts = box((-0.5, 0.0, -0.5), (0.5, 0.9, 0.5), ("leaf_dark", "leaf", "leaf_light"))
-    parts += [
-        Face(upright(_blob(generator, x, 0.72, 0.34), -0.51), "leaf", thin=True)
-        for x in (-0.2, 0.2)
-    ]
+    parts += [thin(upright(_blob(generator, x, 0.72, 0.34), -0.51), "leaf") for x in (-0.2, 0.2)]
     return shape_of(parts)
 
 
@@ -97,10 +93,10 @@ def street_lamp() -> Shape:
     """A pole of 6.5 m with an arm towards +x and a lamp."""
     return shape_of(
         [
-            Face(upright(rectangle(-0.07, 0.0, 0.07, 6.4)), "pole", thin=True),
-            Face(upright(rectangle(0.0, 6.3, 1.5, 6.4)), "pole", thin=True),
-            Face(upright(rectangle(1.0, 6.2, 1.7, 6.36), -0.01), "lamp", thin=True),
-            Face(sideways(rectangle(-0.3, 6.2, 0.3, 6.34), 1.4), "lamp", thin=True),
+            thin(upright(rectangle(-0.07, 0.0, 0.07, 6.4)), "pole"),
+            thin(upright(rectangle(0.0, 6.3, 1.5, 6.4)), "pole"),
+            thin(upright(rectangle(1.0, 6.2, 1.7, 6.36), -0.01), "lamp"),
+            thin(sideways(rectangle(-0.3, 6.2, 0.3, 6.34), 1.4), "lamp"),
         ]
     )
 
@@ -110,10 +106,10 @@ def utility_pole() -> Shape:
     """A concrete pole of 9 m with cross-arms and a warm transformer."""
     return shape_of(
         [
-            Face(upright(rectangle(-0.15, 0.0, 0.15, 9.0)), "pole", thin=True),
-            Face(upright(rectangle(-0.9, 8.2, 0.9, 8.34), -0.01), "pole", thin=True),
-            Face(upright(rectangle(-0.7, 7.4, 0.7, 7.52), -0.01), "pole", thin=True),
-            Face(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "transformer", thin=True),
+            thin(upright(rectangle(-0.15, 0.0, 0.15, 9.0)), "pole"),
+            thin(upright(rectangle(-0.9, 8.2, 0.9, 8.34), -0.01), "pole"),
+            thin(upright(rectangle(-0.7, 7.4, 0.7, 7.52), -0.01), "pole"),
+            thin(upright(rectangle(0.16, 6.3, 0.66, 7.1), -0.02), "transformer"),
         ]
     )
 
@@ -121,7 +117,7 @@ def utility_pole() -> Shape:
 @cache
 def wire() -> Shape:
     """A cable of one metre along z, scaled to the distance of two poles."""
-    return shape_of([Face(sideways(rectangle(0.0, 0.0, 1.0, 0.05)), "wire", thin=True)])
+    return shape_of([thin(sideways(rectangle(0.0, 0.0, 1.0, 0.05)), "wire")])
 
 
 NUM_SIGNS = 3
@@ -130,18 +126,16 @@ NUM_SIGNS = 3
 @cache
 def sign(kind: int) -> Shape:
     """A traffic sign: round and red-rimmed, square and blue, or a white board."""
-    parts = [Face(upright(rectangle(-0.04, 0.0, 0.04, 2.7)), "pole", thin=True)]
+    parts = [thin(upright(rectangle(-0.04, 0.0, 0.04, 2.7)), "pole")]
     if kind == 0:
         rings = ((0.34, "sign_red"), (0.25, "sign_white"), (0.12, "sign_blue"))
         parts += [
-            Face(upright(disc(0, 2.6, radius), -0.01 * n), name, thin=True)
+            thin(upright(disc(0, 2.6, radius), -0.01 * n), name)
             for n, (radius, name) in enumerate(rings, 1)
         ]
     else:
         plate = rectangle(-0.32, 2.2, 0.32, 2.9) if kind == 1 else rectangle(-0.25, 1.6, 0.25, 2.9)
-        parts.append(
-            Face(upright(plate, -0.01), "sign_blue" if kind == 1 else "sign_white", thin=True)
-        )
+        parts.append(thin(upright(plate, -0.01), "sign_blue" if kind == 1 else "sign_white"))
     return shape_of(parts)
 
 
@@ -157,7 +151,7 @@ def vending_machine() -> Shape:
 @cache
 def skyline() -> Shape:
     """One square metre facing the camera, scaled to a block on the horizon."""
-    return shape_of([Face(upright(rectangle(-0.5, 0.0, 0.5, 1.0)), "far_wall", paint=1, thin=True)])
+    return shape_of([thin(upright(rectangle(-0.5, 0.0, 0.5, 1.0)), "far_wall", paint=1)])
 
 
 @cache
@@ -165,7 +159,5 @@ def far_trees() -> Shape:
     """A line of trees on the horizon, 10 m by 1 m, scaled to size."""
     generator = numpy_generator(0, "synth/far_trees")
     blobs = [_blob(generator, x, 0.40, 0.95) for x in np.linspace(-4.6, 4.6, 7).tolist()]
-    parts = [Face(upright(rectangle(-5.4, 0.0, 5.4, 0.65)), "leaf_dark", thin=True)]
-    return shape_of(
-        [*parts, *(Face(upright(blob, -0.01), "leaf_dark", thin=True) for blob in blobs)]
-    )
+    parts = [thin(upright(rectangle(-5.4, 0.0, 5.4, 0.65)), "leaf_dark")]
+    return shape_of([*parts, *(thin(upright(blob, -0.01), "leaf_dark") for blob in blobs)])

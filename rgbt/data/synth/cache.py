@@ -7,16 +7,10 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any
 
 from rgbt.checks import InputError
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Plan = TypeVar("Plan", bound="DataclassInstance")
 
 
 def default_cache() -> Path:
@@ -27,10 +21,9 @@ def default_cache() -> Path:
 
 def written_once(
     name: str,
-    versions: Mapping[str, int],
-    plan: Plan,
+    plan: Mapping[str, Any],
     cache_dir: str | Path | None,
-    write: Callable[[Plan, Path], None],
+    write: Callable[[Path], None],
 ) -> Path:
     """The folder of a data set, written now if it is not there yet.
 
@@ -38,16 +31,15 @@ def written_once(
     leaves nothing that looks like a data set, and two at once cannot mix.
 
     Args:
-        name: of the data set; begins the name of the folder, which a hash of the next two ends.
-        versions: of what writes it.
-        plan: what it is made from, kept in it as plan.json.
+        name: of the data set; begins the name of the folder, which a hash of the plan ends.
+        plan: all that its bytes follow from; kept in it as plan.json.
         cache_dir: folder that holds written data sets; None: `default_cache`.
         write: fills the empty folder that it is given.
 
     Raises:
         InputError: the cache cannot be written.
     """
-    text = json.dumps({**versions, **asdict(plan)}, sort_keys=True, indent=1)
+    text = json.dumps(plan, sort_keys=True, indent=1)
     cache = Path(cache_dir).expanduser() if cache_dir else default_cache()
     folder = cache / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if folder.is_dir():
@@ -57,7 +49,7 @@ def written_once(
         with tempfile.TemporaryDirectory(prefix=".synth-", dir=cache) as scratch:
             made = Path(scratch) / "made"
             made.mkdir()
-            write(plan, made)
+            write(made)
             (made / "plan.json").write_text(text + "\n", encoding="utf-8")
             _publish(made, folder)
     except OSError as error:

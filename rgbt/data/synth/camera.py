@@ -149,26 +149,3 @@ def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> 
         raise ValueError("flow_between: the two cameras must be the same but for where they stand.")
     rows, columns = (points[axis] / ahead - rays[axis] for axis in (1, 0))
     return np.asarray(np.stack([rows, columns], axis=2) * np.float32(focal), np.float32)
-
-
-def ground_homography(source: SynthCamera, target: SynthCamera) -> NDArray[np.float64]:
-    """Homography that maps ground pixels of `source` to `target`.
-
-        H = K' (R' R^T + R' (C - C') n^T / d) K^-1
-
-    with n the downward normal of the ground in camera coordinates of `source` and d its height.
-
-    Returns:
-        (3, 3) float64 for homogeneous (column, row, 1), scaled to H[2, 2] = 1.
-    """
-    turn = target.rotation @ source.rotation.T
-    shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
-    normal = source.rotation @ np.array([0.0, -1.0, 0.0])
-    plane = np.outer(shift, normal) / source.position[1]
-    homography = _intrinsics(target) @ (turn + plane) @ np.linalg.inv(_intrinsics(source))
-    return np.asarray(homography / homography[2, 2])
-
-
-def _intrinsics(camera: SynthCamera) -> NDArray[np.float64]:
-    column, row = camera.centre
-    return np.array([[camera.focal, 0, column], [0, camera.focal, row], [0, 0, 1.0]])

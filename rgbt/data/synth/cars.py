@@ -14,6 +14,7 @@ from rgbt.data.synth.shapes import (
     rectangle,
     shape_of,
     sideways,
+    thin,
     upright,
 )
 
@@ -80,8 +81,8 @@ def _shell(body: _Body, half: float) -> list[Face]:
     return [
         Face(sideways(side, -half), "paint", CAR, 1),
         Face(sideways(side, half), "paint", CAR, 1),
-        Face(hood, "hood", CAR, 1, thin=True),
-        Face(trunk, "paint", CAR, 1, thin=True),
+        thin(hood, "hood", CAR, 1),
+        thin(trunk, "paint", CAR, 1),
         Face(nose, "hood", CAR, 1),
         Face(rear, "paint", CAR, 1),
     ]

@@ -1,13 +1,19 @@
-"""The data set `synth`: written into a cache folder on first use, then read like MFNet."""
+"""The data set `synth`: scenes in MFNet's layout, written on first use and read like MFNet.
+
+images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
+train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
+next/               the same names after the ego-motion, with flow/NAME.npy, if requested
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Literal
+
+import numpy as np
 
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.data.synth.cache import written_once
 from rgbt.data.synth.factors import (
     EgoMotion,
     ForwardMetres,
@@ -16,11 +22,9 @@ from rgbt.data.synth.factors import (
     YawDegrees,
     with_factors,
 )
-from rgbt.data.synth.writer import SynthPlan, write
+from rgbt.data.synth.scene import Scene
+from rgbt.data.synth.writer import VERSION, Images, Layout, Plan, Shot, bgr
 from rgbt.ranges import Seed, Text
-
-VERSION = 2
-"""Of the generator. Raise it with every change that changes a byte, so that no cache is stale."""
 
 
 @with_factors()
@@ -63,17 +67,40 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
             "set dataset.ego_forward_m too (0 to turn on the spot)."
         )
     motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
-    plan = SynthPlan(
-        seed=seed,
-        num_train=num_train,
-        num_val=num_val,
-        num_test=num_test,
-        factors=factors,
-        motion=motion,
-    )
-    return MFNet(str(cached(plan, cache_dir)), name="synth", num_classes=num_classes)
+    numbers = {"num_train": num_train, "num_val": num_val, "num_test": num_test}
+    plan = Plan(seed=seed, numbers=numbers, factors=factors, motion=motion)
+    return MFNet(str(LAYOUT.cached(plan, cache_dir)), name="synth", num_classes=num_classes)
 
 
-def cached(plan: SynthPlan, cache_dir: str | Path | None) -> Path:
-    """The folder of `plan`, see `written_once`."""
-    return written_once("synth", {"version": VERSION}, plan, cache_dir, write)
+def _shots(plan: Plan) -> list[Shot]:
+    """Names have five digits and D (day) or N (night), as in MFNet."""
+    return [
+        Shot(scene, split, night, f"{scene:05d}{'N' if night else 'D'}")
+        for split, scenes in plan.splits
+        for scene in scenes
+        for night in [plan.is_night(scene)]
+    ]
+
+
+def _images(scene: Scene, shot: Shot) -> Images:
+    return {
+        # The fourth channel, alpha, is thermal.
+        f"images/{shot.name}.png": np.dstack([bgr(scene), scene.thermal]),
+        f"labels/{shot.name}.png": scene.label,
+    }
+
+
+def _lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    lists: dict[str, list[str]] = {
+        f"{split}.txt": [] for split in ("train", "val", "test", "test_day", "test_night")
+    }
+    for shot in shots:
+        lists[f"{shot.split}.txt"].append(shot.name)
+        if shot.split == "test":
+            lists[f"test_{'night' if shot.night else 'day'}.txt"].append(shot.name)
+    return lists
+
+
+LAYOUT = Layout(
+    name="synth", versions={"version": VERSION}, shots=_shots, images=_images, lists=_lists
+)

@@ -16,6 +16,7 @@ from rgbt.data.synth.shapes import (
     rectangle,
     shape_of,
     sideways,
+    thin,
     upright,
 )
 
@@ -47,7 +48,7 @@ def _wedge(
     for side in (-1, 1):
         outline: list[Point] = [(0.0, low, -low_half), (side * low_half, low, 0.0)]
         outline += [(side * high_half, high, 0.0), (0.0, high, -high_half)]
-        parts.append(Face(outline, material, label, thin=True))
+        parts.append(thin(outline, material, label))
     return parts
 
 
@@ -93,22 +94,17 @@ def guardrail() -> Shape:
         (0.70, 0.86, "rail_light"),
     )
     parts = [
-        Face(sideways(rectangle(ends[0], low, ends[1], high)), material, GUARDRAIL, thin=True)
+        thin(sideways(rectangle(ends[0], low, ends[1], high)), material, GUARDRAIL)
         for low, high, material in strips
     ]
     parts.append(
-        Face(
+        thin(
             sideways(rectangle(ends[0], 0.0, ends[0] + 0.14, 0.92)),
             "rail_dark",
             GUARDRAIL,
-            thin=True,
         )
     )
-    parts.append(
-        Face(
-            upright(rectangle(-0.07, 0.0, 0.07, 0.92), ends[0]), "rail_light", GUARDRAIL, thin=True
-        )
-    )
+    parts.append(thin(upright(rectangle(-0.07, 0.0, 0.07, 0.92), ends[0]), "rail_light", GUARDRAIL))
     return shape_of(parts)
 
 
@@ -124,8 +120,6 @@ def bump() -> Shape:
             x0, x1 = (number / NUM_STRIPES - 0.5, (number + 1) / NUM_STRIPES - 0.5)
             material = "black_band" if number % 2 else "yellow"
             corners: list[Point] = [(x0, 0.0, z), (x1, 0.0, z), (x1, 0.08, peak), (x0, 0.08, peak)]
-            parts.append(Face(corners, material, BUMP, thin=True))
+            parts.append(thin(corners, material, BUMP))
     top = [(-0.5, 0.08, -0.12), (0.5, 0.08, -0.12), (0.5, 0.08, 0.12), (-0.5, 0.08, 0.12)]
-    return shape_of(
-        [*parts[:NUM_STRIPES], Face(top, "yellow", BUMP, thin=True), *parts[NUM_STRIPES:]]
-    )
+    return shape_of([*parts[:NUM_STRIPES], thin(top, "yellow", BUMP), *parts[NUM_STRIPES:]])

@@ -7,28 +7,54 @@ labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rgbt.data.kp import KP
-from rgbt.data.kp_layout import is_night as is_night_name
-from rgbt.data.kp_layout import sets_of
-from rgbt.data.synth.cache import written_once
-from rgbt.data.synth.classes import kp_ids
-from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
+from rgbt.data.kp import CLASSES, KP
+from rgbt.data.synth import people
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
-from rgbt.data.synth.light import is_night
-from rgbt.data.synth.scene import render_scene
-from rgbt.data.synth.writer import SynthPlan, bgr, write_each, write_image, write_list
+from rgbt.data.synth.materials import class_table, ids_in
+from rgbt.data.synth.scene import Scene
+from rgbt.data.synth.shapes import PERSON
+from rgbt.data.synth.writer import VERSION, Images, Layout, Plan, Shot, bgr
 from rgbt.ranges import Seed, Text
 
-VERSION = 1
-"""Of the files beside the scenes. Raise it with every change that changes a byte of them."""
-
 _FRAMES_PER_VIDEO = 40
+
+_SETS = {
+    ("train", False): (0, 1, 2),
+    ("train", True): (3, 4, 5),
+    ("val", False): (6,),
+    ("val", True): (10,),
+    ("test", False): (7, 8),
+    ("test", True): (9, 11),
+}
+"""(split, night) -> recordings that the CRM release gives to it."""
+
+VOID = "void"
+"""What has no class: the id after the last one, ignored in training and in every score."""
+
+BY_LABEL = ("car", "person", "bicycle", "sidewalk", VOID, "fence", VOID, "road")
+"""Class of MFNet's labels 1 to 8; a person on a bicycle is a "rider"."""
+
+OF_SCENERY = {
+    "road": ("asphalt", "patch", "line", "manhole"),
+    "sidewalk": ("paving",),
+    "building": ("facade", "facade_side", "far_wall", "vent"),
+    "wall": ("wall",),
+    "pole": ("pole", "lamp", "transformer"),
+    "traffic_sign": ("sign_blue", "sign_red", "sign_white"),
+    "vegetation": ("leaf_dark", "leaf", "leaf_light", "bark"),
+    "terrain": ("grass",),
+    "sky": ("sky",),
+    VOID: ("wire", "vending", "vending_body"),
+}
+"""Materials of what MFNet leaves unlabelled, by class."""
+
+TABLE = class_table([*CLASSES, VOID], BY_LABEL, OF_SCENERY)
 
 
 @with_factors(night_share=0.48)
@@ -44,60 +70,65 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
 ) -> KP:
     """The data set with these factors, generated on first use.
 
-    Five of the 19 classes are in no scene (see `rgbt.data.synth.classes`): where absent classes
-    count as 0, as in the published tables, no network scores more than 14 / 19 = 73.7 %.
+    Five of the 19 classes are in no scene (see `kp_ids`): where absent classes count as 0, as in
+    the published tables, no network scores more than 14 / 19 = 73.7 %.
 
     Args and errors as of `rgbt.data.synth.dataset.synth`, without a second frame.
     """
-    plan = SynthPlan(
-        seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors
-    )
-    return KP(str(cached(plan, cache_dir)), name="synth_kp", num_classes=num_classes)
+    numbers = {"num_train": num_train, "num_val": num_val, "num_test": num_test}
+    plan = Plan(seed=seed, numbers=numbers, factors=factors)
+    return KP(str(LAYOUT.cached(plan, cache_dir)), name="synth_kp", num_classes=num_classes)
 
 
-def cached(plan: SynthPlan, cache_dir: str | Path | None) -> Path:
-    """The folder of `plan`, see `written_once`."""
-    versions = {"scenes": SCENES_VERSION, "files": VERSION}
-    return written_once("synth_kp", versions, plan, cache_dir, write)
-
-
-def write(plan: SynthPlan, folder: Path) -> None:
-    """Write the whole data set into `folder`, which exists; OSError if that is not possible."""
-    by_split = names_of(plan)
-    names = [name for split in by_split.values() for name in split]
-    write_each(partial(_write_numbered, plan, names, folder), plan.num_scenes)
-    for split, own in by_split.items():
-        nights = {name for name in own if is_night_name(name)}
-        for suffix, listed in (("", own), ("_day", set(own) - nights), ("_night", nights)):
-            if listed:
-                path = folder / f"{split}{suffix}.txt"
-                write_list(path, [f"{name}.png" for name in sorted(listed)])
-
-
-def names_of(plan: SynthPlan) -> dict[str, list[str]]:
-    """Split -> names of its scenes.
-
-    The recordings are those that the CRM release gives to a split, by day and at night.
-    """
-    found: dict[str, list[str]] = {}
-    for split, scenes in plan.splits.items():
-        nights = [is_night(plan.seed, scene, plan.factors.night_share) for scene in scenes]
-        found[split] = []
+def _shots(plan: Plan) -> list[Shot]:
+    shots = []
+    for split, scenes in plan.splits:
+        nights = [plan.is_night(scene) for scene in scenes]
         for number, (scene, night) in enumerate(zip(scenes, nights, strict=True)):
             # How many scenes of the same time of day come before this one.
             before = nights[:number].count(night)
-            sets = sets_of(f"{split}_{'night' if night else 'day'}")
+            sets = _SETS[split, night]
             recording = sets[before * len(sets) // nights.count(night)]
-            found[split].append(
-                f"set{recording:02d}_V{before // _FRAMES_PER_VIDEO:03d}_I{scene:05d}"
-            )
-    return found
+            name = f"set{recording:02d}_V{before // _FRAMES_PER_VIDEO:03d}_I{scene:05d}"
+            shots.append(Shot(scene, split, night, name))
+    return shots
 
 
-def _write_numbered(plan: SynthPlan, names: list[str], folder: Path, number: int) -> None:
-    scene = render_scene(plan.seed, number, plan.factors)
-    recording, video, frame = names[number].split("_")
-    images = folder / "images" / recording / video
-    write_image(images / "visible" / f"{frame}.jpg", bgr(scene))
-    write_image(images / "lwir" / f"{frame}.jpg", np.repeat(scene.thermal[..., None], 3, axis=2))
-    write_image(folder / "labels" / f"{names[number]}.png", kp_ids(scene))
+def _images(scene: Scene, shot: Shot) -> Images:
+    recording, video, frame = shot.name.split("_")
+    folder = f"images/{recording}/{video}"
+    return {
+        f"{folder}/visible/{frame}.jpg": bgr(scene),
+        f"{folder}/lwir/{frame}.jpg": np.repeat(scene.thermal[..., None], 3, axis=2),
+        f"labels/{shot.name}.png": kp_ids(scene),
+    }
+
+
+def _lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    lists: dict[str, list[str]] = {}
+    for shot in sorted(shots, key=lambda shot: shot.name):
+        for suffix in ("", "_night" if shot.night else "_day"):
+            lists.setdefault(f"{shot.split}{suffix}.txt", []).append(f"{shot.name}.png")
+    return lists
+
+
+def kp_ids(scene: Scene) -> NDArray[np.uint8]:
+    """Class ids of KP, those of Cityscapes: (H, W) uint8, 0 to 19.
+
+    Of the 19 classes five are never there: traffic_light, truck, bus, train, motorcycle; vans are
+    cars as in Cityscapes. Guardrails are "fence" so that there is one; Cityscapes gives them no
+    class.
+    """
+    ids = ids_in(TABLE, scene.label, scene.material)
+    ridden = [n for n, thing in enumerate(scene.placed) if thing.shape is people.bike(True)]
+    on_bike = (scene.label == PERSON) & np.isin(scene.owner, ridden)
+    return np.where(on_bike, np.uint8(CLASSES.index("rider")), ids)
+
+
+LAYOUT = Layout(
+    name="synth_kp",
+    versions={"scenes": VERSION, "files": 1},
+    shots=_shots,
+    images=_images,
+    lists=_lists,
+)

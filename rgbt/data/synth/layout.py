@@ -34,7 +34,11 @@ def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> l
     for number in range(factors.num_objects):
         # Low-discrepancy in number: distances are spread however many groups there are.
         share = (u[7] + number * _GOLDEN) % 1.0
-        placed += _group(road, near[number * _MAX_GROUP : (number + 1) * _MAX_GROUP], share)
+        rows = near[number * _MAX_GROUP : (number + 1) * _MAX_GROUP]
+        # The first row chooses kind and side.
+        nearest, farthest, place = groups.GROUPS[_KINDS[bisect(_NEAR_SHARES, rows[0][0])]]
+        z = nearest * (farthest / nearest) ** share
+        placed += place(road, rows, z, -1 if rows[0][1] < 0.5 else 1)
     far = draw_rows(seed, index, "far", factors.num_far_objects)
     return _without_collisions(placed + [_far_object(road, row) for row in far])
 
@@ -57,13 +61,6 @@ def _without_collisions(placed: list[Placed]) -> list[Placed]:
             kept.append(thing)
             taken.append((x, z, across, along, is_car))
     return kept
-
-
-def _group(road: Road, rows: list[Row], share: float) -> list[Placed]:
-    """Members of one near group; the first row chooses its kind and side."""
-    nearest, farthest, place = groups.GROUPS[_KINDS[bisect(_NEAR_SHARES, rows[0][0])]]
-    z = nearest * (farthest / nearest) ** share
-    return place(road, rows, z, -1 if rows[0][1] < 0.5 else 1)
 
 
 def _far_object(road: Road, row: Row) -> Placed:
@@ -93,18 +90,16 @@ def _structures(road: Road, u: list[float]) -> list[Placed]:
             z = 3.5 + 7 * u[2] + furniture.RAIL_STEP_M * number
             placed.append(Placed(furniture.guardrail(), road.x(z, lateral), z, yaw=road.heading(z)))
     if u[4] < 0.6:
-        placed.append(_bump(road, 4.2 + 7.5 * u[5] ** 1.3, both_lanes=u[6] < 0.6))
+        both_lanes, z = u[6] < 0.6, 4.2 + 7.5 * u[5] ** 1.3
+        width = 2 * road.half_width - 0.3 if both_lanes else road.half_width - 0.2
+        bump = Placed(
+            furniture.bump(),
+            road.x(z, 0.0 if both_lanes else -road.half_width / 2),
+            z,
+            yaw=road.heading(z),
+            scale=(width, 1.0, 1.0),
+            layer=GROUND,
+            shadow_from=NO_SHADOW,
+        )
+        placed.append(bump)
     return placed
-
-
-def _bump(road: Road, z: float, both_lanes: bool) -> Placed:
-    width = 2 * road.half_width - 0.3 if both_lanes else road.half_width - 0.2
-    return Placed(
-        furniture.bump(),
-        road.x(z, 0.0 if both_lanes else -road.half_width / 2),
-        z,
-        yaw=road.heading(z),
-        scale=(width, 1.0, 1.0),
-        layer=GROUND,
-        shadow_from=NO_SHADOW,
-    )

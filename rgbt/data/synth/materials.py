@@ -1,4 +1,4 @@
-"""What surfaces are made of: colour, temperature, texture, glow. A table, no code.
+"""What surfaces are made of: colour, temperature, texture, glow, and class in other data sets.
 
 Temperatures are degrees above the air: by day (sun-warmed), by night, and what running adds
 (an engine, a body). They are plausible, not measured.
@@ -6,9 +6,11 @@ Temperatures are degrees above the air: by day (sun-warmed), by night, and what 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 RGB = tuple[float, float, float]
 
@@ -105,3 +107,42 @@ INDEX = {name: number for number, name in enumerate(MATERIALS)}
 def column(field: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """One column of the table: (M,) or (M, 3) float32 in the order of `INDEX`."""
     return np.array([getattr(material, field) for material in MATERIALS.values()], np.float32)
+
+
+ELSEWHERE = 255
+"""Of materials that only labelled objects are made of."""
+
+Table = NDArray[np.uint8]
+"""(labels, materials) -> class id."""
+
+
+def class_table(
+    classes: Sequence[str], by_label: Sequence[str], of_scenery: Mapping[str, Sequence[str]]
+) -> Table:
+    """The class of every pair of label and material; ids follow the order of `classes`.
+
+    By label where one is: tyres and glass belong to a car or a bike, which only the label tells.
+    Else by material: curbs, plants and the sky have materials of their own.
+
+    `by_label` has the classes of MFNet's labels from 1 on, `of_scenery` the materials of what MFNet
+    leaves unlabelled (0), by class.
+    """
+    table = np.full((1 + len(by_label), len(INDEX)), ELSEWHERE, np.uint8)
+    for name, materials in of_scenery.items():
+        table[0, [INDEX[material] for material in materials]] = classes.index(name)
+    for label, name in enumerate(by_label, 1):
+        table[label] = classes.index(name)
+    return table
+
+
+def ids_in(table: Table, label: NDArray[np.uint8], material: NDArray[np.intp]) -> NDArray[np.uint8]:
+    """Class ids (H, W) uint8 of a scene.
+
+    Args:
+        table: of `class_table`.
+        label: (H, W) MFNet's.
+        material: (H, W) index into `MATERIALS`.
+    """
+    ids = table[label, material]
+    assert (ids != ELSEWHERE).all(), "every material of the scenery has a class"
+    return ids

@@ -13,6 +13,7 @@ from rgbt.data.synth.shapes import (
     rectangle,
     shape_of,
     sideways,
+    thin,
     tube,
     upright,
 )
@@ -26,11 +27,20 @@ def person(kind: int) -> Shape:
     stride = (0.02, 0.16, 0.24)[kind % 3]
     from_behind = kind >= NUM_WALKERS // 2
     parts = [*_leg(-0.08, -0.06 - stride), *_leg(0.08, 0.06 + stride)]
-    parts += [*_arm(-1, stride), *_arm(1, stride), *_torso(), *_head(from_behind)]
+    parts += [*_arm(-1, stride), *_arm(1, stride)]
+    # Two halves that meet in an edge towards the camera, so that the sun shades one of them.
+    for side in (-1, 1):
+        torso = [(0.0, 0.84, -0.12), (side * 0.18, 0.84, 0.0), (side * 0.24, 1.36, 0.0)]
+        torso += [(side * 0.15, 1.46, 0.0), (0.0, 1.46, -0.12)]
+        parts.append(thin(torso, "cloth", PERSON, 1))
+    cap = [(-0.125, 1.61), (0.125, 1.61), (0.09, 1.70), (0.0, 1.735), (-0.09, 1.70)]
+    parts += [
+        thin(upright(rectangle(-0.05, 1.42, 0.05, 1.52)), "skin", PERSON),
+        thin(upright(disc(0.0, 1.60, 0.125)), "hair" if from_behind else "skin", PERSON),
+        thin(upright(cap, -0.01), "hair", PERSON),
+    ]
     if kind in (1, 5):
-        parts.append(
-            Face(upright(rectangle(-0.17, 0.98, 0.17, 1.40), -0.16), "bag", PERSON, thin=True)
-        )
+        parts.append(thin(upright(rectangle(-0.17, 0.98, 0.17, 1.40), -0.16), "bag", PERSON))
     return shape_of(parts)
 
 
@@ -38,36 +48,17 @@ def _leg(hip_x: float, foot_x: float) -> list[Face]:
     leg = [(hip_x - 0.09, 0.90), (hip_x + 0.09, 0.90), (foot_x + 0.06, 0.07), (foot_x - 0.06, 0.07)]
     shoe = rectangle(foot_x - 0.07, 0.0, foot_x + 0.08, 0.09)
     return [
-        Face(upright(leg), "trousers", PERSON, 2, thin=True),
-        Face(upright(shoe), "shoe", PERSON, thin=True),
+        thin(upright(leg), "trousers", PERSON, 2),
+        thin(upright(shoe), "shoe", PERSON),
     ]
 
 
 def _arm(side: int, stride: float) -> list[Face]:
     hand = (side * (0.27 + stride * 0.4), 0.86)
     return [
-        Face(upright(tube((side * 0.22, 1.40), hand, 0.11)), "cloth", PERSON, 1, thin=True),
-        Face(upright(disc(*hand, 0.055, 6)), "skin", PERSON, thin=True),
+        thin(upright(tube((side * 0.22, 1.40), hand, 0.11)), "cloth", PERSON, 1),
+        thin(upright(disc(*hand, 0.055, 6)), "skin", PERSON),
     ]
-
-
-def _torso() -> list[Face]:
-    """Two halves that meet in an edge towards the camera, so that the sun shades one of them."""
-    halves = []
-    for side in (-1, 1):
-        outline = [(0.0, 0.84, -0.12), (side * 0.18, 0.84, 0.0), (side * 0.24, 1.36, 0.0)]
-        outline += [(side * 0.15, 1.46, 0.0), (0.0, 1.46, -0.12)]
-        halves.append(Face(outline, "cloth", PERSON, 1, thin=True))
-    return halves
-
-
-def _head(from_behind: bool) -> list[Face]:
-    face = Face(
-        upright(disc(0.0, 1.60, 0.125)), "hair" if from_behind else "skin", PERSON, thin=True
-    )
-    neck = Face(upright(rectangle(-0.05, 1.42, 0.05, 1.52)), "skin", PERSON, thin=True)
-    cap = [(-0.125, 1.61), (0.125, 1.61), (0.09, 1.70), (0.0, 1.735), (-0.09, 1.70)]
-    return [neck, face, Face(upright(cap, -0.01), "hair", PERSON, thin=True)]
 
 
 @cache
@@ -86,9 +77,9 @@ def _bike_wheels() -> list[Face]:
     parts = []
     for z in (-0.53, 0.53):
         edge = rectangle(-0.035, 0.0, 0.035, 0.68)
-        parts.append(Face(sideways(disc(z, 0.34, 0.34)), "tyre", BIKE, thin=True))
-        parts.append(Face(sideways(disc(z, 0.34, 0.27)), "spokes", BIKE, thin=True))
-        parts.append(Face(upright(edge, z), "tyre", BIKE, thin=True))
+        parts.append(thin(sideways(disc(z, 0.34, 0.34)), "tyre", BIKE))
+        parts.append(thin(sideways(disc(z, 0.34, 0.27)), "spokes", BIKE))
+        parts.append(thin(upright(edge, z), "tyre", BIKE))
     return parts
 
 
@@ -101,17 +92,15 @@ def _bike_frame() -> list[Face]:
         (head, (0.53, 0.34)),
         (crank, (-0.53, 0.34)),
     ]
-    parts = [Face(sideways(tube(a, b, 0.075)), "metal", BIKE, 1, thin=True) for a, b in tubes]
-    parts.append(Face(sideways(tube((-0.53, 0.34), seat, 0.06)), "metal", BIKE, 1, thin=True))
-    parts.append(
-        Face(upright(rectangle(-0.05, 0.3, 0.05, 0.95), -0.2), "metal", BIKE, 1, thin=True)
-    )
-    parts.append(Face(upright(rectangle(-0.28, 0.98, 0.28, 1.05), 0.38), "trim", BIKE, thin=True))
-    parts.append(Face(sideways(tube((0.30, 1.02), head, 0.07)), "trim", BIKE, thin=True))
-    parts.append(Face(sideways(rectangle(-0.36, 0.86, -0.1, 0.94)), "saddle", BIKE, thin=True))
-    parts.append(Face(upright(rectangle(-0.1, 0.86, 0.1, 0.94), -0.36), "saddle", BIKE, thin=True))
-    parts.append(Face(sideways(rectangle(0.42, 0.72, 0.76, 0.98)), "spokes", BIKE, thin=True))
-    parts.append(Face(upright(rectangle(-0.17, 0.72, 0.17, 0.98), 0.76), "spokes", BIKE, thin=True))
+    parts = [thin(sideways(tube(a, b, 0.075)), "metal", BIKE, 1) for a, b in tubes]
+    parts.append(thin(sideways(tube((-0.53, 0.34), seat, 0.06)), "metal", BIKE, 1))
+    parts.append(thin(upright(rectangle(-0.05, 0.3, 0.05, 0.95), -0.2), "metal", BIKE, 1))
+    parts.append(thin(upright(rectangle(-0.28, 0.98, 0.28, 1.05), 0.38), "trim", BIKE))
+    parts.append(thin(sideways(tube((0.30, 1.02), head, 0.07)), "trim", BIKE))
+    parts.append(thin(sideways(rectangle(-0.36, 0.86, -0.1, 0.94)), "saddle", BIKE))
+    parts.append(thin(upright(rectangle(-0.1, 0.86, 0.1, 0.94), -0.36), "saddle", BIKE))
+    parts.append(thin(sideways(rectangle(0.42, 0.72, 0.76, 0.98)), "spokes", BIKE))
+    parts.append(thin(upright(rectangle(-0.17, 0.72, 0.17, 0.98), 0.76), "spokes", BIKE))
     return parts
 
 
@@ -135,9 +124,5 @@ def _rider() -> list[Face]:
         ),
         (disc(0.0, 1.59, 0.12), "hair", 0),
     ]
-    parts = [
-        Face(sideways(line), name, PERSON, paint, thin=True) for line, name, paint in from_side
-    ]
-    return parts + [
-        Face(upright(line), name, PERSON, paint, thin=True) for line, name, paint in across
-    ]
+    parts = [thin(sideways(line), name, PERSON, paint) for line, name, paint in from_side]
+    return parts + [thin(upright(line), name, PERSON, paint) for line, name, paint in across]

@@ -5,36 +5,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
-from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from rgbt.data.pst900 import CLASSES, PST900, Bags
-from rgbt.data.pst900_layout import FOLDERS, PARTS
-from rgbt.data.synth.cache import written_once
-from rgbt.data.synth.dataset import VERSION as SCENES_VERSION
 from rgbt.data.synth.factors import NumScenes, SceneFactors, with_factors
-from rgbt.data.synth.scene import render_scene
+from rgbt.data.synth.scene import Scene
 from rgbt.data.synth.shapes import BUMP, CAR_STOP, COLOR_CONE, PERSON
-from rgbt.data.synth.writer import SynthPlan, bgr, write_each, write_image
+from rgbt.data.synth.writer import VERSION, Images, Layout, Plan, Shot, bgr
 from rgbt.ranges import Seed, Text
-
-VERSION = 1
-"""Of the files beside the scenes. Raise it with every change that changes a byte of them."""
 
 VAL_BAG = 20
 """The recording of the training part that scenes for validation lie in."""
 
-_TRAIN_BAGS = tuple(range(1, VAL_BAG))
-_TEST_BAGS = (21, 22, 23, 24, 25)
-"""Those of the real test part."""
+_BAGS = {"train": range(1, VAL_BAG), "val": (VAL_BAG,), "test": (21, 22, 23, 24, 25)}
+"""Recordings of each split; those for testing are the real ones."""
 
 _FRAME_STEP = 10
 
-STANDS_FOR = {
+_STANDS_FOR = {
     COLOR_CONE: "fire_extinguisher",
     CAR_STOP: "backpack",
     BUMP: "hand_drill",
@@ -43,7 +33,7 @@ STANDS_FOR = {
 """Which object of a street stands for which of the four; everything else is background."""
 
 CLASS_OF = np.array(
-    [CLASSES.index(STANDS_FOR.get(label, "background")) for label in range(BUMP + 1)], np.uint8
+    [CLASSES.index(_STANDS_FOR.get(label, "background")) for label in range(9)], np.uint8
 )
 
 
@@ -70,58 +60,31 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     `rgbt.data.pst900.PST900`; () makes "val" the test part, as in the releases, and leaves the
     scenes for validation in training.
     """
-    plan = SynthPlan(
-        seed=seed, num_train=num_train, num_val=num_val, num_test=num_test, factors=factors
-    )
-    folder = str(cached(plan, cache_dir))
+    numbers = {"num_train": num_train, "num_val": num_val, "num_test": num_test}
+    plan = Plan(seed=seed, numbers=numbers, factors=factors)
+    folder = str(LAYOUT.cached(plan, cache_dir))
     return PST900(folder, name="synth_pst900", num_classes=num_classes, val_bags=val_bags)
 
 
-def cached(plan: SynthPlan, cache_dir: str | Path | None) -> Path:
-    """The folder of `plan`, see `written_once`."""
-    versions = {"scenes": SCENES_VERSION, "files": VERSION}
-    return written_once("synth_pst900", versions, plan, cache_dir, write)
+def _shots(plan: Plan) -> list[Shot]:
+    shots = []
+    for split, scenes in plan.splits:
+        bags, part = _BAGS[split], "test" if split == "test" else "train"
+        for number, scene in enumerate(scenes):
+            bag = bags[number * len(bags) // len(scenes)]
+            name = f"{scene}_bag{bag:02d}_rect_rgb_frame{scene * _FRAME_STEP:010d}"
+            shots.append(Shot(scene, split, plan.is_night(scene), name, part))
+    return shots
 
 
-class ImageToWrite(NamedTuple):
-    """One picture to be written: number of its scene, its part, the recording that it is of."""
-
-    scene: int
-    part: str
-    bag: int
-
-    @property
-    def name(self) -> str:
-        """As the archive calls its pictures."""
-        return f"{self.scene}_bag{self.bag:02d}_rect_rgb_frame{self.scene * _FRAME_STEP:010d}"
+def _images(scene: Scene, shot: Shot) -> Images:
+    return {
+        f"{shot.folder}/rgb/{shot.name}.png": bgr(scene),
+        f"{shot.folder}/thermal/{shot.name}.png": scene.thermal,
+        f"{shot.folder}/labels/{shot.name}.png": CLASS_OF[scene.label],
+    }
 
 
-def shots_of(plan: SynthPlan) -> tuple[ImageToWrite, ...]:
-    """Every picture, numbered over all splits: no scene is in two of them."""
-    train, test = PARTS
-    parts = [
-        *((train, bag) for bag in _spread(plan.num_train, _TRAIN_BAGS)),
-        *((train, VAL_BAG) for _ in range(plan.num_val)),
-        *((test, bag) for bag in _spread(plan.num_test, _TEST_BAGS)),
-    ]
-    return tuple(ImageToWrite(scene, part, bag) for scene, (part, bag) in enumerate(parts))
-
-
-def _spread(num: int, bags: tuple[int, ...]) -> Iterator[int]:
-    return (bags[number * len(bags) // num] for number in range(num))
-
-
-def write(plan: SynthPlan, folder: Path) -> None:
-    """Write the whole data set into `folder`, which exists; OSError if that is not possible."""
-    shots = shots_of(plan)
-    write_each(partial(_write_numbered, plan, shots, folder), len(shots))
-
-
-def _write_numbered(
-    plan: SynthPlan, shots: tuple[ImageToWrite, ...], folder: Path, number: int
-) -> None:
-    shot = shots[number]
-    scene = render_scene(plan.seed, shot.scene, plan.factors)
-    images = (bgr(scene), scene.thermal, CLASS_OF[scene.label])
-    for kind, image in zip(FOLDERS, images, strict=True):
-        write_image(folder / shot.part / kind / f"{shot.name}.png", image)
+LAYOUT = Layout(
+    name="synth_pst900", versions={"scenes": VERSION, "files": 1}, shots=_shots, images=_images
+)

@@ -12,8 +12,7 @@ from rgbt.data.synth import materials
 from rgbt.data.synth.camera import Floats, SynthCamera, floats
 from rgbt.data.synth.facets import Facets
 from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.lamps import Lamp, headlight, lamplight
-from rgbt.data.synth.light import Light
+from rgbt.data.synth.light import Lamp, Light, headlight, lamplight
 from rgbt.data.synth.raster import average
 from rgbt.data.synth.surface import Surface, sample_tile
 
@@ -61,7 +60,10 @@ def render_rgb(
     last = int(np.flatnonzero(glow[..., 3].any(1)).max(initial=-1)) + 1
     share = glow[:last, :, 3] * np.float32(1 / 255)
     image[:, :last] += share * _sky(surface.rays[:, :last], light, surface.camera, seed)
-    return _exposed(image, light)
+    optical = image * _column(light.tint * np.float32(-1.7 * light.exposure))
+    # cv2.exp is five times as fast as NumPy's; it takes two dimensions.
+    exposed = 1.0 - cv2.exp(optical.reshape(-1, image.shape[2])).reshape(image.shape)
+    return np.asarray(np.sqrt(np.maximum(exposed, 0)), np.float32)
 
 
 def _column(colour: Floats) -> Floats:
@@ -133,13 +135,6 @@ def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
     return np.asarray(
         colour + cover * (np.float32(1.05) * light.horizon.max() - colour), np.float32
     )
-
-
-def _exposed(image: Floats, light: Light) -> Floats:
-    optical = image * _column(light.tint * np.float32(-1.7 * light.exposure))
-    # cv2.exp is five times as fast as NumPy's; it takes two dimensions.
-    exposed = 1.0 - cv2.exp(optical.reshape(-1, image.shape[2])).reshape(image.shape)
-    return np.asarray(np.sqrt(np.maximum(exposed, 0)), np.float32)
 
 
 def develop(

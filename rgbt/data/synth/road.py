@@ -88,11 +88,12 @@ class Quads(NamedTuple):
 def ground_quads(road: Road) -> Quads:
     """Terrain, sidewalks, asphalt, markings and kerbs, from bottom to top."""
     w, (left, right) = road.half_width, road.sidewalk
+    z, x, width, length = road.patches.T
     strips = [
         ("paving", UNLABELED, _strip(-w - left, -w)),
         ("paving", UNLABELED, _strip(w, w + right)),
         ("asphalt", UNLABELED, _strip(-w, w)),
-        ("patch", UNLABELED, _patches(road)),
+        ("patch", UNLABELED, _rows(z, z + length, x, x + width)),
         *(("line", UNLABELED, rows) for rows in _markings(road)),
         *_kerbs(road),
     ]
@@ -150,11 +151,6 @@ def _corners(road: Road, rows: Floats) -> Floats:
     corners[:, :4, 2] = ends
     corners[:, 4:] = corners[:, 3:4]
     return corners
-
-
-def _patches(road: Road) -> Floats:
-    z, x, width, length = road.patches.T
-    return _rows(z, z + length, x, x + width)
 
 
 def _markings(road: Road) -> list[Floats]:

@@ -12,9 +12,8 @@ from rgbt.data.synth import rgb, thermal
 from rgbt.data.synth.camera import Floats, SynthCamera, camera_of, flow_between
 from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.lamps import Lamp, lamps_of
 from rgbt.data.synth.layout import place_objects
-from rgbt.data.synth.light import Light, draw_light
+from rgbt.data.synth.light import Lamp, Light, draw_light, lamps_of
 from rgbt.data.synth.placement import Placed
 from rgbt.data.synth.raster import draw
 from rgbt.data.synth.road import draw_road, ground_quads
@@ -141,16 +140,10 @@ def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
     inside &= (target_columns >= 0) & (target_columns <= width - 1)
     to_rows = np.rint(np.where(inside, target_rows, 0)).astype(int)
     to_columns = np.rint(np.where(inside, target_columns, 0)).astype(int)
-    expected = _depth_in(first.camera, second)
+    points = second.camera.to_world(second.camera.rays(), 1.0 / second.depth)
+    expected = first.camera.to_camera(np.moveaxis(points, 0, 2).astype(np.float64))[..., 2]
+    expected = np.where(np.isinf(second.depth), np.inf, expected).astype(np.float32)
     found = first.depth[to_rows, to_columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         agrees = np.abs(1 / found - 1 / expected) < 0.03 / expected + 2e-3
     return np.asarray(inside & agrees)
-
-
-def _depth_in(camera: SynthCamera, scene: Scene) -> Floats:
-    """Depth along the axis of `camera` of each pixel of `scene`."""
-    inverse = 1.0 / scene.depth
-    points = scene.camera.to_world(scene.camera.rays(), inverse)
-    depth = camera.to_camera(np.moveaxis(points, 0, 2).astype(np.float64))[..., 2]
-    return np.where(np.isinf(scene.depth), np.inf, depth).astype(np.float32)

@@ -43,6 +43,11 @@ class Face(NamedTuple):
     thin: bool = False
 
 
+def thin(corners: Sequence[Point], material: str, label: int = UNLABELED, paint: int = 0) -> Face:
+    """A part that is seen from both sides."""
+    return Face(corners, material, label, paint, thin=True)
+
+
 @dataclass(frozen=True, eq=False)
 class Shape:
     """Parts as arrays, in drawing order.

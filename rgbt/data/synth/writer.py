@@ -1,8 +1,6 @@
-"""Writes scenes in MFNet's layout: images, labels, split lists; in parallel where it is worth it.
+"""Writes scenes in the layout of a data set, in parallel where it is worth it.
 
-images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
-train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
-next/               the same names after the ego-motion, with flow/NAME.npy, if requested
+What the layouts are is in `dataset` (MFNet), `kp`, `pst900` and `freiburg`.
 """
 
 from __future__ import annotations
@@ -10,12 +8,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,9 +21,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
+from rgbt.data.synth.cache import written_once
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.light import is_night
 from rgbt.data.synth.scene import Scene, render_pair, render_scene
+
+VERSION = 2
+"""Of the scenes. Raise it with every change that changes a byte, so that no cache is stale."""
 
 _WORTH_A_POOL = 200
 """Scenes; fewer are written before a pool has started."""
@@ -36,80 +38,127 @@ _WORTH_A_BAR = 100
 _FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 """A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
 
+Images = dict[str, NDArray[Any]]
+"""Path in the data set -> image in OpenCV's order of channels, or array if the path says .npy."""
+
+FRAMES = "next"
+"""Folder of the second frames, in the same layout, with flow/NAME.npy."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class SynthPlan:
+class Plan:
     """What a written data set consists of; equal plans give equal files.
 
     Attributes:
         seed: of the data set.
-        num_train: scenes of the training split.
-        num_val: scenes of the validation split.
-        num_test: scenes of the test split.
+        numbers: scenes by key of the configuration, such as "num_train".
         factors: what the scenes are made of.
         motion: of the camera to a second frame of every scene, or None for single frames.
     """
 
     seed: int
-    num_train: int
-    num_val: int
-    num_test: int
+    numbers: Mapping[str, int]
     factors: SceneFactors
     motion: EgoMotion | None = None
 
     @property
-    def num_scenes(self) -> int:
-        """Scenes in all splits."""
-        return self.num_train + self.num_val + self.num_test
+    def splits(self) -> Iterator[tuple[str, range]]:
+        """Every number, without "num_", and its scenes; none is in two of them."""
+        first = 0
+        for key, number in self.numbers.items():
+            yield key.removeprefix("num_"), range(first, first + number)
+            first += number
 
-    @property
-    def splits(self) -> dict[str, range]:
-        """Split -> its scenes, which are numbered over all splits: none is in two of them."""
-        val, test = self.num_train, self.num_train + self.num_val
-        return {"train": range(val), "val": range(val, test), "test": range(test, self.num_scenes)}
-
-    def name(self, index: int) -> str:
-        """Five digits and D (day) or N (night), as in MFNet; indices run on over the splits."""
-        night = is_night(self.seed, index, self.factors.night_share)
-        return f"{index:05d}{'N' if night else 'D'}"
+    def is_night(self, scene: int) -> bool:
+        """Whether a scene is one at night, by the share of the factors."""
+        return is_night(self.seed, scene, self.factors.night_share)
 
 
-def write(plan: SynthPlan, folder: Path) -> None:
-    """Write the whole data set into `folder`, which exists; OSError if that is not possible."""
-    write_each(partial(write_index, plan, folder), plan.num_scenes)
-    lists = {split: [plan.name(scene) for scene in own] for split, own in plan.splits.items()}
-    for time in ("day", "night"):
-        letter = time[0].upper()
-        lists[f"test_{time}"] = [name for name in lists["test"] if name.endswith(letter)]
-    for root in [folder, folder / "next"] if plan.motion else [folder]:
-        for split, names in lists.items():
-            write_list(root / f"{split}.txt", names)
+class Shot(NamedTuple):
+    """One scene to be written: its number, its split, whether it is night, its name and folder."""
+
+    scene: int
+    split: str
+    night: bool
+    name: str
+    folder: str = ""
 
 
-def write_list(path: Path, lines: Sequence[str]) -> None:
-    """Write a split list, one name per line."""
-    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+def _no_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    del shots
+    return {}
 
 
-def write_index(plan: SynthPlan, folder: Path, index: int) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Which files of which scenes a data set has.
+
+    Attributes:
+        name: of the data set; the name of its folder begins with it.
+        versions: of what writes it; a part of the folder's name.
+        shots: every scene, in the order of their numbers.
+        images: the files of a scene.
+        lists: the split lists, by path.
+        named: entries of the plan that plan.json names where they are None.
+    """
+
+    name: str
+    versions: Mapping[str, int]
+    shots: Callable[[Plan], list[Shot]]
+    images: Callable[[Scene, Shot], Images]
+    lists: Callable[[Sequence[Shot]], dict[str, list[str]]] = _no_lists
+    named: dict[str, Any] = field(default_factory=lambda: {"motion": None})
+
+    def cached(self, plan: Plan, cache_dir: str | Path | None) -> Path:
+        """The folder of `plan`, see `written_once`."""
+        motion = {} if plan.motion is None else {"motion": asdict(plan.motion)}
+        content = {
+            **self.versions,
+            "seed": plan.seed,
+            **plan.numbers,
+            "factors": asdict(plan.factors),
+            **self.named,
+            **motion,
+        }
+        return written_once(self.name, content, cache_dir, partial(self.write, plan))
+
+    def write(self, plan: Plan, folder: Path) -> None:
+        """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
+        shots = self.shots(plan)
+        work = partial(write_shot, self, plan, folder)
+        hidden = len(shots) < _WORTH_A_BAR
+        with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
+            task = progress.add_task("writing synthetic scenes", total=len(shots))
+            for _ in _for_each(work, shots):
+                progress.advance(task)
+        for root in [folder, folder / FRAMES] if plan.motion else [folder]:
+            for path, lines in self.lists(shots).items():
+                text = "".join(f"{line}\n" for line in lines)
+                (root / path).write_text(text, encoding="utf-8")
+
+
+def write_shot(layout: Layout, plan: Plan, folder: Path, shot: Shot) -> None:
     """Render and write one scene, with its second frame where the plan has a motion."""
-    name = plan.name(index)
+    factors = replace(plan.factors, night_share=float(shot.night))
     if plan.motion is None:
-        _write_scene(render_scene(plan.seed, index, plan.factors), folder, name)
+        _write(layout.images(render_scene(plan.seed, shot.scene, factors), shot), folder)
         return
-    pair = render_pair(plan.seed, index, plan.factors, plan.motion)
-    _write_scene(pair.first, folder, name)
-    _write_scene(pair.second, folder / "next", name)
+    pair = render_pair(plan.seed, shot.scene, factors, plan.motion)
+    _write(layout.images(pair.first, shot), folder)
     flow = np.where(pair.visible[..., None], pair.flow, np.float32(np.nan))
-    path = folder / "next" / "flow" / f"{name}.npy"
-    path.parent.mkdir(exist_ok=True)
-    np.save(path, flow)
+    second = layout.images(pair.second, shot) | {f"flow/{shot.name}.npy": flow}
+    _write(second, folder / FRAMES)
 
 
-def _write_scene(scene: Scene, root: Path, name: str) -> None:
-    # The fourth channel, alpha, is thermal.
-    write_image(root / "images" / f"{name}.png", np.dstack([bgr(scene), scene.thermal]))
-    write_image(root / "labels" / f"{name}.png", scene.label)
+def _write(images: Images, folder: Path) -> None:
+    for name, image in images.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".npy":
+            np.save(path, image)
+            continue
+        _, encoded = cv2.imencode(path.suffix, image, _FAST_PNG if path.suffix == ".png" else ())
+        path.write_bytes(encoded.tobytes())
 
 
 def bgr(scene: Scene) -> NDArray[np.uint8]:
@@ -117,36 +166,13 @@ def bgr(scene: Scene) -> NDArray[np.uint8]:
     return np.ascontiguousarray(scene.rgb[..., ::-1])
 
 
-def write_image(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Write an image as it is (OpenCV's order of channels), a PNG compressed for speed."""
-    _, encoded = cv2.imencode(path.suffix, image, _FAST_PNG if path.suffix == ".png" else ())
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encoded.tobytes())
-
-
-def write_each(work: partial[None], num: int) -> None:
-    """``work(index)`` for every scene, on all cores where there are many, with a progress bar."""
-    with _advancing(num) as advance:
-        for _ in _for_each(work, range(num)):
-            advance()
-
-
-def _for_each(work: partial[None], indices: Sequence[int]) -> Iterator[None]:
+def _for_each(work: partial[None], shots: Sequence[Shot]) -> Iterator[None]:
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    if len(indices) < _WORTH_A_POOL or cores == 1:
+    if len(shots) < _WORTH_A_POOL or cores == 1:
         cv2.setNumThreads(1)
-        yield from map(work, indices)
+        yield from map(work, shots)
         return
     # Forked workers need not import the caller's main module again; only Linux forks safely.
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     with ProcessPoolExecutor(cores, context, cv2.setNumThreads, (1,)) as pool:
-        yield from pool.map(work, indices, chunksize=8)
-
-
-@contextmanager
-def _advancing(total: int) -> Iterator[partial[None]]:
-    """A progress bar on stderr, gone when done; none for what takes less than about a second."""
-    hidden = total < _WORTH_A_BAR
-    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
-        task = progress.add_task("writing synthetic scenes", total=total)
-        yield partial(progress.advance, task)
+        yield from pool.map(work, shots, chunksize=8)

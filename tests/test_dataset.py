@@ -1,0 +1,62 @@
+"""Data sets in front of another one: what each leaves as it is."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rgbt.corruptions.pixels import Noise
+from rgbt.data.cache.dataset import CachedDataset, cached_layer
+from rgbt.data.mfnet import CLASSES, MFNet
+from rgbt.data.pseudo_labels import FORMAT, PseudoLabelled, Unlabelled
+from rgbt.dataset import DatasetWrapper, layers, reader_of
+from rgbt.evaluation.corrupted_dataset import CorruptedDataset
+
+NAMES = ("00001D", "00002N")
+
+
+def pseudo(source: MFNet, folder: Path) -> PseudoLabelled:
+    manifest = {"format": FORMAT, "classes": CLASSES, "digest": "abc"}
+    (folder / "pseudo_labels.json").write_text(json.dumps(manifest))
+    return PseudoLabelled(source, folder, with_confidence=True)
+
+
+def corrupted(source: MFNet, _: Path) -> CorruptedDataset:
+    kind = Noise(image="both", severities=(8.0,))
+    return CorruptedDataset(source, kind, 8, split="train")
+
+
+WRAPPERS: dict[str, Callable[[MFNet, Path], DatasetWrapper]] = {
+    "cached": lambda source, folder: CachedDataset(source, folder / "cache", num_threads=1),
+    "pseudo-labelled": pseudo,
+    "unlabelled": lambda source, folder: Unlabelled(source),
+    "corrupted": corrupted,
+}
+
+
+@pytest.mark.parametrize("kind", WRAPPERS)
+def test_other_members_are_those_of_source(
+    write_mfnet: Callable[..., Path], tmp_path: Path, kind: str
+) -> None:
+    source = MFNet(str(write_mfnet({"train": list(NAMES)}, (2, 3))))
+    wrapped = WRAPPERS[kind](source, tmp_path)
+    # As worker processes get it.
+    for each in (wrapped, pickle.loads(pickle.dumps(wrapped)), copy.deepcopy(wrapped)):
+        for key in ("root", "name", "num_classes", "classes", "palette", "unscored", "splits"):
+            assert getattr(each, key) == getattr(source, key)
+        assert each.record == source.record
+        assert each.names("train") == NAMES
+        assert (each.has("train"), each.has("val")) == (True, False)
+        assert each.files("00001D") == source.files("00001D")
+        assert each.decoding().items() >= source.decoding().items()
+        assert each.nights(NAMES) == (False, True)
+        assert each.fingerprint() == source.fingerprint()
+        assert not hasattr(each, "nothing")
+    assert list(layers(Unlabelled(wrapped)))[1:] == [wrapped, source]
+    assert reader_of(wrapped) is source
+    assert (cached_layer(Unlabelled(wrapped)) is wrapped) == (kind == "cached")
