@@ -24,7 +24,7 @@ from rgbt.data.kp import KP
 from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
-from rgbt.data.report.dataset import check_dataset
+from rgbt.data.report import check_dataset
 from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.conftest import write_data
