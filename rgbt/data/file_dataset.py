@@ -207,8 +207,11 @@ class FileDataset:
 
     def thermal_values(self, name: str) -> NDArray[Any]:
         """Values of the thermal camera that are read, (H, W); InputError as of `read`."""
-        path = existing_file("thermal image", self.frame(name).thermal, name, self.root)
-        return self.images.cut(self.images.values(path), name)
+        frame = self.frame(name)
+        path = existing_file("thermal image", frame.thermal, name, self.root)
+        is_packed = frame.rgb == frame.thermal
+        values = self.images.whole(name, path, path)[1] if is_packed else self.images.values(path)
+        return self.images.cut(values, name)
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:
         """Files of the layout that belong to no image of a split."""

@@ -210,6 +210,13 @@ def test_check_does_not_depend_on_threads(write_mfnet) -> None:
     assert len(counted) == 13  # 00004D is in two lists
 
 
+def test_check_of_another_class_is_refused() -> None:
+    node = {"_target_": "rgbt.data.label_map.LabelMap", "num_source": 1, "targets": ["a"]}
+    config = OmegaConf.create({"dataset": {**node, "groups": {"a": [0]}}})
+    with pytest.raises(InputError, match="LabelMap cannot be checked"):
+        main.__wrapped__(config)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not SHARED.exists(), reason="reference material is not here")
 def test_check_of_real_pairs(capsys: pytest.CaptureFixture[str]) -> None:
