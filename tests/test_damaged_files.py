@@ -209,7 +209,7 @@ def decode(path: Path) -> Any:
 
 
 def read_label(path: Path) -> Any:
-    from rgbt.data.files import read_label as read
+    from rgbt.data.labels import read_label as read
 
     return plain(read(path, 5))
 
@@ -227,7 +227,7 @@ def label_array(folder: Path) -> Path:
 
 
 def read_label_array(path: Path) -> Any:
-    from rgbt.data.files import read_label_array as read
+    from rgbt.data.labels import read_label as read
 
     return plain(read(path, 5))
 

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
-from rgbt.data.report.dataset import check_dataset, checks_of, num_listed
-from rgbt.data.report.values import DatasetReport, SplitReport
-from rgbt.dataset import LabelledDataset
+from rgbt.data.file_dataset import FileDataset
+from rgbt.data.report import DatasetReport, SplitReport, check_dataset, read_lists
 
 WIDTH_WITHOUT_TERMINAL = 120
 
@@ -27,13 +27,21 @@ WIDTH_WITHOUT_TERMINAL = 120
 @command()
 def main(config: DictConfig) -> int:
     """Check ``config.dataset``; returns 1 if there are problems."""
-    return check_and_print(build(config.dataset))
+    dataset = build(config.dataset)
+    if not isinstance(dataset, FileDataset):
+        raise InputError(
+            f"dataset: {type(dataset).__name__} cannot be checked, it is no "
+            "rgbt.data.file_dataset.FileDataset; choose dataset=mfnet, freiburg, synth or another "
+            "file of conf/dataset, or derive it from that class."
+        )
+    return check_and_print(dataset)
 
 
-def check_and_print(dataset: LabelledDataset) -> int:
+def check_and_print(dataset: FileDataset) -> int:
     """Read a data set and print the report; returns 1 if there are problems."""
     with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("reading", total=num_listed(dataset))
+        lists, _, _ = read_lists(dataset)
+        task = progress.add_task("reading", total=len(set().union(*lists.values())))
         report = check_dataset(
             dataset,
             num_threads=os.cpu_count() or 1,
@@ -43,18 +51,17 @@ def check_and_print(dataset: LabelledDataset) -> int:
     return 1 if report.problems else 0
 
 
-def print_report(dataset: LabelledDataset, report: DatasetReport) -> None:
+def print_report(dataset: FileDataset, report: DatasetReport) -> None:
     """Write the report to stdout: two tables, then one line per note and per problem."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
-    checks = checks_of(dataset)
-    title = f"{dataset.name} ({checks.title}): {dataset.root}"
+    title = f"{dataset.name} ({dataset.title}): {dataset.root}"
     console.print(title, soft_wrap=True, markup=False)
     if report.splits:
         console.print(split_table(report.splits))
         labelled = (split for split in report.splits if split.pixels.any())
-        own = tuple(split for split in labelled if not checks.repeats(split.split))
+        own = tuple(split for split in labelled if not dataset.repeats(split.split))
         console.print(class_table(own, (*dataset.classes, "ignored")))
     for kind, lines in (("note", report.notes), ("problem", report.problems)):
         for line in lines:

@@ -2,21 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.files import read_label
-from rgbt.data.images import PairReader
-from rgbt.data.integrity import within
-from rgbt.data.named_files import check_lengths, with_label
+from rgbt.checks import InputError, nearest
+from rgbt.data.folder.frames import FolderFrame, Patterns
+from rgbt.data.folder.splits import SplitRule
+from rgbt.data.images import PairReader, Range
+from rgbt.data.labels import LabelCodes
+from rgbt.data.named_files import check_size, existing_file, hash_of_files
 from rgbt.requirements import Record
 from rgbt.types import Sample
+
+SplitNames = Mapping[str, tuple[str, ...]]
+"""Split -> names, of the splits whose names could be read."""
+
+
+class Expected(NamedTuple):
+    """Numbers of the published data set, which `rgbt check` compares a copy with.
+
+    Attributes:
+        name: of the data set; those with another name are not compared.
+        day_night: split -> its images by day and at night, without mirrored copies.
+        images: split -> its images.
+        hw: size of the images.
+    """
+
+    name: str
+    day_night: Mapping[str, tuple[int, int]] = {}
+    images: Mapping[str, int] = {}
+    hw: tuple[int, int] | None = None
 
 
 class FileDataset:
     """A reader only: it never resizes, augments or remaps, and refuses what it cannot read exactly.
+
+    Subclasses give the attributes below, `frame` and `nights`; and what `rgbt check` asks, where
+    it differs.
 
     Args:
         root: its folder, which exists.
@@ -27,12 +54,18 @@ class FileDataset:
 
     Attributes:
         images: how its images, and new ones of any folder, are read.
+        codes: the meaning of label values.
+        patterns: of the paths of its files, where they follow patterns.
+        rule: divides its frames into splits, where a subclass does not.
 
     Raises:
         InputError: numbers of classes, names and colours differ.
     """
 
     images: PairReader
+    codes: LabelCodes
+    patterns: Patterns
+    rule: SplitRule
 
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
@@ -45,21 +78,61 @@ class FileDataset:
         classes: tuple[str, ...],
         palette: tuple[tuple[int, int, int], ...],
     ) -> None:
-        check_lengths(num_classes, classes, palette)
+        for key, length in (("classes", len(classes)), ("palette", len(palette))):
+            if length != num_classes:
+                raise InputError(
+                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
+                    "make them agree."
+                )
         self.root = root
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
+        self._names: dict[str, tuple[str, ...]] = {}
 
     @property
     def record(self) -> Record:
         """The number of its classes."""
         return Record(num_classes=self.num_classes)
 
-    def files(self, name: str) -> tuple[Path, ...]:
-        """RGB and thermal image (one file where thermal is the fourth channel), then the label."""
+    @property
+    def splits(self) -> Mapping[str, str]:
+        """Split -> its list, or the pattern of its files."""
+        return self.rule.splits
+
+    def has(self, split: str) -> bool:
+        """Whether any sample of `split` exists; InputError if the split is unknown."""
+        self.check_split(split)
+        return self.rule.has(split)
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in order; InputError if it is unknown, missing or empty."""
+        self.check_split(split)
+        if split not in self._names:
+            self._names[split] = self.rule.names(split)
+        return self._names[split]
+
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`; InputError if there can be no such frame."""
         raise NotImplementedError
+
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
+        """Whether each image was taken at night; None if the data set does not state it."""
+        raise NotImplementedError
+
+    def check_split(self, split: str) -> None:
+        """Refuse a split that is not one of `splits`."""
+        if split not in self.splits:
+            raise InputError(
+                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
+            )
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """Every file that `read` opens: RGB, thermal (if it has its own) and label (if any)."""
+        frame = self.frame(name)
+        paths = (frame.rgb, frame.thermal, frame.label)
+        return tuple(dict.fromkeys(path for path in paths if path is not None))
 
     def read(self, name: str) -> Sample:
         """The sample called `name`, decoded.
@@ -72,14 +145,88 @@ class FileDataset:
                 has other channels, bits or size than expected, or the label holds a value that has
                 no meaning.
         """
-        pair = self.pair(name)
-        return with_label(pair, self.label(name), self.files(name)[-1])
+        pair, label = self.pair(name), self.label(name)
+        if label is not None:
+            check_size(pair.rgb, "its label", label, name, self.frame(name).label)
+        return replace(pair, label=label)
 
     def pair(self, name: str) -> Sample:
         """The images of `read` alone, without the label; InputError as there."""
-        paths = [within(path, self.root) for path in self.files(name)[:-1]]
-        return self.images.read(name, paths[0], paths[-1])
+        frame = self.frame(name)
+        rgb = existing_file("RGB image", frame.rgb, name, self.root)
+        return self.images.read(
+            name, rgb, existing_file("thermal image", frame.thermal, name, self.root)
+        )
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W) uint8, or None; InputError as there."""
-        return read_label(within(self.files(name)[-1], self.root), self.num_classes)
+        path = self.frame(name).label
+        if path is None:
+            return None
+        return self.codes.read(existing_file("label", path, name, self.root))
+
+    def decoding(self) -> dict[str, Any]:
+        """Settings that change what `read` makes of the files."""
+        return {
+            "codes": sorted(self.codes.codes.items()),
+            "layouts": [list(layout) for layout in self.images.layouts],
+            **{key: getattr(self.images, key) for key in ("thermal_range", "most_tint", "crop")},
+        }
+
+    def fingerprint(self) -> str:
+        """See `hash_of_files`; splits that are not there are empty."""
+        names = {split: self.names(split) if self.has(split) else () for split in self.splits}
+        return hash_of_files(names, self.files)
+
+    # What `rgbt check` asks.
+
+    @property
+    def title(self) -> str:
+        """The layout, for a headline."""
+        return type(self).__name__
+
+    expected: Expected | None = None
+    """Numbers of the published data set."""
+
+    clipping: Range | None = None
+    """Range of thermal values whose shares are reported; None: none is."""
+
+    most_clipped: float = 1.0
+    """Largest share of the thermal values of a split that may be outside `clipping`."""
+
+    mirrored: str | None = None
+    """Suffix of the names of mirrored copies, which only training splits may list."""
+
+    def repeats(self, split: str) -> bool:
+        """Whether a split only repeats images of other splits, and need not exist."""
+        return split.endswith(("_day", "_night"))
+
+    def sources(self, split: str) -> tuple[str, ...]:
+        """What a split is made of; splits of one source may share names."""
+        return (self.splits[split],)
+
+    def thermal_values(self, name: str) -> NDArray[Any]:
+        """Values of the thermal camera that are read, (H, W); InputError as of `read`."""
+        frame = self.frame(name)
+        path = existing_file("thermal image", frame.thermal, name, self.root)
+        is_packed = frame.rgb == frame.thermal
+        values = self.images.whole(name, path, path)[1] if is_packed else self.images.values(path)
+        return self.images.cut(values, name)
+
+    def unused(self, lists: SplitNames) -> Iterable[Path]:
+        """Files of the layout that belong to no image of a split."""
+        used = {path for names in lists.values() for name in names for path in self.files(name)}
+        return {
+            match.path
+            for pattern in self.patterns
+            if pattern is not None
+            for match in pattern.files(self.root)
+        } - used
+
+    def own_problems(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
+        """Further problems of names and files; no image is opened."""
+        return []
+
+    def own_notes(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
+        """Further remarks."""
+        return []

@@ -19,10 +19,8 @@ from PIL import Image
 from rgbt.checks import InputError, one_line
 from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
 from rgbt.files.budgets import check_array
-from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
-CountImage = NDArray[np.uint16]
 
 
 def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
@@ -47,53 +45,6 @@ def read_rgb(path: Path, advice: str = "use the original file") -> Array:
             f"{path}: expected 3 channels (red, green, blue), got {channels(rgb)}; {advice}."
         )
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def read_thermal(path: Path) -> Array:
-    """Grey levels of a thermal image, (H, W) uint8, of one channel or three equal ones."""
-    return one_channel(_decode(path), path)
-
-
-def read_counts(path: Path) -> CountImage:
-    """Counts of a thermal camera, (H, W) uint16, at their full depth; InputError for others."""
-    counts = decode(path)
-    if counts.dtype != np.uint16:
-        raise InputError(
-            f"{path}: expected a thermal image of 16 bits (counts of the camera), got "
-            f"{counts.dtype}; use the original file, a converted one no longer holds the counts "
-            "that dataset.thermal_range cuts."
-        )
-    if counts.ndim != 2:
-        raise InputError(
-            f"{path}: expected a thermal image of one channel, got {counts.shape[2]}; use the "
-            "original file."
-        )
-    return np.asarray(counts, np.uint16)
-
-
-def read_label(path: Path, num_classes: int) -> Array:
-    """Class indices (H, W) uint8 below `num_classes`, or 255 = ignore.
-
-    Raises:
-        InputError: missing, not decodable, not 8 bit, several channels, or another value.
-    """
-    label = read_indices(path)
-    if label.dtype != np.uint8:
-        raise InputError(f"{path}: expected 8 bits per channel, got {label.dtype}.")
-    check_values(label, num_classes, path)
-    return np.asarray(label, np.uint8)
-
-
-def read_label_array(path: Path, num_classes: int) -> Array:
-    """Class indices of a `.npy` file, whole numbers (H, W), as `read_label`."""
-    label = read_array(path, "class indices, whole numbers of shape (rows, columns)")
-    if label.dtype.kind not in "iu" or label.ndim != 2:
-        raise InputError(
-            f"{path}: expected class indices, whole numbers of shape (rows, columns), got "
-            f"{label.shape} {label.dtype}; use the original file."
-        )
-    check_values(label, num_classes, path)
-    return label.astype(np.uint8)
 
 
 def read_indices(path: Path) -> NDArray[Any]:
@@ -169,21 +120,6 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
     return array
 
 
-def one_channel(thermal: NDArray[Any], path: Path) -> NDArray[Any]:
-    """(H, W) of (H, W) or of (H, W, 3) with equal channels; InputError for all else."""
-    if thermal.ndim == 2:
-        return thermal
-    # Whole channels are compared: comparing their interleaved pixels takes five times as long.
-    first, *others = cv2.split(thermal)
-    equal = all(np.array_equal(first, other) for other in others)
-    if channels(thermal) != 3 or not equal:
-        raise InputError(
-            f"{path}: expected a thermal image of one channel or three equal ones, got "
-            f"{channels(thermal)} channels{'' if equal else ' that differ'}."
-        )
-    return np.asarray(first)
-
-
 def decode(path: Path) -> NDArray[Any]:
     """An image as written, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
 
@@ -196,17 +132,6 @@ def decode(path: Path) -> NDArray[Any]:
 def channels(image: NDArray[Any]) -> int:
     """Channels of (H, W) or (H, W, C)."""
     return 1 if image.ndim == 2 else image.shape[2]
-
-
-def check_values(label: NDArray[Any], num_classes: int, path: Path) -> None:
-    """Refuse values that are neither a class nor 255, naming up to eight of them."""
-    wrong = ((label < 0) | (label >= num_classes)) & (label != IGNORE)
-    if wrong.any():
-        values = ", ".join(str(value) for value in np.unique(label[wrong])[:8])
-        raise InputError(
-            f"{path}: label value {values} is out of range; expected 0 to {num_classes - 1}, or "
-            f"{IGNORE} to ignore a pixel."
-        )
 
 
 def _decode(path: Path) -> Array:

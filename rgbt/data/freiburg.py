@@ -18,14 +18,12 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.file_dataset import FileDataset
-from rgbt.data.files import read_counts, read_label, read_label_array
-from rgbt.data.freiburg_images import FreiburgImages, whole_frame
-from rgbt.data.freiburg_layout import FreiburgFrame, find_frames, inside
-from rgbt.data.integrity import within
-from rgbt.data.named_files import check_split, existing_file, existing_root, size_of
-from rgbt.data.prepare.freiburg import PREPARATION
-from rgbt.data.report.freiburg import FreiburgChecks
+from rgbt.data.file_dataset import FileDataset, SplitNames
+from rgbt.data.folder.frames import FolderFrame
+from rgbt.data.freiburg_layout import TEST, TRAIN, find_frames, inside
+from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.labels import indices
+from rgbt.data.named_files import existing_file, existing_root, size_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
@@ -53,6 +51,12 @@ Count = Annotated[int, Interval(ge=0, lt=2**16)]
 CountRange = tuple[Count, Count]
 Edge = Annotated[int, Interval(ge=0, le=8192)]
 Crop = tuple[Edge, Edge, Edge, Edge]
+LAYOUTS = (
+    PairPattern(*TRAIN[:2]),
+    PairPattern(*TEST[:2]),
+    # Of one part of the archive the stamps of RGB end in a 0 more than those of thermal.
+    PairPattern(TEST.rgb.replace("{stamp}", "{stamp}0"), TEST.thermal),
+)
 
 MOST_STRETCH = 0.02
 """Largest relative difference of the aspect ratios of label and frame, due to rounding."""
@@ -102,8 +106,7 @@ class Freiburg(FileDataset):
             classes, names and colours that differ.
     """
 
-    images: FreiburgImages
-    preparation = PREPARATION
+    title = "layout of Freiburg Thermal"
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -123,17 +126,42 @@ class Freiburg(FileDataset):
         super().__init__(folder, name, num_classes, classes, palette)
         self.unscored = unscored
         self.crop = crop
-        self.thermal_range = thermal_range
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences
-        self.splits = SPLITS
-        self._split_frames: dict[str, tuple[FreiburgFrame, ...]] = {}
-        _check_root(self.root)
+        self._split_frames: dict[str, tuple[FolderFrame, ...]] = {}
+        if not any(inside(folder, part).is_dir() for part in ("train", "test")):
+            raise InputError(
+                f"dataset.root: '{root}' holds neither the folder train nor test; give the folder "
+                "into which both archives were unpacked."
+            )
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
                 check_choice(f"dataset.{key}", word, classes)
-        _check_numbers(crop, thermal_range)
-        self.images = FreiburgImages(crop, thermal_range)
+        if crop is not None and not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
+            raise InputError(
+                "dataset.crop: expected [first row, row after the last, first column, column after "
+                f"the last], such as {list(CROP)}, got {list(crop)}."
+            )
+        if not 0 <= thermal_range[0] < thermal_range[1] < 2**16:
+            raise InputError(
+                "dataset.thermal_range: expected counts 0 <= low < high <= 65535, such as "
+                f"{list(THERMAL_RANGE)}, got {list(thermal_range)}."
+            )
+        self.codes = indices(num_classes)
+        self.clipping = thermal_range
+        self.images = PairReader(
+            layouts=LAYOUTS,
+            thermal_range=thermal_range,
+            counts=True,
+            crop=crop,
+            advice="use the original file, a converted one no longer holds the counts that "
+            "dataset.thermal_range cuts",
+        )
+
+    @property
+    def splits(self) -> dict[str, str]:
+        """Split -> the pattern of its files."""
+        return SPLITS
 
     def has(self, split: str) -> bool:
         """Whether `split` has frames; InputError if the split is unknown."""
@@ -146,46 +174,48 @@ class Freiburg(FileDataset):
             InputError: unknown split, no frame of it, a missing sequence of "val".
         """
         frames = self._of(split)
+        hint = f"unpack the archive '{split.partition('_')[0]}' there"
         if split in ("train", "train_day", "val"):
-            self._check_sequences()
+            by_day = [each for each in self._frames.values() if _time_of(each) == "train_day"]
+            known = {word for frame in by_day for word in _sequences(frame)}
+            for word in self.val_sequences if by_day else ():
+                if word not in known:
+                    raise InputError(
+                        f"dataset.val_sequences: there is no day sequence '{word}' in {self.root}; "
+                        f"{nearest(word, {each for each in known if '/' not in each})}."
+                    )
+            if split == "val":
+                hint = f"it is {list(self.val_sequences)}, name existing day sequences"
+            elif by_day:
+                hint = "every day sequence is in dataset.val_sequences, remove one of them"
         if not frames:
-            raise InputError(self._why_empty(split))
+            raise InputError(
+                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
+                f"{self.root}; {hint}."
+            )
         return tuple(frame.name for frame in frames)
 
     def read(self, name: str) -> Sample:
         """See `FileDataset`; cut, thermal as grey levels, without a label in training at night."""
         frame = self.frame(name)
-        pixels, counts = whole_frame(name, *self._image_paths(frame))
+        rgb = existing_file("RGB image", frame.rgb, name, self.root)
+        thermal = existing_file("thermal image", frame.thermal, name, self.root)
+        pixels, values = self.images.whole(name, rgb, thermal)
         # A label is resized to the whole frame, and cropped with it.
-        label = None if frame.label is None else self._label(frame, counts.shape)
-        sample = self.images.sample(name, pixels, counts)
+        label = None if frame.label is None else self._label(frame, frame.label, values.shape)
+        sample = self.images.sample(name, pixels, values, thermal)
         if label is None:
             return sample
         return replace(sample, label=np.ascontiguousarray(self.images.cut(label, name)))
-
-    def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
-        return self.images.read(name, *self._image_paths(self.frame(name)))
 
     def label(self, name: str) -> Array | None:
         """The label of `read` alone; the frame is read as well, for its size."""
         return self.read(name).label
 
-    def counts(self, name: str) -> NDArray[np.uint16]:
-        """Counts of the thermal camera, (H, W) uint16, cut as in `read`; InputError as there."""
-        return self.images.cut(read_counts(self._image_paths(self.frame(name))[1]), name)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
-        frame = self.frame(name)
-        paths = (frame.rgb, frame.thermal, frame.label)
-        return tuple(path for path in paths if path is not None)
-
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files."""
         return {
-            "crop": self.crop,
-            "thermal_range": self.thermal_range,
+            **super().decoding(),
             "ignored_test": sorted(self.ignored_test),
             "val_sequences": sorted(self.val_sequences),
             "classes": self.classes,
@@ -193,7 +223,7 @@ class Freiburg(FileDataset):
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
         """Whether each frame is in a night folder; InputError if there is no such frame."""
-        return tuple(self.frame(name).night for name in names)
+        return tuple(self.frame(name).values["time"] == "night" for name in names)
 
     def fingerprint(self) -> str:
         """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
@@ -206,82 +236,72 @@ class Freiburg(FileDataset):
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
-    def checks(self) -> FreiburgChecks:
-        """What `rgbt.data.check` checks of this data set."""
-        return FreiburgChecks(self)
-
-    def frame(self, name: str) -> FreiburgFrame:
+    def frame(self, name: str) -> FolderFrame:
         """The files of `name`; InputError if there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
         return self._frames[name]
 
+    def repeats(self, split: str) -> bool:
+        """The split "train" is "train_day", and "test" the day followed by the night."""
+        return split in ("train", "test")
+
+    def unused(self, lists: SplitNames) -> list[Path]:  # noqa: ARG002 - as every data set
+        """Thermal images and labels without an RGB image."""
+        return self._found[1]
+
+    def own_problems(self, lists: SplitNames) -> list[str]:
+        """Frames in two parts, by their time stamps; names differ between the parts."""
+
+        def forms(name: str) -> tuple[str, str]:
+            """The stamp without and with the number in the burst, which may be left out."""
+            stamp = self.frame(name).values["stamp"]
+            return stamp.removesuffix("0"), stamp
+
+        problems = []
+        for test in ("test_day", "test_night"):
+            for other in ("train_day", "train_night", "val"):
+                trained = {form: name for name in lists.get(other, ()) for form in forms(name)}
+                both = [name for name in lists.get(test, ()) if forms(name)[0] in trained]
+                problems += [
+                    f"splits {test} and {other} share {len(both)} frames by their time stamps, "
+                    f"the first is '{name}', which is '{trained[forms(name)[0]]}'."
+                    for name in both[:1]
+                ]
+        return problems
+
     @cached_property
-    def frames(self) -> tuple[FreiburgFrame, ...]:
-        """Every frame; listed once, so later changes of the folder have no effect."""
+    def _found(self) -> tuple[dict[str, FolderFrame], list[Path]]:
+        """See `find_frames`; listed once, so later changes of the folder have no effect."""
         return find_frames(self.root)
 
-    @cached_property
-    def _frames(self) -> dict[str, FreiburgFrame]:
-        return {frame.name: frame for frame in self.frames}
+    @property
+    def _frames(self) -> dict[str, FolderFrame]:
+        return self._found[0]
 
-    def _of(self, split: str) -> tuple[FreiburgFrame, ...]:
+    def _of(self, split: str) -> tuple[FolderFrame, ...]:
+        self.check_split(split)
         if split not in self._split_frames:
-            self._split_frames[split] = self._select(split)
+            wanted = {"train": "train_day", "val": "val_day"}.get(split, split)
+            self._split_frames[split] = tuple(
+                frame for frame in self._frames.values() if self._part(frame).startswith(wanted)
+            )
         return self._split_frames[split]
 
-    def _select(self, split: str) -> tuple[FreiburgFrame, ...]:
-        check_split(split, self.splits)
-        part, _, time = split.partition("_")
-        time = time or ("day" if part in ("train", "val") else "")
-        return tuple(
-            frame
-            for frame in self.frames
-            if self._part(frame) == part and time in ("", "night" if frame.night else "day")
-        )
+    def _part(self, frame: FolderFrame) -> str:
+        """The part and time of a frame: "val_day" of training days that are held out."""
+        time = _time_of(frame)
+        held_out = time == "train_day" and set(_sequences(frame)) & set(self.val_sequences)
+        return "val_day" if held_out else time
 
-    def _part(self, frame: FreiburgFrame) -> str:
-        if frame.is_test:
-            return "test"
-        held_out = not frame.night and not set(frame.sequences).isdisjoint(self.val_sequences)
-        return "val" if held_out else "train"
-
-    def _check_sequences(self) -> None:
-        by_day = [frame for frame in self.frames if not (frame.is_test or frame.night)]
-        known = {word for frame in by_day for word in frame.sequences}
-        for word in self.val_sequences:
-            if by_day and word not in known:
-                raise InputError(
-                    f"dataset.val_sequences: there is no day sequence '{word}' in {self.root}; "
-                    f"{nearest(word, {sequence for sequence in known if '/' not in sequence})}."
-                )
-
-    def _why_empty(self, split: str) -> str:
-        hint = f"unpack the archive '{split.partition('_')[0]}' there"
-        if split == "val":
-            hint = f"it is {list(self.val_sequences)}, name existing day sequences"
-        elif split in ("train", "train_day") and self.has("val"):
-            hint = "every day sequence is in dataset.val_sequences, remove one of them"
-        return (
-            f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-            f"{self.root}; {hint}."
-        )
-
-    def _image_paths(self, frame: FreiburgFrame) -> tuple[Path, Path]:
-        thermal = existing_file("thermal image", frame.thermal, frame.name, self.root)
-        return within(frame.rgb, self.root), thermal
-
-    def _label(self, frame: FreiburgFrame, hw: tuple[int, ...]) -> Array:
+    def _label(self, frame: FolderFrame, path: Path, hw: tuple[int, ...]) -> Array:
         """The label, resized to the frame with the nearest pixel."""
-        assert frame.label is not None, "the frame has a label"
-        path = existing_file("label", frame.label, frame.name, self.root)
-        read = read_label if path.suffix == ".png" else read_label_array
-        label = read(path, self.num_classes)
+        label = self.codes.read(existing_file("label", path, frame.name, self.root))
         if label.shape != hw:
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
                 raise InputError(
-                    f"{frame.label} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
+                    f"{path} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
                     f"{hw[0]}x{hw[1]}, which is another aspect ratio; use the label of the whole "
                     "frame."
                 )
@@ -289,29 +309,18 @@ class Freiburg(FileDataset):
             label = np.asarray(
                 cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8
             )
-        if self._part(frame) != "train" and self.ignored_test:
+        if not self._part(frame).startswith("train") and self.ignored_test:
             ignored = [self.classes.index(word) for word in self.ignored_test]
             label = np.where(np.isin(label, ignored), np.uint8(IGNORE), label)
         return label
 
 
-def _check_root(root: Path) -> None:
-    if not any(inside(root, part).is_dir() for part in ("train", "test")):
-        raise InputError(
-            f"dataset.root: '{root}' holds neither the folder train nor test; give the folder into "
-            "which both archives were unpacked."
-        )
+def _time_of(frame: FolderFrame) -> str:
+    """The part of the archive and the time of a frame: "train_night"."""
+    return f"{frame.values.get('part', 'train')}_{frame.values['time']}"
 
 
-def _check_numbers(crop: tuple[int, int, int, int] | None, thermal_range: tuple[int, int]) -> None:
-    if crop is not None and not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
-        raise InputError(
-            "dataset.crop: expected [first row, row after the last, first column, column after the "
-            f"last], such as {list(CROP)}, got {list(crop)}."
-        )
-    low, high = thermal_range
-    if not 0 <= low < high <= np.iinfo(np.uint16).max:
-        raise InputError(
-            f"dataset.thermal_range: expected counts 0 <= low < high <= 65535, such as "
-            f"{list(THERMAL_RANGE)}, got {[low, high]}."
-        )
+def _sequences(frame: FolderFrame) -> tuple[str, str]:
+    """The training sequence of a frame, and the piece of it: "seq_00_day", "seq_00_day/00"."""
+    sequence = frame.values["sequence"]
+    return sequence, f"{sequence}/{frame.values['piece']}"

@@ -34,7 +34,6 @@ warnings.filterwarnings("ignore", module=r"PIL\.")  # on damaged files, which ar
 
 LEFT_OUT = "replace it, or use data.on_error=skip to leave it out"
 
-
 UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
 """Exceptions of Pillow for damaged headers, and for files that are not images."""
 
@@ -49,7 +48,13 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
     try:
         return read_bytes(path, CONTENT, advice)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{path} is missing{_why_missing(path)}.") from None
+        why = ""
+        if os.path.islink(path):  # noqa: PTH114
+            why = (
+                f": it is a link to {path.readlink()}, where nothing is; restore that file, or use "
+                "data.on_error=skip to leave it out"
+            )
+        raise InputError(f"{path} is missing{why}.") from None
     except PermissionError:
         raise InputError(
             f"{path} may not be read, permission is denied; allow it (chmod a+r, and a+x for the "
@@ -167,20 +172,6 @@ def _resolved_file(path: Path) -> str:
 @lru_cache(maxsize=4096)
 def _resolved(folder: str) -> str:
     return os.path.realpath(folder)
-
-
-def _why_missing(path: Path) -> str:
-    if os.path.islink(path):  # noqa: PTH114
-        return (
-            f": it is a link to {path.readlink()}, where nothing is; restore that file, or use "
-            "data.on_error=skip to leave it out"
-        )
-    if path.stem.endswith("_flip"):
-        return (
-            "; the list names a mirrored copy: write it, or point dataset.splits to a list without "
-            "such names"
-        )
-    return ""
 
 
 def _is_whole_png(data: bytes) -> bool:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import FileDataset
-from rgbt.data.files import read_label
-from rgbt.data.grey import read_grey
-from rgbt.data.images import GreyImages, PairPattern
-from rgbt.data.integrity import read_names, within
+from rgbt.data.file_dataset import Expected, FileDataset, SplitNames
+from rgbt.data.folder.frames import FolderFrame, Patterns
+from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.integrity import read_names
 from rgbt.data.kp_layout import (
     FORM,
     LABELS_OF,
@@ -28,11 +23,9 @@ from rgbt.data.kp_layout import (
     set_of,
     sets_of,
 )
-from rgbt.data.named_files import check_split, existing_root, hash_of_files, names_in, root_nearby
-from rgbt.data.prepare.kp import PREPARATION
-from rgbt.data.report.kp import KPChecks
+from rgbt.data.labels import indices
+from rgbt.data.named_files import existing_root, names_in, root_nearby
 from rgbt.ranges import Colour, Names, NumClasses, Text
-from rgbt.types import IGNORE
 
 ListSource = Literal["auto", "files", "sets"]
 
@@ -47,10 +40,19 @@ PALETTE = (
     *((70, 130, 180), (220, 20, 60), (255, 0, 0), (0, 0, 142), (0, 0, 70)),
     *((0, 60, 100), (0, 80, 100), (0, 0, 230), (119, 11, 32)),
 )
-MOST_TINT = 8
-"""Grey levels by which the channels of a thermal image may differ at a pixel."""
-
-ADVICE = "use the original file of the folder lwir"
+IMAGES = {
+    "the CRM release": PairPattern(
+        "images/{set}/{video}/visible/{frame}.jpg", "images/{set}/{video}/lwir/{frame}.jpg"
+    ),
+    "MS-UDA": PairPattern(
+        "pseudo_KP/{time}/{set}_{video}_visible_{frame}.png",
+        "pseudo_KP/{time}/{set}_{video}_lwir_{frame}.png",
+    ),
+}
+LABELS = {
+    "the CRM release": "labels/{set}_{video}_{frame}.png",
+    "MS-UDA": "labels/{time}/{set}_{video}_{frame}.png",
+}
 
 
 class KP(FileDataset):
@@ -72,7 +74,7 @@ class KP(FileDataset):
     Thermal is the mean over the three channels of the lwir image, rounded. If channels differ, the
     releases disagree: CRM takes the real mean, OpenRSS truncates it. A grey JPEG decodes to equal
     channels; if it was saved as a colour image, its channels may differ by a few levels. A
-    difference of up to `MOST_TINT` is accepted; an image with a larger one is a colour image.
+    difference of up to 8 levels is accepted; an image with a larger one is a colour image.
 
     Source: images KAIST multispectral pedestrian data set (Hwang et al., CVPR 2015); labels MS-UDA
     (Kim et al., RA-L 2021); split CRM (Shin et al., ICRA 2024).
@@ -89,20 +91,16 @@ class KP(FileDataset):
             `splits` is set although sets are used.
     """
 
-    images = GreyImages(
-        layouts=(
-            PairPattern(
-                "images/{set}/{video}/visible/{frame}.jpg", "images/{set}/{video}/lwir/{frame}.jpg"
-            ),
-            PairPattern(
-                "pseudo_KP/{time}/{set}_{video}_visible_{frame}.png",
-                "pseudo_KP/{time}/{set}_{video}_lwir_{frame}.png",
-            ),
-        ),
-        thermal=partial(read_grey, advice=ADVICE, most_tint=MOST_TINT),
+    images = PairReader(
+        layouts=tuple(IMAGES.values()),
+        most_tint=8,
+        advice="use the original file of the folder lwir",
     )
-
-    preparation = PREPARATION
+    expected = Expected(
+        "kp",
+        day_night={"train": (261, 238), "val": (64, 76), "test": (178, 133)},
+        hw=(512, 640),
+    )
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -117,13 +115,23 @@ class KP(FileDataset):
     ) -> None:
         folder = existing_root(root, "that holds images and labels of KP")
         super().__init__(folder, name, num_classes, classes, palette)
-        _check_root(self.root)
-        self.lists: Literal["files", "sets"] = _find_lists(self.root, splits, lists)
+        self.codes = indices(num_classes, num_classes)  # the value after the last class is void
+        if not _holds_kp(folder):
+            near = root_nearby(folder, _holds_kp) or "the folder that does"
+            raise InputError(
+                f"dataset.root: '{folder}' does not hold the folders images and labels of KP (or "
+                f"pseudo_KP and labels); give {near}."
+            )
+        self.lists: Literal["files", "sets"] = _find_lists(folder, splits, lists)
+        by_time = any((folder / "labels" / each).is_dir() for each in LABELS_OF.values())
+        has_labels = not by_time or any((folder / "labels").glob("set*.png"))
+        self.layout = "the CRM release" if (folder / "images").is_dir() else "MS-UDA"
+        labels = LABELS["the CRM release" if has_labels else "MS-UDA"]
+        self.patterns = Patterns.of(*IMAGES[self.layout][:2], labels)
         self._files = dict(splits)
-        self._names: dict[str, tuple[str, ...]] = {}
 
     @property
-    def splits(self) -> Mapping[str, str]:
+    def splits(self) -> dict[str, str]:
         """Split -> its list, or its sets."""
         if self.lists == "files":
             return self._files
@@ -134,14 +142,14 @@ class KP(FileDataset):
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""
-        check_split(split, self.splits)
+        self.check_split(split)
         if self.lists != "files":
-            return bool(self._with_labels(split))
+            return bool(self._of_sets(split))
         sources = self._sources(split)
         if len(sources) != 1 or sources == (split,):
             return bool(sources)
         # The list may contain days or nights only.
-        return any(self._is_of_time(name, split) for name in self._read_list(sources[0]))
+        return bool(self._of_time(self._read_list(sources[0]), split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in the order of its list, or sorted.
@@ -149,76 +157,101 @@ class KP(FileDataset):
         Raises:
             InputError: unknown split, missing or empty list, an invalid name, no label of the sets.
         """
-        check_split(split, self.splits)
+        self.check_split(split)
         if split not in self._names:
-            read = self._of_lists if self.lists == "files" else self._of_sets
-            self._names[split] = read(split)
+            names = self._of_lists(split) if self.lists == "files" else self._of_sets(split)
+            if not names:
+                expected = (
+                    f"{self.splits[split]} in {self.root / 'labels'}; unpack all labels of KP"
+                )
+                if self.lists == "files":
+                    listed = ", ".join(self.list_files(split))
+                    expected = f"such an image in '{self.root / listed}'; correct the list"
+                raise InputError(
+                    f"split '{split}' of {self.name} is empty: expected {expected} there."
+                )
+            self._names[split] = names
         return self._names[split]
 
-    def label(self, name: str) -> NDArray[np.uint8]:
-        """The label of `read` alone, (H, W) uint8; InputError as there."""
-        # The value after the last class is void.
-        label = read_label(within(self.files(name)[-1], self.root), self.num_classes + 1)
-        label[label == self.num_classes] = IGNORE
-        return label
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`; InputError if the name is invalid."""
+        values = dict(zip(("set", "video", "frame"), parts_of(name), strict=True))
+        values["time"] = LABELS_OF[is_night(name)]
+        return self.patterns.frame(self.root, name, values)
 
-    def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; InputError if the name is invalid."""
-        recording, video, frame = parts_of(name)
-        if self.has_images:
-            folder = self.root / "images" / recording / video
-            images = tuple(folder / kind / f"{frame}.jpg" for kind in ("visible", "lwir"))
-        else:
-            folder = self.root / "pseudo_KP" / LABELS_OF[is_night(name)]
-            images = tuple(
-                folder / f"{recording}_{video}_{kind}_{frame}.png" for kind in ("visible", "lwir")
-            )
-        return (*images, self.label_path(name))
-
-    def label_path(self, name: str) -> Path:
-        """The label of `name`; InputError if the name is invalid."""
-        folder = self.root / "labels"
-        return (folder if self.has_labels else folder / LABELS_OF[is_night(name)]) / f"{name}.png"
+    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
+        """Whether each image was taken at night, by set number; InputError for other names."""
+        return tuple(is_night(name) for name in names)
 
     def list_files(self, split: str) -> tuple[str, ...]:
         """The lists that `split` is read from; () if sets are used, or no list exists."""
         sources = self._sources(split) if self.lists == "files" else ()
         return tuple(self._files[source] for source in sources)
 
-    def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
-        return {"num_classes": self.num_classes, "most_tint": MOST_TINT}
+    @property
+    def title(self) -> str:
+        """The layout of images and labels, and the source of the splits."""
+        origin = "list files" if self.lists == "files" else "set numbers"
+        return f"KP in the layout of {self.layout}, splits from {origin}"
 
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
-        """Whether each image was taken at night, by set number; InputError for other names."""
-        return tuple(is_night(name) for name in names)
+    def sources(self, split: str) -> tuple[str, ...]:
+        """The lists of a split, or its sets: without a test list two splits may share one."""
+        return self.list_files(split) if self.lists == "files" else super().sources(split)
 
-    def fingerprint(self) -> str:
-        """See `hash_of_files`."""
-        splits = {split: self.names(split) if self.has(split) else () for split in self.splits}
-        return hash_of_files(splits, self.files)
+    def unused(self, lists: SplitNames) -> list[Path]:
+        """Labels of no split; images without a label are many and not meant."""
+        listed = set().union(*lists.values())
+        assert self.patterns.label is not None, "every layout has labels"
+        paths = (match.path for match in self.patterns.label.files(self.root))
+        return [path for path in paths if path.stem not in listed and NAME.fullmatch(path.stem)]
 
-    def checks(self) -> KPChecks:
-        """What `rgbt.data.check` checks of this data set."""
-        return KPChecks(self)
+    def own_problems(self, lists: SplitNames) -> list[str]:
+        """Labels of other names, and splits that are not the union of their day and their night."""
+        strange = [name for name in self.labels_on_disk if NAME.fullmatch(name) is None]
+        problems = [
+            f"{len(strange)} labels have names without a set, the first is '{name}.png'."
+            for name in strange[:1]
+        ]
+        for split, names in lists.items():
+            parts = [f"{split}_{time}" for time in TIMES]
+            if not all(part in lists for part in parts):
+                continue
+            differ = sorted(set(names) ^ {name for part in parts for name in lists[part]})
+            if differ:
+                problems.append(
+                    f"split {split} is not {parts[0]} and {parts[1]} together: {len(differ)} names "
+                    f"are in one of them alone, the first is '{differ[0]}'."
+                )
+        return problems
 
-    @cached_property
-    def has_images(self) -> bool:
-        """Whether images are in folders by set and video, and not in the layout of MS-UDA."""
-        return (self.root / "images").is_dir()
-
-    @cached_property
-    def has_labels(self) -> bool:
-        """Whether labels are in one folder, and not in the layout of MS-UDA."""
-        folder = self.root / "labels"
-        by_time = any((folder / each).is_dir() for each in LABELS_OF.values())
-        return not by_time or any(folder.glob("set*.png"))
+    def own_notes(self, lists: SplitNames) -> list[str]:
+        """The source of the splits, and whether it is the division of MS-UDA."""
+        if self.lists == "sets":
+            notes = [
+                "no list is read: all labels on disk are divided into splits by set numbers, as in "
+                "the CRM release."
+            ]
+        else:
+            files = dict.fromkeys(path for split in self.splits for path in self.list_files(split))
+            notes = [f"splits are read from the lists {', '.join(files) or '(none)'}."]
+        train, val = lists.get("train", ()), lists.get("val", ())
+        # Days that CRM tests or validates on.
+        is_ms_uda = not any(self.nights(train)) and all(self.nights(val)) and val
+        if self.name == "kp" and is_ms_uda and not {6, 7, 8}.isdisjoint(map(set_of, train)):
+            notes.append(
+                "the training split has only days and the validation split only nights, as in "
+                "MS-UDA: scores are not comparable with those of CRM, which trains on both; "
+                "dataset.lists=sets divides as CRM does."
+            )
+        return notes
 
     @cached_property
     def labels_on_disk(self) -> tuple[str, ...]:
         """Sorted names of all label files, valid or not; listed once."""
         folder = self.root / "labels"
-        folders = [folder] if self.has_labels else [folder / each for each in LABELS_OF.values()]
+        assert self.patterns.label is not None, "every layout has labels"
+        by_time = "time" in self.patterns.label.words
+        folders = [folder / each for each in LABELS_OF.values()] if by_time else [folder]
         return tuple(sorted({name for each in folders for name in names_in(each)}))
 
     def _sources(self, split: str) -> tuple[str, ...]:
@@ -236,22 +269,15 @@ class KP(FileDataset):
         return parts if all(map(is_there, parts)) else ()
 
     @staticmethod
-    def _is_of_time(name: str, split: str) -> bool:
-        return is_night(name) == split.endswith("_night")
+    def _of_time(names: tuple[str, ...], split: str) -> tuple[str, ...]:
+        return tuple(name for name in names if is_night(name) == split.endswith("_night"))
 
     def _of_lists(self, split: str) -> tuple[str, ...]:
         sources = self._sources(split) or (split,)
-        names = [name for source in sources for name in self._read_list(source)]
+        names = tuple(name for source in sources for name in self._read_list(source))
         if len(sources) > 1:
             return tuple(sorted(names))
-        if sources != (split,):
-            names = [name for name in names if self._is_of_time(name, split)]
-        if not names:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: there is no such image in "
-                f"'{self.root / self._files[sources[0]]}'."
-            )
-        return tuple(names)
+        return names if sources == (split,) else self._of_time(names, split)
 
     def _read_list(self, split: str) -> tuple[str, ...]:
         path = self.root / self._files[split]
@@ -269,35 +295,16 @@ class KP(FileDataset):
                 )
         return names
 
-    def _with_labels(self, split: str) -> tuple[str, ...]:
+    def _of_sets(self, split: str) -> tuple[str, ...]:
         wanted = sets_of(split)
         return tuple(
             name for name in self.labels_on_disk if NAME.fullmatch(name) and set_of(name) in wanted
         )
 
-    def _of_sets(self, split: str) -> tuple[str, ...]:
-        names = self._with_labels(split)
-        if not names:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-                f"{self.root / 'labels'}; unpack all labels of KP there."
-            )
-        return names
-
 
 def _holds_kp(root: Path) -> bool:
-    return (root / "labels").is_dir() and any(
-        (root / images).is_dir() for images in ("images", "pseudo_KP")
-    )
-
-
-def _check_root(root: Path) -> None:
-    if not _holds_kp(root):
-        near = root_nearby(root, _holds_kp) or "the folder that does"
-        raise InputError(
-            f"dataset.root: '{root}' does not hold the folders images and labels of KP (or "
-            f"pseudo_KP and labels); give {near}."
-        )
+    images = ((root / each).is_dir() for each in ("images", "pseudo_KP"))
+    return (root / "labels").is_dir() and any(images)
 
 
 def _find_lists(root: Path, splits: dict[str, str], wanted: ListSource) -> Literal["files", "sets"]:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, Literal
+import re
+from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import FileDataset
-from rgbt.data.files import read_thermal
-from rgbt.data.images import GreyImages, PairPattern
-from rgbt.data.integrity import read_names
-from rgbt.data.mfnet_layout import FOLDERS, MIRRORED, SPLITS, base_name, either_layout
-from rgbt.data.named_files import check_split, existing_root, hash_of_files
-from rgbt.data.prepare.mfnet import PREPARATION
-from rgbt.data.report.mfnet import MFNetChecks
+from rgbt.data.file_dataset import Expected, FileDataset, SplitNames
+from rgbt.data.folder.frames import FolderFrame, Patterns
+from rgbt.data.folder.splits import ByList
+from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.labels import indices
+from rgbt.data.named_files import existing_root
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
-LayoutName = Literal["auto", "packed", "folders"]
+Layout = Literal["packed", "folders"]
 
 CLASSES = (
     *("unlabeled", "car", "person", "bike", "curve"),
@@ -26,6 +24,24 @@ PALETTE = (
     *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
     *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
 )
+LAYOUTS: dict[Layout, PairPattern] = {
+    "packed": PairPattern("images/{name}.png", "images/{name}.png", "labels/{name}.png"),
+    "folders": PairPattern("RGB/{name}.png", "Thermal/{name}.png", "Label/{name}.png"),
+}
+FOLDERS = {
+    name: tuple(dict.fromkeys(str(text).partition("/")[0] for text in patterns))
+    for name, patterns in LAYOUTS.items()
+}
+EITHER_LAYOUT = " or ".join("+".join(folders) for folders in FOLDERS.values())
+SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
+
+NAME = re.compile(r"\d{5}[DN](_flip)?")
+MIRRORED = "_flip"
+
+
+def time_of(name: str) -> str:
+    """The last letter of `name` before the suffix of mirrored copies: D by day, N at night."""
+    return name.removesuffix(MIRRORED)[-1:]
 
 
 class MFNet(FileDataset):
@@ -51,16 +67,14 @@ class MFNet(FileDataset):
         InputError: no such root, no known layout, or numbers of classes, names and colours differ.
     """
 
-    images = GreyImages(
-        layouts=tuple(
-            PairPattern(f"{folders[0]}/{{name}}.png", f"{folders[-2]}/{{name}}.png")
-            for folders in FOLDERS.values()
-        ),
-        thermal=read_thermal,
+    images = PairReader(
+        layouts=tuple(PairPattern(*layout[:2]) for layout in LAYOUTS.values()),
         packed_advice="dataset.layout=folders for separate images",
     )
-
-    preparation = PREPARATION
+    mirrored = MIRRORED
+    expected = Expected(
+        "mfnet", day_night={"train": (410, 374), "val": (205, 187), "test": (205, 188)}
+    )
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -71,88 +85,57 @@ class MFNet(FileDataset):
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         splits: dict[Text, Text] = SPLITS,
-        layout: LayoutName = "auto",
+        layout: Literal["auto"] | Layout = "auto",
     ) -> None:
-        folder = existing_root(root, f"that holds {either_layout()} and the split lists")
+        folder = existing_root(root, f"that holds {EITHER_LAYOUT} and the split lists")
         super().__init__(folder, name, num_classes, classes, palette)
-        self.splits = dict(splits)
-        self.layout = _find_layout(self.root, layout)
-        self._names: dict[str, tuple[str, ...]] = {}
-
-    def has(self, split: str) -> bool:
-        """Whether the list of `split` exists; InputError if the split is unknown."""
-        return self.list_path(split).is_file()
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names in the order of the list; InputError if it is unknown, missing or empty."""
-        if split not in self._names:
-            self._names[split] = self._read_list(split)
-        return self._names[split]
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """The packed image of `name`, or its RGB and its thermal image, and its label."""
-        return tuple(self.root / folder / f"{name}.png" for folder in FOLDERS[self.layout])
-
-    def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
-        return {"layout": self.layout, "num_classes": self.num_classes}
-
-    def is_night(self, name: str) -> bool:
-        """Whether the last letter of the name, before the suffix, is N (night) and not D (day).
-
-        Raises:
-            InputError: the name ends in neither letter.
-        """
-        letter = base_name(name)[-1:]
-        if letter not in ("D", "N"):
+        for known, folders in FOLDERS.items():
+            if layout in ("auto", known) and all((folder / each).is_dir() for each in folders):
+                self.layout = known
+                break
+        else:
+            wanted = EITHER_LAYOUT if layout == "auto" else "+".join(FOLDERS[layout])
             raise InputError(
-                f"the name '{name}' has no time of day: expected a name that ends in D or N "
-                f"(before '{MIRRORED}'); rename it in the split lists of {self.root}."
+                f"dataset.root: '{root}' does not hold the folders {wanted}; give the folder of "
+                "the data set itself."
             )
-        return letter == "N"
+        self.patterns = Patterns.of(*LAYOUTS[self.layout])
+        self.codes = indices(num_classes)
+        self.rule = ByList(folder, dict(splits), "dataset.splits")
+
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`."""
+        return self.patterns.frame(self.root, name, {"name": name})
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """`is_night` of every name; None if none states the time of day, InputError if some do."""
-        if not any(base_name(name)[-1:] in ("D", "N") for name in names):
+        """Whether each name ends in N (night) and not D (day), before the suffix "_flip".
+
+        None if none does, InputError if only some do.
+        """
+        without = [name for name in names if time_of(name) not in ("D", "N")]
+        if len(without) == len(names):
             return None
-        return tuple(self.is_night(name) for name in names)
-
-    def fingerprint(self) -> str:
-        """See `hash_of_files`; splits without a list are empty."""
-        listed = {split: self.names(split) if self.has(split) else () for split in self.splits}
-        return hash_of_files(listed, self.files)
-
-    def checks(self) -> MFNetChecks:
-        """What `rgbt.data.check` checks of this data set."""
-        return MFNetChecks(self)
-
-    def list_path(self, split: str) -> Path:
-        """The list file of `split`; InputError if the split is unknown."""
-        check_split(split, self.splits)
-        return self.root / self.splits[split]
-
-    def names_on_disk(self) -> frozenset[str]:
-        """Names of all PNG files in the folders of images and labels, listed or not."""
-        folders = [self.root / folder for folder in FOLDERS[self.layout]]
-        return frozenset(path.stem for folder in folders for path in folder.glob("*.png"))
-
-    def _read_list(self, split: str) -> tuple[str, ...]:
-        path = self.list_path(split)
-        if not path.is_file():
+        if without:
             raise InputError(
-                f"dataset.splits.{split}: there is no list '{path}'; write it (one name per line), "
-                f"or name another list with dataset.splits.{split}=..."
+                f"the name '{without[0]}' has no time of day: expected a name that ends in D or N "
+                f"(before '{MIRRORED}'); rename it in the split lists of {self.root}."
             )
-        return read_names(path, f"dataset.splits.{split}")
+        return tuple(time_of(name) == "N" for name in names)
 
+    @property
+    def title(self) -> str:
+        """One of the two layouts."""
+        return f"{self.layout} layout"
 
-def _find_layout(root: Path, wanted: LayoutName) -> Literal["packed", "folders"]:
-    for layout in ("packed", "folders"):
-        folders_exist = all((root / folder).is_dir() for folder in FOLDERS[layout])
-        if wanted in ("auto", layout) and folders_exist:
-            return layout
-    expected = either_layout() if wanted == "auto" else "+".join(FOLDERS[wanted])
-    raise InputError(
-        f"dataset.root: '{root}' does not hold the folders {expected}; give the folder of the "
-        "data set itself."
-    )
+    def repeats(self, split: str) -> bool:
+        """Lists by time of day only repeat names of others, and need not exist."""
+        return super().repeats(split) and not self.has(split)
+
+    def own_problems(self, lists: SplitNames) -> list[str]:
+        """Names of another form."""
+        return [
+            f"split {split}: '{name}' is not five digits and D or N (or that with '{MIRRORED}')."
+            for split, names in lists.items()
+            for name in dict.fromkeys(names)
+            if not NAME.fullmatch(name)
+        ]

@@ -1,4 +1,4 @@
-"""Functions shared by the readers of data sets: roots, splits, image sizes, fingerprints.
+"""Functions shared by the readers of data sets: roots, files of a sample, sizes, fingerprints.
 
 Nothing here depends on the layout of one data set.
 """
@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError
 from rgbt.data.integrity import is_there, within
-from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
 
@@ -29,38 +27,19 @@ def existing_root(root: str, content: str) -> Path:
     return path
 
 
-def check_split(split: str, splits: Iterable[str]) -> None:
-    """Refuse a split that is not one of `splits`."""
-    if split not in splits:
-        raise InputError(f"dataset.splits has no split '{split}'; {nearest(split, splits)}.")
-
-
 def existing_file(what: str, path: Path, name: str, root: Path) -> Path:
     """`path`, one file of the sample `name`; InputError if it is missing or outside `root`."""
     if not is_there(path):
-        raise InputError(
-            f"'{name}': its {what} {path} is missing; restore it, or use data.on_error=skip to "
-            "leave the frame out."
-        )
+        advice = "restore it, or use data.on_error=skip to leave the frame out"
+        if name.endswith("_flip"):
+            advice = "the list names a mirrored copy: write it, or use a list without such names"
+        raise InputError(f"'{name}': its {what} {path} is missing; {advice}.")
     return within(path, root)
 
 
 def names_in(folder: Path) -> tuple[str, ...]:
     """Sorted names of the PNG files of a folder, without ending and without those of archivers."""
     return tuple(sorted(path.stem for path in folder.glob("*.png") if path.name[0] != "."))
-
-
-def pair_of_one_size(name: str, rgb: Array, thermal: Array, path: Path) -> Sample:
-    """The sample of RGB (H, W, 3) and thermal (H, W) of `path`; InputError if the sizes differ."""
-    check_size(rgb, "thermal", thermal, name, path)
-    return Sample(rgb=rgb, thermal=thermal, label=None, name=name)
-
-
-def with_label(pair: Sample, label: Array | None, path: Path | None) -> Sample:
-    """`pair` with its label (H, W), read from `path`; InputError if the sizes differ."""
-    if label is not None:
-        check_size(pair.rgb, "its label", label, pair.name, path)
-    return replace(pair, label=label)
 
 
 def check_size(rgb: Array, what: str, image: NDArray[Any], name: str, path: Path | None) -> None:
@@ -105,18 +84,6 @@ def root_nearby(root: Path, holds: Callable[[Path], bool]) -> Path | None:
             return False
 
     return next(filter(is_one, (root.absolute().parent, *sorted(root.iterdir()))), None)
-
-
-def check_lengths(
-    num_classes: int, classes: tuple[str, ...], palette: tuple[tuple[int, int, int], ...]
-) -> None:
-    """Refuse names or colours that are not one per class."""
-    for key, length in (("classes", len(classes)), ("palette", len(palette))):
-        if length != num_classes:
-            raise InputError(
-                f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
-                "make them agree."
-            )
 
 
 def size_of(path: Path) -> int:

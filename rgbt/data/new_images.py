@@ -15,10 +15,7 @@ from rgbt.data.folder.pattern import NO_VALUES, PathMatch, Pattern, WordValues, 
 from rgbt.data.images import PairPattern
 
 KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Suffixes of image files, in lower case."""
-
-ARRAY = ".npy"
-"""Another suffix of thermal images."""
+"""Suffixes of image files, in lower case; thermal images may also be .npy."""
 
 PLAIN = (
     PairPattern("rgb/{name}.png", "thermal/{name}.png"),
@@ -61,23 +58,29 @@ def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewIm
     Raises:
         InputError: no complete pair, two of one name, or two thermal images for one RGB image.
     """
-    alone: dict[Path, Path] = {}
-    for layouts_of_tier, any_kind in _tiers(layouts):
-        found = _in_tier(folder, layouts_of_tier, any_kind=any_kind)
-        if found.pairs:
-            _check_names(found.pairs)
-            return found
-        alone = alone or found.alone
-    raise InputError(_why_nothing(folder, layouts, name, alone))
-
-
-def _tiers(layouts: Sequence[PairPattern]) -> Iterator[tuple[list[PairPattern], bool]]:
-    """Layouts that are tried together, and whether other suffixes are accepted."""
-    inner = list(layouts)
+    tiers, inner = [], list(layouts)
     while inner:
-        yield from ((inner, any_kind) for any_kind in (False, True))
+        tiers.append(inner)
         inner = [shorter for each in inner if (shorter := _inside(each)) is not None]
-    yield from (([plain], any_kind) for plain in PLAIN for any_kind in (False, True))
+    alone: dict[Path, Path] = {}
+    for tier in (*tiers, *([plain] for plain in PLAIN)):
+        for any_kind in (False, True):
+            found = _in_tier(folder, tier, any_kind=any_kind)
+            if found.pairs:
+                return found
+            alone = alone or found.alone
+    reason = f"{folder} holds {what_is_in(folder)}"
+    for rgb, thermal in list(alone.items())[:1]:
+        reason = (
+            f"the thermal image of {rgb} would be {thermal}, but {thermal.parent} holds "
+            f"{what_is_in(thermal.parent)}"
+        )
+    raise InputError(
+        f"{KEY}={folder} holds no pair of images: {reason}. Expected were the files of {name} "
+        f"({'; '.join(map(str, layouts))}; also without the first folders), folders rgb and "
+        "thermal with equal names, or PNG files of four channels (red, green, blue, thermal). One "
+        "pair is predicted with rgb=FILE thermal=FILE instead of input."
+    )
 
 
 def _inside(layout: PairPattern) -> PairPattern | None:
@@ -111,12 +114,24 @@ def _in_tier(folder: Path, layouts: Sequence[PairPattern], *, any_kind: bool) ->
             else:
                 pairs[path] = NewPair("_".join(values[each] for each in rgb.words), path, thermal)
     partners = {pair.thermal for pair in pairs.values() if pair.thermal != pair.rgb} | labels
-    found = [pair for path, pair in pairs.items() if path not in partners]
+    named: dict[str, NewPair] = {}
+    for pair in (pairs[path] for path in sorted(pairs) if path not in partners):
+        if pair.name in named:
+            raise InputError(
+                f"{KEY}: {named[pair.name].rgb} and {pair.rgb} would both be called "
+                f"'{pair.name}'; rename or move one of them."
+            )
+        named[pair.name] = pair
     used = {*pairs, *partners}
+    every = sorted(
+        path
+        for path in (folder.rglob("*") if named else ())
+        if path.suffix.lower() in KINDS and not path.name.startswith(".")
+    )
     return NewImages(
-        tuple(sorted(found, key=lambda pair: in_order(pair.name))),
+        tuple(named[name] for name in sorted(named, key=in_order)),
         {path: alone[path] for path in sorted(alone) if path not in used},
-        tuple(path for path in _all_images(folder) if path not in {*used, *alone}) if found else (),
+        tuple(path for path in every if path not in {*used, *alone}),
     )
 
 
@@ -127,7 +142,7 @@ def _files(
     if text is None:
         return
     stem, dot, ending = text.rpartition(".")
-    kinds = (ending, *(kind[1:] for kind in (*KINDS, ARRAY))) if any_kind and dot else (ending,)
+    kinds = (ending, *(kind[1:] for kind in (*KINDS, ".npy"))) if any_kind and dot else (ending,)
     for kind in dict.fromkeys(kinds):
         yield from Pattern(f"{stem}{dot}{kind}", KEY).files(folder, values, any_case=True)
 
@@ -137,16 +152,15 @@ def _partner(
 ) -> Path | None:
     """The thermal image of an RGB image; an exact match of the name is preferred."""
     exact = Pattern(layout.thermal, KEY).path(folder, values)
-    found = {path: None for path, _ in _files(layout.thermal, folder, values, any_kind=any_kind)}
+    found = list(dict(_files(layout.thermal, folder, values, any_kind=any_kind)))
     if exact in found or not found:
         return exact if found else None
-    first, *more = found
-    if more:
+    if len(found) > 1:
         raise InputError(
-            f"{KEY}={folder}: {first} and {more[0]} may both be the thermal image of one pair; "
+            f"{KEY}={folder}: {found[0]} and {found[1]} may both be the thermal image of one pair; "
             "remove or rename one of them."
         )
-    return first
+    return found[0]
 
 
 def _has_four_channels(path: Path) -> bool:
@@ -154,40 +168,3 @@ def _has_four_channels(path: Path) -> bool:
         return channels(decode(path)) == 4
     except InputError:  # reading it raises this error again
         return True
-
-
-def _all_images(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in KINDS and not path.name.startswith(".")
-    )
-
-
-def _check_names(pairs: Sequence[NewPair]) -> None:
-    seen: dict[str, Path] = {}
-    for pair in pairs:
-        if pair.name in seen:
-            raise InputError(
-                f"{KEY}: {seen[pair.name]} and {pair.rgb} would both be called '{pair.name}'; "
-                "rename or move one of them."
-            )
-        seen[pair.name] = pair.rgb
-
-
-def _why_nothing(
-    folder: Path, layouts: Sequence[PairPattern], name: str, alone: dict[Path, Path]
-) -> str:
-    own = "; ".join(map(str, layouts))
-    for rgb, thermal in alone.items():
-        reason = f"the thermal image of {rgb} would be {thermal}, but "
-        reason += f"{thermal.parent} holds {what_is_in(thermal.parent)}"
-        break
-    else:
-        reason = f"{folder} holds {what_is_in(folder)}"
-    return (
-        f"{KEY}={folder} holds no pair of images: {reason}. Expected were the files of {name} "
-        f"({own}; also without the first folders), folders rgb and thermal with equal names, or "
-        "PNG files of four channels (red, green, blue, thermal). One pair is predicted with "
-        "rgb=FILE thermal=FILE instead of input."
-    )

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from rgbt.checks import InputError
-from rgbt.data.files import decode, read_label
+from rgbt.data.files import decode
+from rgbt.data.labels import read_label
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.files.budgets import read_json
 from rgbt.types import Sample

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cached_property, partial
+from collections import Counter
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
-from rgbt.data.file_dataset import FileDataset
-from rgbt.data.grey import read_grey
-from rgbt.data.images import GreyImages, PairPattern
-from rgbt.data.integrity import read_names, within
-from rgbt.data.named_files import existing_root, hash_of_files, names_in, root_nearby
-from rgbt.data.prepare.pst900 import PREPARATION
+from rgbt.checks import InputError
+from rgbt.data.file_dataset import Expected, FileDataset, SplitNames
+from rgbt.data.folder.frames import FolderFrame, Patterns
+from rgbt.data.folder.splits import ByList
+from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.labels import indices
+from rgbt.data.named_files import existing_root, names_in, root_nearby
 from rgbt.data.pst900_layout import FOLDERS, PARTS, SPLITS, bag_of
-from rgbt.data.report.pst900 import PST900Checks
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 Bags = tuple[Annotated[int, Interval(ge=0, le=10**6)], ...]
 CLASSES = ("background", "fire_extinguisher", "backpack", "hand_drill", "survivor")
 PALETTE = ((0, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 0), (255, 255, 255))
 
-ADVICE = (
-    "the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the counts of "
-    "the camera and is not read"
-)
+TEST_BAGS = {21: 40, 22: 59, 23: 28, 24: 72, 25: 89}
+"""Recording -> pairs of the test part, 288 in all."""
 
 
 class PST900(FileDataset):
@@ -66,15 +61,17 @@ class PST900(FileDataset):
             differ.
     """
 
-    images = GreyImages(
+    images = PairReader(
         layouts=(
             PairPattern("{part}/rgb/{name}.png", "{part}/thermal/{name}.png"),
             PairPattern("rgb/{name}.png", "thermal/{name}.png"),
         ),
-        thermal=partial(read_grey, advice=ADVICE),
+        advice="the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the "
+        "counts of the camera and is not read",
     )
-
-    preparation = PREPARATION
+    clipping = (0, 255)
+    # The archive holds 597 training pairs; the data set's page says 606.
+    expected = Expected("pst900", images={"train": 597, "test": 288}, hw=(720, 1280))
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -88,14 +85,22 @@ class PST900(FileDataset):
     ) -> None:
         folder = existing_root(root, "that holds train and test of PST900")
         super().__init__(folder, name, num_classes, classes, palette)
+        self.codes = indices(num_classes)
         self.val_bags = val_bags
-        self.has_lists = _has_lists(self.root)
-        self._parts: dict[str, tuple[str, ...]] = {}
+        if val_bags:
+            self.expected = self.expected._replace(images={"test": self.expected.images["test"]})
+        self.has_lists = _has_lists(folder)
+        prefix = "" if self.has_lists else "{part}/"
+        self.patterns = Patterns.of(*(f"{prefix}{kind}/{{name}}.png" for kind in FOLDERS))
+        self._lists = ByList(folder, {part: f"{part}.txt" for part in SPLITS}, "split")
 
     @property
-    def splits(self) -> Mapping[str, str]:
+    def splits(self) -> dict[str, str]:
         """Split -> its files or its list."""
-        made_of = {split: self._made_of(self.part_of(split)) for split in SPLITS}
+        made_of = {}
+        for split in SPLITS:
+            part = self.part_of(split)
+            made_of[split] = f"{part}.txt" if self.has_lists else f"{part}/rgb/*.png"
         if self.val_bags:
             bags = list(self.val_bags)
             made_of["train"] += f" without the bags {bags}"
@@ -103,21 +108,19 @@ class PST900(FileDataset):
         return made_of
 
     def part_of(self, split: str) -> str:
-        """The part of the archive, or the list, of `split`; InputError if that is unknown."""
-        if split not in SPLITS:
-            raise InputError(f"dataset: there is no split '{split}'; {nearest(split, SPLITS)}.")
+        """The part of the archive, or the list, of a known `split`."""
         if split != "val":
             return split
         if self.val_bags:
             return "train"
-        return "val" if self.has_lists and (self.root / "val.txt").is_file() else "test"
+        return "val" if self.has_lists and self._lists.has("val") else "test"
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""
-        part = self.part_of(split)
+        self.check_split(split)
         if self.has_lists:
-            return self._list(part).is_file()
-        return bool(self._part(part, split)) and bool(self._chosen(split))
+            return self._lists.has(self.part_of(split))
+        return bool(self._chosen(split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted, or in the order of its list.
@@ -125,134 +128,131 @@ class PST900(FileDataset):
         Raises:
             InputError: unknown split, nothing of it, or a bag of `val_bags` that is not there.
         """
-        part = self.part_of(split)
-        if self.val_bags and part == "train":
-            self._check_bags()
-        names = self._chosen(split)
-        if not names:
-            raise InputError(self._why_empty(split))
-        return names
-
-    def thermal(self, name: str) -> NDArray[np.uint8]:
-        """The thermal image called `name` alone, (H, W) uint8; InputError as in `read`."""
-        return self.images.thermal(within(self.files(name)[1], self.root))
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; InputError if no part or both have it."""
-        folders = self._folders(name)
-        if len(folders) != 1:
-            reason = "both train and test have" if folders else "neither train nor test has"
-            raise InputError(
-                f"{self.name} ({self.root}): {reason} an image called '{name}'; use the original "
-                "archive, in which every name is in one part."
-            )
-        return _files_in(folders[0], name)
-
-    def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
-        return {"num_classes": self.num_classes}
-
-    def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
-        """None: it is dark underground at any time."""
-
-    def fingerprint(self) -> str:
-        """See `hash_of_files`; a name in both parts has the files of both."""
-        splits = {split: self._chosen(split) if self.has(split) else () for split in SPLITS}
-        return hash_of_files(
-            splits,
-            lambda name: [
-                path for folder in self._folders(name) for path in _files_in(folder, name)
-            ],
-        )
-
-    def checks(self) -> PST900Checks:
-        """What `rgbt.data.check` checks of this data set."""
-        return PST900Checks(self)
-
-    def folders(self) -> tuple[Path, ...]:
-        """Every folder that holds rgb, thermal and labels."""
-        if self.has_lists:
-            return (self.root,)
-        return tuple(self.root / part for part in PARTS if (self.root / part).is_dir())
-
-    def _made_of(self, part: str) -> str:
-        return f"{part}.txt" if self.has_lists else f"{part}/rgb/*.png"
-
-    def _list(self, part: str) -> Path:
-        return self.root / f"{part}.txt"
-
-    def _part(self, part: str, split: str) -> tuple[str, ...]:
-        """Names of a part; folders are listed once, so later changes have no effect."""
-        if part not in self._parts:
-            if self.has_lists:
-                lines = read_names(self._list(part), f"split '{split}' of {self.name}")
-                self._parts[part] = tuple(line.removesuffix(".png") for line in lines)
-            else:
-                self._parts[part] = names_in(self.root / part / FOLDERS[0])
-        return self._parts[part]
-
-    def _chosen(self, split: str) -> tuple[str, ...]:
-        names = self._part(self.part_of(split), split)
-        if not self.val_bags or split == "test":
-            return names
-        return tuple(name for name in names if (bag_of(name) in self.val_bags) == (split == "val"))
-
-    def _folders(self, name: str) -> tuple[Path, ...]:
-        """Folders with an image `name`: one, several or none."""
-        return (self.root,) if self.has_lists else self._folders_of.get(name, ())
-
-    @cached_property
-    def _folders_of(self) -> dict[str, tuple[Path, ...]]:
-        folders: dict[str, tuple[Path, ...]] = {}
-        for part in PARTS:
-            for name in self._part(part, part):
-                folders[name] = (*folders.get(name, ()), self.root / part)
-        return folders
-
-    def _check_bags(self) -> None:
-        known = {str(bag_of(name)) for name in self._part("train", "train")} - {"None"}
-        for bag in self.val_bags:
-            if str(bag) not in known:
-                listed = ", ".join(sorted(known, key=int)) or "none"
-                raise InputError(
-                    f"dataset.val_bags: the training part of {self.root} has no bag {bag}; its "
-                    f"bags are {listed}."
-                )
-
-    def _why_empty(self, split: str) -> str:
+        self.check_split(split)
         part = self.part_of(split)
         advice = f"unpack the folder '{part}' of the archive there"
         if self.val_bags and part == "train":
             advice = "every image is of a bag in dataset.val_bags, remove one of them"
-        return (
-            f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-            f"{self.root}; {advice}."
+            known = {bag for name in self._part("train") if (bag := bag_of(name)) is not None}
+            for bag in self.val_bags:
+                if bag not in known:
+                    raise InputError(
+                        f"dataset.val_bags: the training part of {self.root} has no bag {bag}; "
+                        f"its bags are {', '.join(map(str, sorted(known))) or 'none'}."
+                    )
+        names = self._chosen(split)
+        if not names:
+            raise InputError(
+                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
+                f"{self.root}; {advice}."
+            )
+        return names
+
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`; InputError if no part or both have it."""
+        if self.has_lists:
+            return self.patterns.frame(self.root, name, {"name": name})
+        parts = [part for part in PARTS if name in self._names_of[part]]
+        if len(parts) != 1:
+            reason = "both train and test have" if parts else "neither train nor test has"
+            raise InputError(
+                f"{self.name} ({self.root}): {reason} an image called '{name}'; use the original "
+                "archive, in which every name is in one part."
+            )
+        return self.patterns.frame(self.root, name, {"name": name, "part": parts[0]})
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """RGB, thermal and label of `name`; of both parts if both have it."""
+        if self.has_lists:
+            return super().files(name)
+        return tuple(
+            self.root / part / kind / f"{name}.png"
+            for part in PARTS
+            for kind in FOLDERS
+            if name in self._names_of[part]
         )
 
+    def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
+        """None: it is dark underground at any time."""
 
-def _files_in(folder: Path, name: str) -> tuple[Path, ...]:
-    return tuple(folder / kind / f"{name}.png" for kind in FOLDERS)
+    @property
+    def title(self) -> str:
+        """One of the two layouts."""
+        return f"PST900 in {'lists' if self.has_lists else 'folders'}"
 
+    def repeats(self, split: str) -> bool:
+        """The validation split is the test part, unless it has a list or bags of its own."""
+        return split == "val" and self.part_of(split) == "test"
 
-def _has_parts(root: Path) -> bool:
-    return any((root / part / FOLDERS[0]).is_dir() for part in PARTS)
+    def unused(self, lists: SplitNames) -> set[Path]:
+        """Files of the layout that belong to no image of a split."""
+        found = super().unused(lists)
+        return {path for path in found if self.has_lists or path.parts[-3] in PARTS}
 
+    def own_notes(self, lists: SplitNames) -> list[str]:
+        """What "val" is, and recordings in the wrong part."""
+        notes = []
+        if self.repeats("val"):
+            notes.append(
+                "split val is the test part, as in the CRM release: a checkpoint chosen on it is "
+                "chosen on what is reported; dataset.val_bags takes recordings out of training "
+                "instead."
+            )
+        if self.name != "pst900":
+            return notes
+        bags = {split: Counter(map(bag_of, lists.get(split, ()))) for split in PARTS}
+        tested = sum(bags["train"][bag] for bag in TEST_BAGS)
+        if tested:
+            part = "is" if tested == bags["train"].total() else "holds"
+            notes.append(
+                f"split train {part} {tested} images of the bags 21 to 25, which the archive has "
+                "for testing: the folders train and test seem to be exchanged, as in the drawing "
+                "on the data set's page; exchange them back."
+            )
+        if bags["test"] and bags["test"] != Counter(TEST_BAGS):
+            found, listed = (
+                ", ".join(
+                    f"{count} of {'no bag' if bag is None else f'bag {bag}'}"
+                    for bag, count in sorted(each.items(), key=lambda item: item[0] or -1)
+                )
+                for each in (bags["test"], TEST_BAGS)
+            )
+            notes.append(f"split test has {found}; the archive has {listed}.")
+        return notes
 
-def _is_flat(root: Path) -> bool:
-    return all((root / kind).is_dir() for kind in FOLDERS)
+    @cached_property
+    def _names_of(self) -> dict[str, dict[str, None]]:
+        """Part -> its names, sorted; folders are listed once, so later changes have no effect."""
+        return {part: dict.fromkeys(names_in(self.root / part / FOLDERS[0])) for part in PARTS}
+
+    def _part(self, part: str) -> tuple[str, ...]:
+        if not self.has_lists:
+            return tuple(self._names_of[part])
+        return tuple(line.removesuffix(".png") for line in self._lists.names(part))
+
+    def _chosen(self, split: str) -> tuple[str, ...]:
+        names = self._part(self.part_of(split))
+        if not self.val_bags or split == "test":
+            return names
+        return tuple(name for name in names if (bag_of(name) in self.val_bags) == (split == "val"))
 
 
 def _has_lists(root: Path) -> bool:
     """Whether `root` has the layout of lists; InputError if it has neither layout."""
-    if _has_parts(root):
+
+    def has_parts(folder: Path) -> bool:
+        return any((folder / part / FOLDERS[0]).is_dir() for part in PARTS)
+
+    is_flat = all((root / kind).is_dir() for kind in FOLDERS)
+    if has_parts(root):
         return False
-    if _is_flat(root) and any((root / f"{part}.txt").is_file() for part in PARTS):
+    if is_flat and any((root / f"{part}.txt").is_file() for part in PARTS):
         return True
-    near = root_nearby(root, _has_parts)
+    near = root_nearby(root, has_parts)
     advice = "give the folder into which the archive was unpacked"
     if near is not None:
         advice = f"give {near}, which does"
-    elif _is_flat(root):
+    elif is_flat:
         advice = (
             "it holds rgb, thermal and labels themselves, but neither train.txt nor test.txt says "
             "which image belongs to which part; write these lists (one name per line)"

@@ -24,7 +24,7 @@ from rgbt.data.kp import KP
 from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
-from rgbt.data.report.dataset import check_dataset
+from rgbt.data.report import check_dataset
 from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.conftest import write_data
@@ -182,28 +182,6 @@ def test_check_reports_each_problem_in_one_line(kind: str, tmp_path: Path, outsi
     assert check_dataset(make(root)).problems == sound
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_file_without_permission_is_refused(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Permission is taken away here and not on the disk, where it would not bind root."""
-    make, root = KINDS[kind].make, KINDS[kind].write(tmp_path / "data")
-    sound = check_dataset(make(root)).problems
-    name = make(root).names("test")[0]
-    allowed = Path.read_bytes
-    for denied in make(root).files(name):
-
-        def read_bytes(path: Path, denied: Path = denied) -> bytes:
-            if path == denied:
-                raise PermissionError(13, "Permission denied", str(path))
-            return allowed(path)
-
-        monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        told = [line for line in check_dataset(make(root)).problems if line not in sound]
-        assert len(told) == 1
-        assert told[0].startswith(f"{denied} may not be read, permission is denied; allow it")
-
-
 def loaded(dataset: LabelledDataset, split: str, on_error: Any) -> tuple[list[str], dict[str, str]]:
     """Names that one pass over `split` hands out, and what it notes of others.
 
@@ -241,37 +219,3 @@ def test_the_loader_stops_or_goes_on(kind: str, split: str, tmp_path: Path, outs
                 assert len(found) == len(names) - (split != "train")
                 assert skipped == {name: str(told.value)}
     assert sorted(loaded(dataset, split, "raise")[0]) == sorted(names)
-
-
-def mfnet_lists(root: Path) -> LabelledDataset:
-    return MFNet(str(write_data(root, {**NAMES, "val": ["00001D"]}, MF_HW)))
-
-
-def pst900_lists(root: Path) -> LabelledDataset:
-    train, test = pst900_files.TRAIN, pst900_files.TEST
-    return PST900(
-        str(pst900_files.write_lists(root, {"train": train, "val": train[:1], "test": test}))
-    )
-
-
-def kp_lists(root: Path) -> LabelledDataset:
-    lists = {**kp_files.LISTS, "val": (*kp_files.VAL, kp_files.TRAIN[0])}
-    return KP(str(kp_files.write_lists(kp_files.write_kp(root), lists)))
-
-
-def folder_lists(root: Path) -> LabelledDataset:
-    folder_files.write_folder(root)
-    (root / "train.txt").write_text("train_1\ntrain_2\n")
-    (root / "val.txt").write_text("val_1\ntrain/1\n")
-    plain = {key: text.replace("split", "part") for key, text in folder_files.PATTERNS.items()}
-    return folder_files.folder(root, **plain, lists={"train": "train.txt", "val": "val.txt"})
-
-
-@pytest.mark.parametrize("write", [mfnet_lists, pst900_lists, kp_lists, folder_lists])
-def test_a_name_in_two_splits(write: Callable[[Path], LabelledDataset], tmp_path: Path) -> None:
-    dataset = write(tmp_path / "data")
-    name = dataset.names("train")[0]
-    told = [line for line in check_dataset(dataset).problems if "share" in line]
-    assert told[0] == f"splits train and val share 1 names, the first is '{name}'."
-    # Parts by time of day that KP has without lists of their own repeat it.
-    assert all(re.fullmatch(rf"splits \w+ and \w+ share 1 .*'{name}'\.", line) for line in told)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
 from rgbt.data.folder.dataset import Folder
-from rgbt.data.folder.values import grey, label_codes, painted
-from rgbt.data.report.dataset import check_dataset, checks_of
+from rgbt.data.images import grey
+from rgbt.data.labels import label_codes, painted
+from rgbt.data.report import check_dataset
 from tests.conftest import write_png
 from tests.data.folder_files import (
     CLASSES,
@@ -62,14 +62,12 @@ def test_reads_what_the_patterns_name(sound: Path) -> None:
     assert np.abs(sample.thermal - exact).max() <= 0.5 + 1e-9
     assert [sample.rgb.dtype, sample.thermal.dtype, sample.label.dtype] == [np.uint8] * 3
     assert sample.name == "test_2"
-    np.testing.assert_array_equal(dataset.label("test_2"), label)
-    np.testing.assert_array_equal(dataset.values("test_2"), counts)
+    np.testing.assert_array_equal(dataset.thermal_values("test_2"), counts)
     assert dataset.files("test_2") == (
         sound / "test/rgb/2.png",
         sound / "test/ir/2_ir.tif",
         sound / "test/mask/2.png",
     )
-    assert pickle.loads(pickle.dumps(dataset)).read("test_2").name == "test_2"
 
 
 def test_grey_levels_by_hand() -> None:
@@ -101,7 +99,7 @@ def test_thermal_of_eight_bits(root: Path) -> None:
     np.testing.assert_array_equal(stretched, level * 5)
     said = refused(lambda: dataset.read("val_1"))
     assert said.startswith(f"{root / 'val/ir/1_ir.tif'}: expected 8 bits per pixel, got uint16")
-    assert "give dataset.thermal_range=[low, high]" in said
+    assert "need dataset.thermal_range=[low, high]" in said
     said = refused(lambda: folder(root).read("train_1"))
     assert "dataset.thermal_range=[20000, 24000], got 8 bits; use the original file" in said
 
@@ -120,15 +118,9 @@ def test_thermal_of_real_numbers(root: Path) -> None:
 
 
 def test_thermal_as_arrays(root: Path) -> None:
-    for split, name in (
-        ("train", "1"),
-        ("train", "2"),
-        ("train", "3"),
-        ("val", "1"),
-        ("test", "1"),
-    ):
-        target = root / split / "ir" / f"{name}.npy"
-        np.save(target, np.full(HW, 20.0 if split == "train" else 30.0))
+    for path in list(root.glob("*/ir/*.tif")):
+        level = 20.0 if path.parts[-3] == "train" else 30.0
+        np.save(path.with_name(path.stem.removesuffix("_ir")), np.full(HW, level))
     dataset = folder(root, thermal="{split}/ir/{name}.npy", thermal_range=(20, 30))
     assert (dataset.read("train_1").thermal == 0).all()
     assert (dataset.read("val_1").thermal == 255).all()
@@ -153,8 +145,12 @@ def test_packed_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sample.rgb, image[..., :3])
     np.testing.assert_array_equal(sample.thermal, image[..., 3])
     assert dataset.files("train_7") == (tmp_path / "train/7.png", tmp_path / "train/7_mask.png")
-    assert dataset.decoding()["packed"]
-    assert checks_of(dataset).title == "RGB {split}/{name}.png, thermal channel 4"
+    assert dataset.title == "RGB {split}/{name}.png, thermal channel 4"
+    stretched = folder(tmp_path, **{**keys, "thermal_range": (0, 51)})
+    np.testing.assert_array_equal(
+        stretched.read("train_7").thermal, np.minimum(image[..., 3].astype(int) * 5, 255)
+    )
+    assert len(check_dataset(stretched).problems) == 3  # most values are clipped
     write_png(tmp_path / "train" / "7.png", image[..., :3])
     assert "got 3; use the original file, or give dataset.thermal its own pattern" in refused(
         lambda: dataset.read("train_7")
@@ -174,17 +170,6 @@ def test_all_in_one_folder(tmp_path: Path) -> None:
     )
     assert list(dataset.frames) == ["test_1", "train_9", "train_10", "val_1"]
     assert check_dataset(dataset).problems == ()
-
-
-def test_sizes_that_differ(root: Path) -> None:
-    write_png(root / "train" / "mask" / "1.png", np.zeros((3, 4), np.uint8))
-    write_tiff(root / "train" / "ir" / "2_ir.tif", np.zeros((3, 4), np.uint16))
-    dataset = folder(root)
-    assert refused(lambda: dataset.read("train_1")) == (
-        "'train_1': RGB is 6x8 pixels but its label is 3x4; both must show the same pixels, align "
-        f"them first: {root / 'train/mask/1.png'}."
-    )
-    assert "RGB is 6x8 pixels but thermal is 3x4" in refused(lambda: dataset.read("train_2"))
 
 
 def test_unlabelled(root: Path) -> None:
@@ -219,9 +204,8 @@ def test_label_values(root: Path) -> None:
     assert not found[1:].any()
     label[1, :3] = (9, 9, 30)
     write_png(path, label)
-    assert refused(lambda: dataset.label("train_1")) == (
-        f"{path}: label value 9 (2 pixels, most frequent of 2 unknown ones) is neither in "
-        "dataset.ids nor in dataset.ignored (known: 0, 7, 24, 26, 255, 400); add it there."
+    assert "label value 9 (2 pixels, most frequent of 2 unknown ones) is neither" in refused(
+        lambda: dataset.label("train_1")
     )
     # 255 may be a class, where it is said.
     whole = folder(root, ids={**ids, 255: "person", 9: "car", 30: "car"}, ignored=(7,))
@@ -250,11 +234,6 @@ def test_label_arrays(root: Path) -> None:
     found = dataset.label("train_1")
     assert found is not None
     assert (found == 2).all()
-    for wrong in (np.zeros(HW), np.zeros((*HW, 3), int)):
-        np.save(root / "train" / "mask" / "2.npy", wrong)
-        assert "expected whole numbers of shape (rows, columns), got" in refused(
-            lambda: dataset.label("train_2")
-        )
 
 
 def test_label_colours(root: Path) -> None:
@@ -270,10 +249,8 @@ def test_label_colours(root: Path) -> None:
     assert dataset.palette == ((0, 0, 0), (220, 20, 60), (0, 0, 142))
     image[2, :3] = [(60, 20, 220), (60, 20, 220), (1, 2, 3)]
     write_png(path, image)
-    assert refused(lambda: dataset.label("train_1")) == (
-        f"{path}: colour [60, 20, 220] (2 pixels, most frequent of 2 unknown ones) is neither "
-        "in dataset.colours nor in dataset.ignored; add it there, or save labels that were never "
-        "resized."
+    assert "colour [60, 20, 220] (2 pixels, most frequent of 2 unknown ones)" in refused(
+        lambda: dataset.label("train_1")
     )
 
 
@@ -373,10 +350,9 @@ def test_a_sound_data_set(sound: Path) -> None:
         ("test", 2),
     ]
     assert (report.splits[0].num_day, report.splits[0].num_night) == (2, 1)
-    low, high = RANGE
-    assert report.notes[0] == (
-        "split train: of the thermal pixels 0.00% are 0, 0.00% lie below and 0.00% above "
-        f"dataset.thermal_range=[{low}, {high}]."
+    assert report.notes[0].startswith(
+        "split train: 0.00% of the thermal pixels are 0, 0.00% lie below and 0.00% above "
+        "dataset.thermal_range=[20000, 24000]; the others run from "
     )
 
 
@@ -391,10 +367,9 @@ def test_each_problem_is_one_line(root: Path) -> None:
         "(dataset.rgb='{part}/rgb/{name}.png'); restore it, or remove the name from the list.",
         "split train lists 'train_1' 2 times.",
         "splits train and val share 1 names, the first is 'val_1'.",
-        "2 thermal images or labels have no RGB image (dataset.rgb) and are in no split, the first "
-        f"is {root}/test/ir/2_ir.tif.",
+        f"2 files belong to no image of a split, the first is {root}/test/ir/2_ir.tif.",
     ]
-    assert report.notes[-1] == "3 frames are in no split, the first is 'extra_1'."
+    assert report.notes[0] == "3 frames are in no split, the first is 'extra_1'."
     # Two splits that are said to be one are no mistake.
     same = folder(root, folders={"train": "train", "val": "val", "test": "val"})
     assert not any("share" in line for line in check_dataset(same).problems)
@@ -416,7 +391,7 @@ def test_a_range_that_misses_the_values(root: Path) -> None:
     write_tiff(root / "val" / "ir" / "1_ir.tif", half)
     report = check_dataset(folder(root))
     assert report.problems == ()
-    assert any("split val: of the thermal pixels 16.67% are 0, 0.00% lie below and 41.67%" in line
+    assert any("split val: 16.67% of the thermal pixels are 0, 0.00% lie below and 41.67%" in line
                for line in report.notes)  # fmt: skip
 
 

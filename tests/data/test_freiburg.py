@@ -1,23 +1,18 @@
+"""Freiburg Thermal: frames, partners, labels, and what the check finds in a copy."""
+
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from rgbt.checks import InputError
-from rgbt.data import freiburg
-from rgbt.data.freiburg import CLASSES, CROP, PALETTE, THERMAL_RANGE, Freiburg
-from rgbt.data.mfnet import MFNet
-from rgbt.data.next_frames import NextFrames
-from rgbt.dataset import LabelledDataset
+from rgbt.data.freiburg import Freiburg
+from rgbt.data.report import check_dataset
 from tests.conftest import write_png
 from tests.data import freiburg_files as files
 from tests.data.freiburg_files import reader, write_freiburg
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -29,9 +24,6 @@ def path_of(dataset: Freiburg, name: str, kind: str) -> Path:
     path = getattr(dataset.frame(name), kind)
     assert isinstance(path, Path)
     return path
-
-
-# ---- splits ---------------------------------------------------------------------------------
 
 
 def test_splits_by_folder(root: Path) -> None:
@@ -51,13 +43,6 @@ def test_splits_by_folder(root: Path) -> None:
     assert all(dataset.has(split) for split in dataset.splits)
 
 
-def test_order_does_not_follow_the_file_system(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = {split: reader(root).names(split) for split in freiburg.SPLITS}
-    listed = Path.iterdir
-    monkeypatch.setattr(Path, "iterdir", lambda path: reversed(sorted(listed(path))))
-    assert {split: reader(root).names(split) for split in freiburg.SPLITS} == expected
-
-
 def test_night_is_what_the_path_says(root: Path) -> None:
     dataset = reader(root)
     assert dataset.nights(dataset.names("train_day")) == (False,) * 3
@@ -65,11 +50,6 @@ def test_night_is_what_the_path_says(root: Path) -> None:
     assert dataset.nights(dataset.names("test")) == (False, False, True, True)
     with pytest.raises(InputError, match="has no frame called 'other'"):
         dataset.nights(("other",))
-
-
-def test_night_in_root_is_ignored(tmp_path: Path) -> None:
-    dataset = reader(write_freiburg(tmp_path / "night_drives"))
-    assert dataset.nights(dataset.names("test")) == (False, False, True, True)
 
 
 @pytest.mark.parametrize("folder", ["seq_05_dusk", "seq_05_day_and_night"])
@@ -117,9 +97,6 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
         dataset.names("tran")
 
 
-# ---- partners -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("time", ["day", "night"])
 def test_stamp_of_thermal_may_lack_last_zero(tmp_path: Path, time: str) -> None:
     files.write_test(tmp_path, time, "1570_120", thermal="1570_12")
@@ -128,7 +105,8 @@ def test_stamp_of_thermal_may_lack_last_zero(tmp_path: Path, time: str) -> None:
     for name, partner in zip(dataset.names("test"), ("1570_12", "1571_130"), strict=True):
         assert path_of(dataset, name, "thermal").name == f"{partner}_ir.png"
         stamp = name.removeprefix(f"test_{time}_")
-        assert np.array_equal(dataset.counts(name), files.contents(stamp)[1][1:12, 5:23])
+        counts = dataset.thermal_values(name)
+        assert np.array_equal(counts, files.contents(stamp)[1][1:12, 5:23])
         assert dataset.read(name).label is not None
 
 
@@ -163,32 +141,6 @@ def test_what_is_no_frame_is_passed_over(root: Path) -> None:
     assert reader(root).names("train") == expected
 
 
-@pytest.mark.parametrize("split", ["train_day", "train_night", "test_night"])
-def test_a_missing_thermal_partner_is_named(root: Path, split: str) -> None:
-    dataset = reader(root)
-    name = dataset.names(split)[0]
-    path = path_of(dataset, name, "thermal")
-    path.unlink()
-    with pytest.raises(InputError) as caught:
-        reader(root).read(name)
-    assert str(caught.value) == (
-        f"'{name}': its thermal image {path} is missing; restore it, or use data.on_error=skip to "
-        "leave the frame out."
-    )
-
-
-@pytest.mark.parametrize("split", ["train_day", "val", "test_night"])
-def test_a_missing_label_is_named(root: Path, split: str) -> None:
-    dataset = reader(root)
-    name = dataset.names(split)[0]
-    path_of(dataset, name, "label").unlink()
-    with pytest.raises(InputError, match=rf"'{name}': its label .* is missing; restore it"):
-        reader(root).read(name)
-
-
-# ---- images ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("split", ["train_day", "val", "test_night"])
 def test_reads_what_lies_there(root: Path, split: str) -> None:
     dataset = reader(root, ignored_test=())
@@ -204,13 +156,7 @@ def test_reads_what_lies_there(root: Path, split: str) -> None:
     assert sample.label.dtype == np.uint8
     assert np.array_equal(sample.label, label[1:12, 5:23])
     assert np.array_equal(dataset.label(name), sample.label)
-
-
-def test_nights_of_training_have_no_label(root: Path) -> None:
-    dataset = reader(root)
-    name = dataset.names("train_night")[0]
-    assert dataset.read(name).label is None
-    assert dataset.label(name) is None
+    assert dataset.read(dataset.names("train_night")[0]).label is None
 
 
 @pytest.mark.parametrize(
@@ -236,38 +182,35 @@ def test_counts_are_clipped_and_scaled(root: Path, count: int, thesis: int, heat
     write_png(path_of(reader(root), name, "thermal"), np.full(files.HW, count, np.uint16))
     assert set(reader(root).read(name).thermal.flat) == {thesis}
     assert set(reader(root, thermal_range=(21800, 25000)).read(name).thermal.flat) == {heatnet}
-    assert set(reader(root).counts(name).flat) == {count}
 
 
-def test_eight_bits_where_sixteen_are_meant(root: Path) -> None:
+@pytest.mark.parametrize(
+    "image", [np.full(files.HW, 85, np.uint8), np.zeros((*files.HW, 3), np.uint16)]
+)
+def test_thermal_images_without_counts_are_refused(root: Path, image: np.ndarray) -> None:
     dataset = reader(root)
     name = dataset.names("train_night")[1]
-    path = path_of(dataset, name, "thermal")
-    write_png(path, np.full(files.HW, 85, np.uint8))
-    with pytest.raises(InputError) as caught:
-        dataset.read(name)
-    assert str(caught.value) == (
-        f"{path}: expected a thermal image of 16 bits (counts of the camera), got uint8; use the "
-        "original file, a converted one no longer holds the counts that dataset.thermal_range cuts."
-    )
-    write_png(path, np.zeros((*files.HW, 3), np.uint16))
-    with pytest.raises(InputError, match=r"expected a thermal image of one channel, got 3;"):
-        dataset.read(name)
-    write_png(path, np.zeros((5, 26), np.uint16))
-    with pytest.raises(InputError, match=f"'{name}': RGB is 13x26 pixels but thermal is 5x26"):
-        dataset.read(name)
-    path.write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"fl_ir_aligned.* cannot be decoded"):
+    write_png(path_of(dataset, name, "thermal"), image)
+    with pytest.raises(InputError, match="expected a thermal image of 16 bits .* one channel"):
         dataset.read(name)
 
 
-def test_rgb_of_other_form_is_refused(root: Path) -> None:
+@pytest.mark.parametrize(
+    ("label", "said"),
+    [
+        (np.full(files.HW, 14), "label value 14 .*is out of range; expected 0 to 13, or 255"),
+        (np.full(files.HW, -1), "label value -1 .*is out of range"),
+        (np.full(files.HW, 256 + 3), "label value 259 .*is out of range"),
+        (np.zeros(files.HW), r"whole numbers of shape \(rows, columns\), got \(13, 26\) float64"),
+        (np.zeros((*files.HW, 3), int), r"got \(13, 26, 3\) int64"),
+        (np.array({}), "cannot be read as an array"),
+    ],
+)
+def test_label_arrays_without_classes_are_refused(root: Path, label: np.ndarray, said: str) -> None:
     dataset = reader(root)
-    name = dataset.names("test_day")[0]
-    path = path_of(dataset, name, "rgb")
-    write_png(path, np.zeros(files.HW, np.uint8))
-    with pytest.raises(InputError, match=r"_rgb.png: expected 3 channels .*, got 1; use the orig"):
-        dataset.read(name)
+    np.save(path_of(dataset, "test_day_1578_0080", "label"), label)
+    with pytest.raises(InputError, match=said):
+        dataset.read("test_day_1578_0080")
 
 
 def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
@@ -281,9 +224,6 @@ def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
             reader(root, crop=crop).read(name)
     with pytest.raises(InputError, match=r"frame is 13x26 .* reaches to row 645 and column 1640;"):
         Freiburg(str(root)).read(name)
-
-
-# ---- labels ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("hw", [(39, 78), (15, 30), (11, 22)])
@@ -329,40 +269,6 @@ def test_ignored_test_applies_to_test_only(
             assert np.array_equal(dataset.label(name), label)
 
 
-def test_labels_that_are_none(root: Path) -> None:
-    dataset = reader(root)
-    day, test = dataset.names("train_day")[0], dataset.names("test_day")[0]
-    write_png(path_of(dataset, day, "label"), np.full(files.HW, 14, np.uint8))
-    with pytest.raises(InputError, match=r"fl_rgb_labels_.*png: label value 14 is out of range"):
-        dataset.read(day)
-    path = path_of(dataset, test, "label")
-    for wrong, said in (
-        (np.full(files.HW, 14), "label value 14 is out of range; expected 0 to 13, or 255"),
-        (np.full(files.HW, -1), "label value -1 is out of range"),
-        (np.full(files.HW, 256 + 3), "label value 259 is out of range"),
-        (np.zeros(files.HW), r"whole numbers of shape \(rows, columns\), got \(13, 26\) float64"),
-        (np.zeros((*files.HW, 3), int), r"got \(13, 26, 3\) int64"),
-        (np.array({}), "cannot be read as an array"),
-    ):
-        np.save(path, wrong)
-        with pytest.raises(InputError, match=said):
-            dataset.read(test)
-    label = np.full(files.HW, 255)
-    np.save(path, label)
-    assert np.array_equal(dataset.label(test), label[1:12, 5:23])
-    for damaged in (b"", b"no array", path.read_bytes()[:100]):
-        path.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"\.npy cannot be read as an array .*on_error=skip"):
-            dataset.read(test)
-    with path.open("wb") as file:
-        np.savez(file, label=label)
-    with pytest.raises(InputError, match=r"\.npy: expected class indices, .* got several arrays"):
-        dataset.read(test)
-
-
-# ---- fingerprint, settings ------------------------------------------------------------------
-
-
 def test_fingerprint(root: Path, tmp_path: Path) -> None:
     expected = reader(root).fingerprint()
     assert len(expected) == 64
@@ -379,21 +285,6 @@ def test_fingerprint(root: Path, tmp_path: Path) -> None:
     assert reader(other).fingerprint() != expected
     path_of(reader(root), "seq_00_night_00_1575_0050", "thermal").unlink()
     assert reader(root).fingerprint() != expected
-
-
-def test_fingerprint_of_a_part(tmp_path: Path) -> None:
-    files.write_test(tmp_path, "day", "1_0")
-    assert len(reader(tmp_path).fingerprint()) == 64
-
-
-def test_workers_get_the_same_frames(root: Path) -> None:
-    dataset = reader(root)
-    dataset.names("train")
-    copy = pickle.loads(pickle.dumps(dataset))
-    assert copy.names("test") == dataset.names("test")
-    assert np.array_equal(
-        copy.read("test_day_1578_0080").rgb, dataset.read("test_day_1578_0080").rgb
-    )
 
 
 def test_wrong_roots(tmp_path: Path) -> None:
@@ -421,31 +312,92 @@ def test_wrong_settings_are_named(root: Path, wrong: dict[str, object], said: st
         reader(root, **wrong)
 
 
-def test_configuration_repeats_the_defaults() -> None:
-    node = yaml.safe_load((ROOT / "conf/dataset/freiburg.yaml").read_text())
-    assert tuple(node["classes"]) == CLASSES
-    assert tuple(map(tuple, node["palette"])) == PALETTE
-    assert (tuple(node["crop"]), tuple(node["thermal_range"])) == (CROP, THERMAL_RANGE)
-    assert (node["unscored"], node["ignored_test"]) == (["background", "ignore"], ["ignore"])
-    assert node["val_sequences"] == ["seq_04_day"]
-    assert node["num_classes"] == len(CLASSES) == len(set(PALETTE)) == 14
+def test_check_of_a_sound_copy(root: Path) -> None:
+    report = check_dataset(reader(root))
+    assert report.problems == ()
+    numbers = {
+        split.split: (split.num_read, split.num_unlabelled, split.num_day, split.num_night)
+        for split in report.splits
+    }
+    assert numbers == {
+        **{"train": (3, 0, 3, 0), "train_day": (3, 0, 3, 0), "train_night": (3, 3, 0, 3)},
+        **{"val": (2, 0, 2, 0), "test": (4, 0, 2, 2)},
+        **{"test_day": (2, 0, 2, 0), "test_night": (2, 0, 0, 2)},
+    }
+    assert all(set(split.sizes) == {(11, 18)} for split in report.splits)
 
 
-# ---- what asks for any data set -------------------------------------------------------------
+def test_pixels_are_counted_by_class(root: Path) -> None:
+    report = check_dataset(reader(root))
+    for split in report.splits:
+        expected = np.zeros(15, int)
+        for name in reader(root).names(split.split):
+            label = files.contents("_".join(name.split("_")[-2:]))[2][1:12, 5:23].ravel()
+            if split.split != "train_night":
+                expected[:14] += np.bincount(label, minlength=14)
+        if "train" not in split.split:
+            expected[[13, 14]] = expected[[14, 13]]
+        assert split.pixels.tolist() == expected.tolist()
 
 
-def test_both_readers_are_data_sets(root: Path, write_mfnet) -> None:
-    datasets: list[LabelledDataset] = [reader(root), MFNet(str(write_mfnet({"test": ["00001D"]})))]
-    assert [len(dataset.unscored) for dataset in datasets] == [2, 0]
-    for dataset in datasets:
-        assert dataset.has("test")
-        assert dataset.label(dataset.names("test")[0]) is not None
-
-
-def test_second_frames_are_of_the_other_layout(root: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        NextFrames(reader(root))
-    assert str(caught.value) == (
-        f"freiburg ({root}) has no second frames: they are read in MFNet's layout only; "
-        "choose dataset=synth with dataset.ego_forward_m=0.5, and frames=virtual needs none."
+def test_the_share_of_clipped_counts(root: Path) -> None:
+    dataset = reader(root)
+    counts = np.full(files.HW, 22000, np.uint16)
+    # Inside the crop of 11 x 18 = 198 pixels, of three frames; and one pixel outside of it.
+    counts[1, 5:23] = 0
+    counts[2, 5:10] = 21799
+    counts[3, 5:7] = 23701
+    counts[4, 5:9] = (21800, 23700, 23700, 21800)
+    counts[0, 0] = 65535
+    for name in dataset.names("train_night"):
+        write_png(dataset.frame(name).thermal, counts)
+    report = check_dataset(dataset)
+    (split,) = [each for each in report.splits if each.split == "train_night"]
+    assert split.thermal == (3 * 198, 3 * 18, 3 * 5, 3 * 2, 21799, 23701)
+    assert (
+        "split train_night: 9.09% of the thermal pixels are 0, 2.53% lie below and 1.01% above "
+        "dataset.thermal_range=[21800, 23700]; the others run from 21799 to 23701." in report.notes
     )
+    assert not any("split train:" in note or "split test:" in note for note in report.notes)
+
+
+def test_a_thermal_image_of_margins_alone(root: Path) -> None:
+    dataset = reader(root)
+    for name in dataset.names("val"):
+        write_png(dataset.frame(name).thermal, np.zeros(files.HW, np.uint16))
+    (split,) = [each for each in check_dataset(dataset).splits if each.split == "val"]
+    assert split.thermal == (2 * 198, 2 * 198, 0, 0, 0, 0)
+
+
+def test_check_finds_each_problem_once(root: Path) -> None:
+    dataset = reader(root)
+    val = dataset.frame(dataset.names("val")[0])
+    val.rgb.unlink()
+    # A frame of training under the same stamp as one for testing; its thermal lacks the zero.
+    files.write_training(root, "seq_00_day/01", "1579_009")
+    assert list(check_dataset(reader(root)).problems) == [
+        f"2 files belong to no image of a split, the first is {val.thermal}.",
+        "splits test_day and train_day share 1 frames by their time stamps, the first is "
+        "'test_day_1579_0090', which is 'seq_00_day_01_1579_009'.",
+    ]
+
+
+def test_equal_stamps_in_two_parts_are_reported(root: Path) -> None:
+    files.write_training(root, "seq_00_night/01", "1581_0110")
+    files.write_training(root, "seq_04_day/01", "1580_0100")
+    files.write_training(root, "seq_00_night/01", "1580_01000")  # ten times as many nanoseconds
+    found = check_dataset(reader(root)).problems
+    assert [problem.partition(" by ")[0] for problem in found] == [
+        "splits test_night and train_night share 1 frames",
+        "splits test_night and val share 1 frames",
+    ]
+
+
+def test_check_of_a_single_part(tmp_path: Path) -> None:
+    files.write_training(tmp_path, "seq_00_day/00", "1_0")
+    report = check_dataset(reader(tmp_path, val_sequences=()))
+    assert [problem.partition(" of ")[0] for problem in report.problems] == [
+        *("split 'train_night'", "split 'val'", "split 'test_day'", "split 'test_night'"),
+    ]
+    assert [note.partition(" of ")[0] for note in report.notes[:1]] == ["split 'test'"]
+    assert len(report.splits) == 2

@@ -1,3 +1,5 @@
+"""MFNet: its two layouts, its lists, and what the check finds in a copy."""
+
 from __future__ import annotations
 
 import os
@@ -5,30 +7,40 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.data.mfnet import CLASSES, PALETTE, MFNet
-from rgbt.data.mfnet_layout import SPLITS, base_name
+from rgbt.data.check import main
+from rgbt.data.mfnet import MFNet
+from rgbt.data.report import check_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
-REAL = SHARED / "realdata" / "mfnet200"
-OFFICIAL = SHARED / "realdata" / "mfnet_names"
+SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"
+SPLITS = {"train": ["00001D", "00002N"], "val": ["00003N"], "test": ["00004D"]}
+
+
+def problems(root: Path, **keys) -> list[str]:
+    return list(check_dataset(MFNet(str(root), **keys)).problems)
+
+
+def run(root: Path, **splits: str) -> int | None:
+    node = OmegaConf.load(ROOT / "conf" / "dataset" / "mfnet.yaml")
+    node.root = str(root)
+    OmegaConf.update(node, "splits", splits)
+    return main.__wrapped__(OmegaConf.create({"dataset": node}))
 
 
 @pytest.mark.parametrize("layout", ["packed", "folders"])
 def test_reads_both_layouts_in_rgb_order(write_mfnet, expected_pair, layout: str) -> None:
-    root = write_mfnet({"train": ["00001D", "00002N"]}, layout=layout)
-    dataset = MFNet(str(root))
+    dataset = MFNet(str(write_mfnet({"train": ["00001D", "00001D_flip"]}, layout=layout)))
     assert dataset.layout == layout
-    sample = dataset.read("00002N")
-    for found, expected in zip(
-        (sample.rgb, sample.thermal, sample.label), expected_pair("00002N", (24, 32)), strict=True
-    ):
-        assert found.dtype == np.uint8
-        np.testing.assert_array_equal(found, expected)
-    assert sample.name == "00002N"
+    for name in dataset.names("train"):  # mirrored copies are read as they are
+        sample = dataset.read(name)
+        arrays = (sample.rgb, sample.thermal, sample.label)
+        for found, expected in zip(arrays, expected_pair(name, (24, 32)), strict=True):
+            assert found.dtype == np.uint8
+            np.testing.assert_array_equal(found, expected)
+        assert sample.name == name
 
 
 def test_known_pixel(tmp_path: Path, png) -> None:
@@ -40,203 +52,193 @@ def test_known_pixel(tmp_path: Path, png) -> None:
     sample = MFNet(str(tmp_path)).read("00001D")
     assert sample.rgb[1, 2].tolist() == [10, 20, 30]
     assert sample.thermal[1, 2] == 40
-    assert sample.label is not None
     assert sample.label.tolist() == [[8, 8, 8], [8, 8, 8]]
 
 
-def test_thermal_of_three_equal_channels(write_mfnet, expected_pair, png) -> None:
+def test_layout_is_found_or_as_configured(write_mfnet, expected_pair, png) -> None:
     root = write_mfnet({"train": ["00001D"]}, layout="folders")
-    thermal = expected_pair("00001D", (24, 32))[1]
+    with pytest.raises(InputError, match=r"does not hold the folders images\+labels"):
+        MFNet(str(root), layout="packed")
+    rgb, thermal, _ = expected_pair("00001D", (24, 32))
     png(root / "Thermal" / "00001D.png", np.dstack([thermal] * 3))
     np.testing.assert_array_equal(MFNet(str(root)).read("00001D").thermal, thermal)
     png(root / "Thermal" / "00001D.png", np.dstack([thermal, thermal, 255 - thermal]))
     with pytest.raises(InputError, match=r"Thermal.*three equal ones, got 3 channels that differ"):
         MFNet(str(root)).read("00001D")
-
-
-def test_layout_is_found_or_as_asked(write_mfnet) -> None:
-    root = write_mfnet({"train": ["00001D"]}, layout="folders")
+    png(root / "RGB" / "00001D.png", np.dstack([rgb, thermal]))
+    with pytest.raises(InputError, match=r"RGB/00001D.png: expected 3 channels .*, got 4"):
+        MFNet(str(root)).read("00001D")
     write_mfnet({"train": ["00001D"]}, layout="packed")
     assert MFNet(str(root)).layout == "packed"
     assert MFNet(str(root), layout="folders").layout == "folders"
 
 
-def test_names_keep_the_order_of_the_list(write_mfnet) -> None:
+def test_lists(write_mfnet) -> None:
     root = write_mfnet({"train": ["00003N", "00001D"]})
     (root / "train.txt").write_text("00003N\r\n\n 00001D \r\n")
-    assert MFNet(str(root)).names("train") == ("00003N", "00001D")
-
-
-def test_one_list_may_serve_two_splits(write_mfnet) -> None:
-    root = write_mfnet({"val": ["00001D"]})
-    dataset = MFNet(str(root), splits={"val": "val.txt", "test": "val.txt"})
-    assert dataset.names("test") == dataset.names("val")
+    dataset = MFNet(str(root), splits={"train": "train.txt", "val": "train.txt", "test": "no.txt"})
+    assert dataset.names("train") == dataset.names("val") == ("00003N", "00001D")
+    assert not dataset.has("test")
+    with pytest.raises(InputError, match=r"dataset.splits.test: there is no list .*no.txt"):
+        dataset.names("test")
 
 
 def test_day_and_night(write_mfnet) -> None:
     dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
-    names = ["00001D", "00001N", "00001D_flip", "00001N_flip"]
-    assert [dataset.is_night(name) for name in names] == [False, True, False, True]
-    assert base_name("00001N_flip") == "00001N"
+    names = ("00001D", "00001N", "00001D_flip", "00001N_flip")
+    assert dataset.nights(names) == (False, True, False, True)
+    assert dataset.nights(("frame7",)) is None
     with pytest.raises(InputError, match="'frame7' has no time of day"):
-        dataset.is_night("frame7")
+        dataset.nights((*names, "frame7"))
 
 
-def test_mirrored_copies_are_read_as_they_lie(write_mfnet, expected_pair) -> None:
-    root = write_mfnet({"train": ["00001D", "00001D_flip"]})
-    sample = MFNet(str(root)).read("00001D_flip")
-    np.testing.assert_array_equal(sample.rgb, expected_pair("00001D_flip", (24, 32))[0])
-    (root / "images" / "00001D_flip.png").unlink()
-    with pytest.raises(
-        InputError, match=r"00001D_flip.png is missing; .* dataset.splits to a list"
-    ):
-        MFNet(str(root)).read("00001D_flip")
+def test_missing_mirrored_copy_is_named(write_mfnet) -> None:
+    dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
+    with pytest.raises(InputError, match=r"00001D_flip.png is missing; .* mirrored copy"):
+        dataset.read("00001D_flip")
 
 
-def test_fingerprint(write_mfnet) -> None:
-    one = write_mfnet({"train": ["00001D", "00002N"]}, folder="one")
-    other = write_mfnet({"train": ["00001D", "00002N"]}, folder="other")
-    expected = MFNet(str(one)).fingerprint()
-    assert len(expected) == 64
-    assert MFNet(str(other)).fingerprint() == expected
-    (other / "labels" / "00001D.png").write_bytes(b"shorter")
-    assert MFNet(str(other)).fingerprint() != expected
-    third = write_mfnet({"train": ["00002N", "00001D"]}, folder="third")
-    assert MFNet(str(third)).fingerprint() != expected
-
-
-def test_names_on_disk(write_mfnet, png) -> None:
+def test_wrong_channels_and_bits_are_refused(write_mfnet, expected_pair, png) -> None:
     root = write_mfnet({"train": ["00001D"]})
-    png(root / "labels" / "00009N.png", np.zeros((2, 2), np.uint8))
-    (root / "images" / "Thumbs.db").write_bytes(b"")
-    assert MFNet(str(root)).names_on_disk() == {"00001D", "00009N"}
-
-
-def test_refuses_a_wrong_root(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"dataset.root: there is no folder '/nowhere'"):
-        MFNet("/nowhere")
-    with pytest.raises(InputError, match=r"does not hold the folders images\+labels or RGB"):
-        MFNet(str(tmp_path))
-    (tmp_path / "images").mkdir()
-    (tmp_path / "labels").mkdir()
-    with pytest.raises(InputError, match=r"does not hold the folders RGB\+Thermal\+Label"):
-        MFNet(str(tmp_path), layout="folders")
-
-
-def test_refuses_numbers_of_classes_that_disagree(write_mfnet) -> None:
-    root = str(write_mfnet({"train": ["00001D"]}))
-    with pytest.raises(InputError, match="num_classes is 5 but dataset.classes has 9"):
-        MFNet(root, num_classes=5)
-    with pytest.raises(InputError, match="num_classes is 2 but dataset.palette has 9"):
-        MFNet(root, num_classes=2, classes=("road", "car"))
-
-
-def test_refuses_wrong_lists(write_mfnet) -> None:
-    root = write_mfnet({"train": ["00001D"]})
-    dataset = MFNet(str(root))
-    with pytest.raises(InputError, match=r"dataset.splits.val: there is no list .*val.txt"):
-        dataset.names("val")
-    with pytest.raises(InputError, match="no split 'trian'; did you mean 'train'?"):
-        dataset.names("trian")
-    (root / "test.txt").write_text("\n \n")
-    with pytest.raises(InputError, match=r"dataset.splits.test: the list .* is empty"):
-        dataset.names("test")
-
-
-def test_refuses_other_channels_and_bits(write_mfnet, expected_pair, png) -> None:
-    root = write_mfnet({"train": ["00001D"]})
-    dataset = MFNet(str(root))
     rgb, thermal, label = expected_pair("00001D", (24, 32))
-    png(root / "images" / "00001D.png", rgb)
-    with pytest.raises(InputError, match=r"images/00001D.png: expected 4 channels .*, got 3"):
-        dataset.read("00001D")
-    png(root / "images" / "00001D.png", np.dstack([rgb, thermal]).astype(np.uint16))
-    with pytest.raises(InputError, match="expected 8 bits per channel, got uint16"):
-        dataset.read("00001D")
-    png(root / "images" / "00001D.png", np.dstack([rgb, thermal]))
-    png(root / "labels" / "00001D.png", label.astype(np.uint16))
-    with pytest.raises(InputError, match=r"labels/00001D.png: expected 8 bits"):
-        dataset.read("00001D")
-    png(root / "labels" / "00001D.png", rgb)
-    with pytest.raises(InputError, match="expected one channel of class indices, got 3"):
-        dataset.read("00001D")
-
-
-def test_folders_layout_refuses_a_packed_image(write_mfnet, expected_pair, png) -> None:
-    root = write_mfnet({"train": ["00001D"]}, layout="folders")
-    rgb, thermal, _ = expected_pair("00001D", (24, 32))
-    png(root / "RGB" / "00001D.png", np.dstack([rgb, thermal]))
-    with pytest.raises(InputError, match=r"RGB/00001D.png: expected 3 channels .*, got 4"):
-        MFNet(str(root)).read("00001D")
-    png(root / "RGB" / "00001D.png", rgb[:, :30])
-    with pytest.raises(InputError, match="RGB is 24x30 pixels but thermal is 24x32"):
-        MFNet(str(root)).read("00001D")
-
-
-def test_refuses_sizes_that_differ(write_mfnet, png) -> None:
-    root = write_mfnet({"train": ["00001D"]})
-    png(root / "labels" / "00001D.png", np.zeros((12, 16), np.uint8))
-    with pytest.raises(InputError, match="'00001D': RGB is 24x32 pixels but its label is 12x"):
-        MFNet(str(root)).read("00001D")
-
-
-def test_labels_out_of_range_are_refused(write_mfnet, png) -> None:
-    root = write_mfnet({"train": ["00001D"]})
-    label = np.zeros((24, 32), np.uint8)
-    label[0, :2] = (8, 255)
-    png(root / "labels" / "00001D.png", label)
-    assert MFNet(str(root)).read("00001D").label is not None
-    label[3, 4] = 9
-    png(root / "labels" / "00001D.png", label)
-    with pytest.raises(InputError, match=r"labels/00001D.png: label value 9 is out of range"):
-        MFNet(str(root)).read("00001D")
-
-
-@pytest.mark.parametrize("folder", ["images", "labels"])
-def test_refuses_damaged_files(write_mfnet, folder: str) -> None:
-    root = write_mfnet({"train": ["00001D"]})
-    path = root / folder / "00001D.png"
-    whole = path.read_bytes()
-    changed = bytearray(whole)
-    changed[len(whole) // 2] ^= 0xFF
-    for damaged in (whole[: len(whole) // 2], bytes(changed), b"", b"no image"):
-        path.write_bytes(damaged)
-        with pytest.raises(InputError, match=rf"{folder}/00001D.png cannot be decoded"):
+    packed = np.dstack([rgb, thermal])
+    wrong = label.copy()
+    wrong[3, 4] = 9
+    for folder, image, said in (
+        ("images", rgb, "expected 4 channels .*, got 3"),
+        ("images", packed.astype(np.uint16), "expected 8 bits per channel, got uint16"),
+        ("labels", label.astype(np.uint16), "expected 8 bits"),
+        ("labels", rgb, "expected one channel of class indices, got 3"),
+        ("labels", wrong, "label value 9 is out of range; expected 0 to 8"),
+    ):
+        write_mfnet({"train": ["00001D"]})
+        png(root / folder / "00001D.png", image)
+        with pytest.raises(InputError, match=rf"{folder}/00001D.png: {said}"):
             MFNet(str(root)).read("00001D")
-    path.unlink()
-    with pytest.raises(InputError, match=rf"{folder}/00001D.png is missing\.$"):
-        MFNet(str(root)).read("00001D")
 
 
-def test_configuration_repeats_the_defaults() -> None:
-    node = yaml.safe_load((ROOT / "conf" / "dataset" / "mfnet.yaml").read_text())
-    assert tuple(node["classes"]) == CLASSES
-    assert tuple(map(tuple, node["palette"])) == PALETTE
-    assert node["splits"] == SPLITS
-    assert node["num_classes"] == 9
+def test_check_counts_a_split(write_mfnet, png) -> None:
+    root = write_mfnet({"train": ["00001D", "00001D_flip", "00002N"]})
+    first = np.zeros((24, 32), np.uint8)
+    first[0, :4] = (1, 1, 2, 255)
+    second = np.zeros((24, 32), np.uint8)
+    second[0, 0] = 1
+    for name, label in (("00001D", first), ("00001D_flip", first), ("00002N", second)):
+        png(root / "labels" / f"{name}.png", label)
+    (split,) = check_dataset(MFNet(str(root), splits={"train": "train.txt"})).splits
+    assert (split.num_names, split.num_read, split.num_flipped) == (3, 3, 1)
+    assert (split.num_day, split.num_night) == (1, 1)
+    assert split.sizes == {(24, 32): 3}
+    assert split.pixels[[1, 2, 9]].tolist() == [5, 2, 2]
+    assert split.images[[0, 1, 2, 3, 9]].tolist() == [3, 3, 2, 0, 2]
+    assert split.pixels.sum() == 3 * 24 * 32
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="reference material is not here")
-def test_reads_real_pairs() -> None:
-    dataset = MFNet(str(REAL))
-    assert len(dataset.names("train")) == len(dataset.names("val")) == 100
-    sample = dataset.read(dataset.names("train")[0])
-    assert sample.rgb.shape == (480, 640, 3)
-    assert sample.thermal.shape == (480, 640)
-    assert sample.label is not None
-    assert sample.label.max() <= 8
+def test_check_finds_each_problem_once(write_mfnet, expected_pair, png, capsys) -> None:
+    root = write_mfnet(SPLITS)
+    assert run(root) == 0
+    output = capsys.readouterr()
+    assert "mfnet (packed layout)" in output.out
+    assert "24x32 (2)" in output.out
+    assert "0 problem(s)" in output.out
+    assert "reading" in output.err
+    names = [f"{number:05d}D" for number in range(10, 17)]
+    lists = {"train": [*names, "odd", "00003N"], "val": ["00003N", "00003N", "00003N_flip"]}
+    write_mfnet({**SPLITS, **lists, "test_day": ["00004D", "00002N"], "test_night": ["00004D"]})
+    rgb, thermal, _ = expected_pair("x", (24, 32))
+    (root / "labels" / "00011D.png").unlink()
+    png(root / "images" / "00099D.png", np.dstack([rgb, thermal]))
+    found = problems(root)
+    for text in (
+        "labels/00011D.png is missing",
+        "split train: 'odd' is not five digits and D or N",
+        "split val lists '00003N' 2 times",
+        "split val lists 1 mirrored copies",
+        "splits train and val share 1 names, the first is '00003N'",
+        "split test_day lists '00002N', which is a night image",
+        "split test_night lists '00004D', which is a day image",
+        "splits test_day and test_night share 1 names",
+        "3 files belong to no image of a split, the first is",
+    ):
+        assert sum(text in problem for problem in found) == 1, text
+    assert len(found) == 9
+    assert not any("\n" in problem for problem in found)
+    assert run(root) == 1
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("problem: ")]
+    assert lines == [f"problem: {problem}" for problem in found]
 
 
-@pytest.mark.skipif(not OFFICIAL.exists(), reason="reference material is not here")
-def test_official_lists_by_letter(write_mfnet) -> None:
+def test_check_of_missing_and_shared_lists(write_mfnet, capsys) -> None:
     root = write_mfnet({"train": ["00001D"]})
-    for path in OFFICIAL.glob("*.txt"):
+    (root / "val.txt").write_text("")
+    report = check_dataset(MFNet(str(root)))
+    assert len(report.problems) == 2
+    assert "val.txt' is empty" in report.problems[0]
+    assert "test.txt'" in report.problems[1]
+    # The parts by time of day only repeat what other lists hold.
+    assert sum("test_day.txt" in note or "test_night.txt" in note for note in report.notes) == 2
+    (root / "val.txt").write_text("00001D\n")
+    assert problems(root, splits={"val": "val.txt", "test": "val.txt"}) == []
+    (root / "train.txt").unlink()
+    (root / "val.txt").unlink()
+    assert run(root) == 1
+    assert "4 problem(s)" in capsys.readouterr().out  # three lists, and files that none names
+
+
+def test_check_notes_numbers_and_sizes(write_mfnet) -> None:
+    root = write_mfnet(SPLITS)
+    write_mfnet({"val": ["00005N"]}, hw=(12, 16))
+    report = check_dataset(MFNet(str(root)))
+    assert (
+        "split train has 1 day and 1 night images, the official list has 410 and 374 (784 in all)."
+        in report.notes
+    )
+    assert any("differ in size (12x16, 24x32)" in note for note in report.notes)
+    own = check_dataset(MFNet(str(root), name="own"))
+    assert not any("the official list" in line for line in own.notes)
+
+
+def test_check_does_not_depend_on_threads(write_mfnet) -> None:
+    names = [f"{number:05d}D" for number in range(12)]
+    root = write_mfnet({**SPLITS, "train": names})
+    for name in names[::2]:
+        (root / "images" / f"{name}.png").unlink()
+    counted: list[int] = []
+    dataset = MFNet(str(root))
+    one = check_dataset(dataset, num_threads=1, advance=lambda: counted.append(1))
+    assert one.problems == check_dataset(dataset, num_threads=4).problems
+    assert len(counted) == 13  # 00004D is in two lists
+
+
+def test_check_of_another_class_is_refused() -> None:
+    node = {"_target_": "rgbt.data.label_map.LabelMap", "num_source": 1, "targets": ["a"]}
+    config = OmegaConf.create({"dataset": {**node, "groups": {"a": [0]}}})
+    with pytest.raises(InputError, match="LabelMap cannot be checked"):
+        main.__wrapped__(config)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED.exists(), reason="reference material is not here")
+def test_check_of_real_pairs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(SHARED / "mfnet200", test="val.txt") == 0
+    output = capsys.readouterr().out
+    assert "split train has 50 day and 50 night images, the official list has 410 and 374" in output
+    guardrail = next(line for line in output.splitlines() if "guardrail" in line)
+    assert "(7)" in guardrail  # in training, and absent from validation
+    assert "0.000% (0)" in guardrail
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="reference material is not here")
+def test_real_pairs_and_official_lists(write_mfnet) -> None:
+    sample = (real := MFNet(str(SHARED / "mfnet200"))).read(real.names("train")[0])
+    assert (sample.rgb.shape, sample.thermal.shape) == ((480, 640, 3), (480, 640))
+    assert sample.label.max() <= 8
+    root = write_mfnet({"train": ["00001D"]})
+    for path in (SHARED / "mfnet_names").glob("*.txt"):
         (root / path.name).write_text(path.read_text())
     dataset = MFNet(str(root))
-    nights = {
-        split: sum(map(dataset.is_night, dataset.names(split)))
-        for split in ("train", "val", "test")
+    names = {split: dataset.names(split) for split in ("train", "val", "test")}
+    assert {split: len(each) for split, each in names.items()} == {
+        **{"train": 784, "val": 392, "test": 393}
     }
-    sizes = {split: len(dataset.names(split)) for split in nights}
-    assert sizes == {"train": 784, "val": 392, "test": 393}
-    assert nights == {"train": 374, "val": 187, "test": 188}
+    assert [sum(dataset.nights(each)) for each in names.values()] == [374, 187, 188]

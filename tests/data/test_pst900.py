@@ -1,14 +1,16 @@
+"""PST900: its two layouts, recordings for validation, and what the check finds in a copy."""
+
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.pst900 import CLASSES, PALETTE, PST900
+from rgbt.data.pst900 import PST900
 from rgbt.data.pst900_layout import bag_of
+from rgbt.data.report import check_dataset
 from tests.conftest import write_png
 from tests.data.pst900_files import (
     HW,
@@ -20,82 +22,55 @@ from tests.data.pst900_files import (
     write_triple,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     return write_pst900(tmp_path / "pst")
 
 
+def notes(root: Path, **keys) -> tuple[str, ...]:
+    report = check_dataset(PST900(str(root), **keys))
+    assert report.problems == ()
+    return report.notes
+
+
 def test_reads_the_archive(root: Path) -> None:
+    (root / "train/rgb" / f"._{TRAIN[0]}.png").write_bytes(b"")  # of an archiver
     dataset = PST900(str(root))
     assert dataset.names("train") == tuple(sorted(TRAIN))
-    assert dataset.names("test") == tuple(sorted(TEST))
+    assert dataset.names("val") == dataset.names("test") == tuple(sorted(TEST))
     for name in (*TRAIN, *TEST):
         sample = dataset.read(name)
         arrays = (sample.rgb, sample.thermal, sample.label)
-        for found, expected in zip(arrays, contents(name)):
-            assert found is not None
+        for found, expected in zip(arrays, contents(name), strict=True):
             assert found.dtype == np.uint8
             np.testing.assert_array_equal(found, expected)
         assert sample.name == name
-        np.testing.assert_array_equal(dataset.label(name), contents(name)[2])
-        np.testing.assert_array_equal(dataset.thermal(name), contents(name)[1])
-    assert dataset.splits == {
-        "train": "train/rgb/*.png",
-        "val": "test/rgb/*.png",
-        "test": "test/rgb/*.png",
-    }
-    assert dataset.unscored == ()
+    assert dataset.splits["val"] == "test/rgb/*.png"
     assert dataset.nights(dataset.names("train")) is None
-
-
-def test_validation_is_the_test_part(root: Path) -> None:
-    dataset = PST900(str(root))
-    assert dataset.names("val") == dataset.names("test")
-    assert dataset.has("val")
+    with pytest.raises(InputError, match="neither train nor test has an image called 'other'"):
+        dataset.read("other")
 
 
 def test_bags_taken_out_of_training(root: Path) -> None:
+    write_triple(root / "test", "0_bag12_x")  # bags of the test part stay in it
     dataset = PST900(str(root), val_bags=(12,))
     assert dataset.names("val") == (TRAIN[2],)
     assert dataset.names("train") == tuple(sorted(TRAIN[:2]))
-    assert dataset.names("test") == tuple(sorted(TEST))
+    assert dataset.names("test") == ("0_bag12_x", *sorted(TEST))
     assert dataset.splits["val"] == "train/rgb/*.png of the bags [12]"
-    assert dataset.splits["train"] == "train/rgb/*.png without the bags [12]"
-    np.testing.assert_array_equal(dataset.read(TRAIN[2]).label, contents(TRAIN[2])[2])
-    write_triple(root / "test", "0_bag12_x")  # bags of the test part stay in it
-    assert PST900(str(root), val_bags=(12,)).names("test") == ("0_bag12_x", *sorted(TEST))
-
-
-def test_bags_that_cannot_be_taken(root: Path) -> None:
     # 1 and 12 are apart: bag 2 is in no name.
     for bags in ((2,), (12, 21)):
         with pytest.raises(InputError, match=rf"val_bags: .* has no bag {bags[-1]}; .* are 1, 12"):
-            PST900(str(root), val_bags=bags).names("val")
-    dataset = PST900(str(root), val_bags=(1, 12))
-    assert not dataset.has("train")
-    with pytest.raises(InputError, match="'train' of pst900 is empty: .* remove one of them"):
-        dataset.names("train")
-    assert len(dataset.names("val")) == 3
+            PST900(str(root), val_bags=bags).names("train")
+    with pytest.raises(InputError, match="every image is of a bag in dataset.val_bags"):
+        PST900(str(root), val_bags=(1, 12)).names("train")
+    assert [bag_of(name) for name in ("bag7_x", "x_bag07_", "handbag7_x", "x_bag7")] == [
+        *(7, 7, None, None)
+    ]
 
 
-@pytest.mark.parametrize(
-    ("name", "bag"),
-    [
-        ("58_bag21_rect_rgb_frame0000000440", 21),
-        ("bag3_x", 3),
-        ("handbag3_x", None),
-        ("1_bag3", None),
-        ("", None),
-    ],
-)
-def test_bag_of(name: str, bag: int | None) -> None:
-    assert bag_of(name) == bag
-
-
-def test_flat_folders_with_lists(tmp_path: Path) -> None:
+def test_lists_without_parts(tmp_path: Path) -> None:
     root = write_lists(tmp_path, {"train": TRAIN[::-1], "test": TEST})
     dataset = PST900(str(root))
     assert dataset.names("train") == TRAIN[::-1]  # in the order of the list
@@ -108,75 +83,31 @@ def test_flat_folders_with_lists(tmp_path: Path) -> None:
     dataset = PST900(str(root))
     assert (dataset.names("val"), dataset.splits["val"]) == (TEST[:1], "val.txt")
     assert PST900(str(root), val_bags=(12,)).names("val") == TRAIN[2:]
-
-
-def test_folders_come_before_lists(root: Path) -> None:
-    write_lists(root, {split: (f"{split}_bag9_x",) for split in ("train", "val", "test")})
+    write_pst900(root)  # parts come before lists
     assert PST900(str(root)).names("train") == tuple(sorted(TRAIN))
-    assert PST900(str(root)).names("val") == tuple(sorted(TEST))
 
 
-def test_files(root: Path) -> None:
-    dataset = PST900(str(root))
-    assert dataset.files(TRAIN[0]) == tuple(
-        root / "train" / kind / f"{TRAIN[0]}.png" for kind in ("rgb", "thermal", "labels")
-    )
-    (root / "train/thermal" / f"{TRAIN[0]}.png").unlink()
-    assert len(PST900(str(root)).files(TRAIN[0])) == 3
-    with pytest.raises(InputError, match=r"train/thermal/10_bag1\S* is missing"):
-        dataset.read(TRAIN[0])
-    assert dataset.decoding() == {"num_classes": 5}
-
-
-def test_fingerprint(tmp_path: Path) -> None:
-    one, other = write_pst900(tmp_path / "one"), write_pst900(tmp_path / "other")
-    expected = PST900(str(one)).fingerprint()
-    assert len(expected) == 64
-    assert PST900(str(other)).fingerprint() == expected
-    assert PST900(str(other), val_bags=(1,)).fingerprint() != expected
+def test_both_layouts_have_one_fingerprint(root: Path, tmp_path: Path) -> None:
+    expected = PST900(str(root)).fingerprint()
+    assert PST900(str(root), val_bags=(1,)).fingerprint() != expected
     flat = write_lists(tmp_path / "flat", {"train": tuple(sorted(TRAIN)), "test": TEST[::-1]})
     assert PST900(str(flat)).fingerprint() == expected
-    label = other / "test/labels" / f"{TEST[0]}.png"
-    changed = {expected}
-    for content in (b"shorter", b""):
-        label.write_bytes(content)
-        changed.add(PST900(str(other)).fingerprint())
-    label.unlink()
-    changed.add(PST900(str(other)).fingerprint())
-    assert len(changed) == 4  # a file that is missing is no empty one
 
 
 def test_a_part_that_is_missing(tmp_path: Path) -> None:
     dataset = PST900(str(write_pst900(tmp_path, test=())))
     assert [dataset.has(split) for split in ("train", "val", "test")] == [True, False, False]
-    with pytest.raises(InputError, match=r"'val' of pst900 is empty: expected test/rgb/\*.png in"):
-        dataset.names("val")
     assert len(dataset.fingerprint()) == 64
-    assert dataset.read(TRAIN[0]).name == TRAIN[0]
-    (tmp_path / "flat").mkdir()
+    report = check_dataset(dataset)
+    assert [problem.partition(" of ")[0] for problem in report.problems] == ["split 'test'"]
+    assert report.notes[0].startswith("split 'val' of pst900 is empty: expected test/rgb/*.png in")
     flat = PST900(str(write_lists(tmp_path / "flat", {"train": TRAIN})))
     assert not flat.has("test")
-    with pytest.raises(InputError, match=r"split 'test' of pst900: .*test.txt is missing"):
+    with pytest.raises(InputError, match=r"there is no list '.*test.txt'"):
         flat.names("test")
 
 
-def test_a_name_in_both_parts(root: Path) -> None:
-    write_pst900(root, (), (TRAIN[0],))
-    dataset = PST900(str(root))
-    for read in (dataset.read, dataset.label, dataset.files):
-        with pytest.raises(InputError, match="both train and test have an image called '10_bag1"):
-            read(TRAIN[0])
-    assert dataset.read(TRAIN[1]).name == TRAIN[1]
-    assert len(dataset.fingerprint()) == 64
-    with pytest.raises(InputError, match="neither train nor test has an image called 'other'"):
-        dataset.read("other")
-    with pytest.raises(InputError, match="no split 'trian'; did you mean 'train'"):
-        dataset.names("trian")
-
-
-def test_refuses_a_wrong_root(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no folder '/nowhere'"):
-        PST900("/nowhere")
+def test_wrong_roots_are_refused(root: Path, tmp_path: Path) -> None:
     for wrong in (tmp_path, root / "train"):
         with pytest.raises(InputError, match=rf"does not hold train/rgb .*; give {root}, which"):
             PST900(str(wrong))
@@ -188,68 +119,91 @@ def test_refuses_a_wrong_root(root: Path, tmp_path: Path) -> None:
         PST900(str(flat))
 
 
-def test_refuses_thermal_counts(root: Path) -> None:
+def test_thermal_counts_are_refused(root: Path) -> None:
     path = root / "train/thermal" / f"{TRAIN[0]}.png"
-    write_png(path, np.full(HW, 30000, np.uint16))
-    with pytest.raises(InputError, match="expected 8 bits .*, got uint16; .* thermal_raw holds"):
-        PST900(str(root)).read(TRAIN[0])
-    write_png(path, contents("x")[0])
-    with pytest.raises(InputError, match=r"three equal ones, got 3 channels that differ by up to"):
-        PST900(str(root)).read(TRAIN[0])
-    write_png(path, np.dstack([contents("x")[1]] * 3))
-    np.testing.assert_array_equal(PST900(str(root)).read(TRAIN[0]).thermal, contents("x")[1])
-    write_png(path, np.dstack([contents("x")[1]] * 4))
-    with pytest.raises(InputError, match=r"three equal ones, got 4 channels; the folder thermal"):
-        PST900(str(root)).read(TRAIN[0])
+    level = contents("x")[1]
+    for image, said in (
+        (np.full(HW, 30000, np.uint16), "expected 8 bits .*, got uint16; .* thermal_raw holds"),
+        (contents("x")[0], r"three equal ones, got 3 channels that differ by up to"),
+        (np.dstack([level] * 4), r"three equal ones, got 4 channels; the folder thermal"),
+    ):
+        write_png(path, image)
+        with pytest.raises(InputError, match=said):
+            PST900(str(root)).read(TRAIN[0])
+    write_png(path, np.dstack([level] * 3))
+    np.testing.assert_array_equal(PST900(str(root)).read(TRAIN[0]).thermal, level)
 
 
-def test_refuses_sizes_that_differ(root: Path) -> None:
-    name = TEST[0]
-    write_png(root / "test/labels" / f"{name}.png", contents(name, (9, 15))[2])
-    with pytest.raises(InputError, match="RGB is 9x16 pixels but its label is 9x15; .*test/labels"):
-        PST900(str(root)).read(name)
-    write_png(root / "test/thermal" / f"{name}.png", contents(name, (8, 16))[1])
-    with pytest.raises(InputError, match="RGB is 9x16 pixels but thermal is 8x16; .*test/thermal"):
-        PST900(str(root)).read(name)
-
-
-def test_labels_out_of_range_are_refused(root: Path) -> None:
-    path = root / "train/labels" / f"{TRAIN[0]}.png"
-    label = np.zeros(HW, np.uint8)
-    label[0, :2] = (4, 255)
-    write_png(path, label)
-    np.testing.assert_array_equal(PST900(str(root)).label(TRAIN[0]), label)
-    label[1, 1] = 5
-    write_png(path, label)
-    with pytest.raises(InputError, match=r"train/labels/\S+: label value 5 is out of range"):
-        PST900(str(root)).read(TRAIN[0])
-
-
-def test_refuses_links_out_of_the_root(root: Path, tmp_path: Path) -> None:
-    inside = root / "train/rgb" / f"{TRAIN[0]}.png"
-    inside.rename(tmp_path / "outside.png")
-    inside.symlink_to(tmp_path / "outside.png")
-    with pytest.raises(InputError, match="leads out of dataset.root"):
-        PST900(str(root)).read(TRAIN[0])
+def test_list_line_outside_the_root_is_refused(root: Path, tmp_path: Path) -> None:
     write_lists(tmp_path / "flat", {"train": ("../../pst/train/rgb/x",)})
     (root / "train/rgb/x.png").write_bytes(b"")
     with pytest.raises(InputError, match="leads out of dataset.root"):
         PST900(str(tmp_path / "flat")).read("../../pst/train/rgb/x")
 
 
-def test_leaves_what_an_archiver_wrote_alone(root: Path) -> None:
-    (root / "train/rgb" / f"._{TRAIN[0]}.png").write_bytes(b"")
-    assert len(PST900(str(root)).names("train")) == 3
+def test_check_notes(root: Path) -> None:
+    thermal = np.full(HW, 7, np.uint8)  # 9 x 16 = 144 pixels, of each of three images
+    thermal[0] = 0
+    thermal[1, :2] = (3, 200)
+    for name in TRAIN:
+        write_png(root / "train/thermal" / f"{name}.png", thermal)
+    for name in TEST:
+        write_png(root / "test/thermal" / f"{name}.png", np.zeros(HW, np.uint8))
+    found = notes(root)
+    for start, note in zip(
+        (
+            "split val is the test part, as in the CRM release: a checkpoint chosen on it",
+            "split test has 1 of bag 21, 1 of bag 25; the archive has 40 of bag 21, 59 of bag 22,",
+            "split train has 3 images, the archive has 597.",
+            "split test has 2 images, the archive has 288.",
+            "images are 9x16, the original ones 720x1280: scores of resized",
+            "split train: 11.11% of the thermal pixels are 0, which those without a measurement "
+            "are; the others run from 3 to 200.",
+            "split test: 100.00% of the thermal pixels are 0",
+        ),
+        found,
+        strict=True,  # "val" would repeat "test"
+    ):
+        assert note.startswith(start)
+    bags = notes(root, val_bags=(12,))
+    assert not any("is the test part" in note or "has 597" in note for note in bags)
+    assert [note[:10] for note in bags[-3:]] == ["split trai", "split val:", "split test"]
+    assert not any("archive" in note for note in notes(root, name="own"))
 
 
-def test_configuration_repeats_the_defaults() -> None:
-    node = yaml.safe_load((ROOT / "conf" / "dataset" / "pst900.yaml").read_text())
-    assert tuple(node["classes"]) == CLASSES
-    assert tuple(map(tuple, node["palette"])) == PALETTE
-    assert node["num_classes"] == len(CLASSES)
-    assert node["val_bags"] == []
+def test_check_of_whole_and_exchanged_parts(tmp_path: Path) -> None:
+    bags = {21: 40, 22: 59, 23: 28, 24: 72, 25: 89}
+    test = [f"{index}_bag{bag}_x" for bag, count in bags.items() for index in range(count)]
+    for part, names in (("train", [f"{index}_bag1_x" for index in range(597)]), ("test", test)):
+        (tmp_path / part / "rgb").mkdir(parents=True)
+        for name in names:
+            (tmp_path / part / "rgb" / f"{name}.png").touch()
+    assert len(check_dataset(PST900(str(tmp_path))).notes) == 1
+    found = notes(write_pst900(tmp_path / "all", train=TEST, test=TRAIN))
+    assert any("split train is 2 images of the bags 21 to 25" in note for note in found)
+    assert any(note.startswith("split test has 2 of bag 1, 1 of bag 12; the") for note in found)
+    found = notes(write_pst900(tmp_path / "some", train=(*TRAIN, TEST[0]), test=(TEST[1], "odd")))
+    assert any(note.startswith("split train holds 1 images of the bags 21 to 25") for note in found)
+    assert any(note.startswith("split test has 1 of no bag, 1 of bag 25; the") for note in found)
 
 
-def test_refuses_numbers_of_classes_that_disagree(root: Path) -> None:
-    with pytest.raises(InputError, match="num_classes is 4 but dataset.classes has 5"):
-        PST900(str(root), num_classes=4)
+def test_check_finds_each_problem_once(root: Path, tmp_path: Path) -> None:
+    write_triple(root / "test", TRAIN[0])
+    write_png(root / "train/labels" / f"{TEST[0]}.png", np.zeros(HW, np.uint8))
+    (root / "train/rgb" / f"{TRAIN[1]}.png").unlink()
+    dataset = PST900(str(root))
+    assert len(dataset.fingerprint()) == 64
+    assert dataset.read(TRAIN[2]).name == TRAIN[2]
+    for text in (
+        f"both train and test have an image called '{TRAIN[0]}'",
+        f"splits train and test share 1 names, the first is '{TRAIN[0]}'.",
+        f"3 files belong to no image of a split, the first is {root}/train/labels/{TRAIN[1]}.png.",
+    ):
+        assert sum(text in line for line in check_dataset(dataset).problems) == 1, text
+    assert len(check_dataset(dataset).problems) == 3
+    flat = write_lists(tmp_path / "flat", {"train": TRAIN, "test": (*TEST, TEST[0])})
+    write_triple(flat, "1_bag2_x")
+    assert check_dataset(PST900(str(flat))).problems == (
+        f"split test lists '{TEST[0]}' 2 times.",
+        f"3 files belong to no image of a split, the first is {flat}/labels/1_bag2_x.png.",
+    )

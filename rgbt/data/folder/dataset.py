@@ -8,37 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 from annotated_types import Interval
-from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.file_dataset import FileDataset
+from rgbt.checks import InputError, check_choice
+from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
-from rgbt.data.folder.images import FolderImages
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
-from rgbt.data.folder.values import (
-    LabelValue,
-    Range,
-    check_limits,
-    each_colour,
-    label_codes,
-    painted,
-)
-from rgbt.data.images import PairPattern
-from rgbt.data.named_files import existing_file, existing_root, hash_of_files
-from rgbt.data.report.folder import FolderChecks
+from rgbt.data.images import PairPattern, PairReader, Range, check_limits
+from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
+from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
-from rgbt.types import Sample
-
-Array = NDArray[np.uint8]
 
 
 class Folder(FileDataset):
@@ -51,15 +37,14 @@ class Folder(FileDataset):
 
     Args:
         root: folder that the patterns are relative to.
-        name: what the data set is called in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
+        num_classes: see `FileDataset`, as `classes`, `name` and `palette`.
+        classes: see there.
         rgb: pattern of the RGB images, 8 bit, three channels.
         thermal: pattern of the thermal images, one channel or three equal ones, of the size of the
             RGB image; the same as `rgb` for files of four channels R, G, B, thermal.
         label: pattern of the labels, images or `.npy`; None: the data set has no labels.
-        palette: (red, green, blue) of each class, 0..255; None: those of `colours`, or colours
-            that differ.
+        name: see there.
+        palette: None: the colours of `colours`, or colours that differ.
         unscored: classes that are counted but left out of every mean over classes.
         folders: split -> value of {split}; None: train, val and test.
         lists: split -> list file in `root`; replaces `folders`.
@@ -77,7 +62,7 @@ class Folder(FileDataset):
         InputError: no such root, patterns that match nothing, or invalid settings.
     """
 
-    images: FolderImages
+    most_clipped = 0.5
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -104,10 +89,13 @@ class Folder(FileDataset):
         night: Text | None = None,
     ) -> None:
         folder = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
-        palette = _palette(num_classes, classes, palette, colours)
+        if palette is None:
+            own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
+            generated = zip(classes, painted(num_classes), strict=False)
+            palette = tuple(own.get(word, colour) for word, colour in generated)
         super().__init__(folder, name, num_classes, classes, palette)
         self.unscored = unscored
-        self.thermal_range = thermal_range
+        self.clipping = thermal_range
         self.night = night
         for word in classes:
             if classes.count(word) > 1:
@@ -117,70 +105,33 @@ class Folder(FileDataset):
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
         self.patterns = patterns_of(rgb, thermal, label)
-        self.images = FolderImages((PairPattern(rgb, thermal, label),), thermal_range)
+        self.images = PairReader(
+            layouts=(PairPattern(rgb, thermal, label),),
+            thermal_range=thermal_range,
+            advice="grey levels have 8 bits in one channel or three equal ones, other values need "
+            "dataset.thermal_range=[low, high], the values that become black and white",
+            packed_advice="give dataset.thermal its own pattern",
+            rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
+        )
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
-        self._rule = self._rule_of(folders, lists, shares, (shares_seed, block))
-        self._names: dict[str, tuple[str, ...]] = {}
+        self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self.unlabelled = unlabelled
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
         # Without labelled splits these may be new images, of the day alone and without labels.
         if set(self.splits) - set(unlabelled):
-            self._check_labels()
-            self._check_night()
+            self._check_labels_and_night()
 
-    @property
-    def splits(self) -> dict[str, str]:
-        """Split -> its pattern, list or share."""
-        return self._rule.splits
-
-    def has(self, split: str) -> bool:
-        """Whether any frame of `split` exists; InputError if the split is unknown."""
-        self._check_split(split)
-        return self._rule.has(split)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split: in the order of its list, or by their text and numbers."""
-        self._check_split(split)
-        if split not in self._names:
-            self._names[split] = self._rule.names(split)
-        return self._names[split]
-
-    def pair(self, name: str) -> Sample:
-        """The images of `read` alone, without the label; InputError as there."""
-        frame = self.frame(name)
-        rgb = self._there("RGB image", frame.rgb, name)
-        return self.images.read(name, rgb, self._there("thermal image", frame.thermal, name))
-
-    def label(self, name: str) -> Array | None:
-        """The label of `read` alone, (H, W) uint8; None if the data set or the split has none."""
-        frame = self.frame(name)
-        if frame.label is None or name in self._without_labels:
-            return None
-        return self.codes.read(self._there("label", frame.label, name))
-
-    def values(self, name: str) -> NDArray[Any]:
-        """Values of the thermal camera before they are grey levels, (H, W); errors as of `read`."""
-        frame = self.frame(name)
-        path = self._there("thermal image", frame.thermal, name)
-        return self.images.values(path, packed=self.packed)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """Every file that `read` opens for `name`: RGB, thermal and, where it has one, label."""
-        frame = self.frame(name)
-        label = None if name in self._without_labels else frame.label
-        paths = (frame.rgb, frame.thermal, label)
-        return tuple(dict.fromkeys(path for path in paths if path is not None))
-
-    def decoding(self) -> dict[str, Any]:
-        """Settings that change what `read` makes of the files."""
-        return {
-            "packed": self.packed,
-            "thermal_range": self.thermal_range,
-            "codes": sorted(self.codes.codes.items()),
-            "of_colours": self.codes.of_colours,
-            "num_classes": self.num_classes,
-        }
+    def frame(self, name: str) -> FolderFrame:
+        """The files of `name`, without a label in splits that have none."""
+        if name not in self.frames:
+            raise InputError(
+                f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
+                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or remove the name "
+                "from the list."
+            )
+        frame = self.frames[name]
+        return frame._replace(label=None) if name in self._without_labels else frame
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
         """Whether each name matches `night`; None if it is not given."""
@@ -200,39 +151,31 @@ class Folder(FileDataset):
         files = hash_of_files(listed, self.files)
         return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
 
-    def checks(self) -> FolderChecks:
-        """What `rgbt.data.check` checks of this data set."""
-        return FolderChecks(self)
-
-    def frame(self, name: str) -> FolderFrame:
-        """The files of `name`; InputError if there is no such frame."""
-        if name not in self.frames:
-            raise InputError(
-                f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
-                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or remove the name "
-                "from the list."
-            )
-        return self.frames[name]
-
     @property
-    def packed(self) -> bool:
-        """Whether thermal is the fourth channel of the file of the RGB image."""
-        return self.patterns.thermal.text == self.patterns.rgb.text
+    def title(self) -> str:
+        """The patterns of its images."""
+        rgb, thermal, _ = self.images.layouts[0]
+        return f"RGB {rgb}, thermal {'channel 4' if rgb == thermal else thermal}"
+
+    def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
+        """Thermal images and labels without an RGB image."""
+        used = {path for each in self.frames.values() for path in each[2:]}
+        partners = [pattern for pattern in self.patterns[1:] if pattern is not None]
+        return {match.path for each in partners for match in each.files(self.root)} - used
+
+    def own_notes(self, lists: SplitNames) -> list[str]:
+        """Frames of no split."""
+        listed = set().union(*lists.values())
+        unlisted = [name for name in self.frames if name not in listed]
+        return [
+            f"{len(unlisted)} frames are in no split, the first is '{name}'."
+            for name in unlisted[:1]
+        ]
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
         present = [split for split in self.unlabelled if self.has(split)]
         return frozenset(name for split in present for name in self.names(split))
-
-    def _check_labels(self) -> None:
-        if self.patterns.label is not None:
-            labelled = (
-                frame for name, frame in self.frames.items() if name not in self._without_labels
-            )
-            check_partners(self.patterns.label, labelled, self.root)
-
-    def _there(self, what: str, path: Path, name: str) -> Path:
-        return existing_file(what, path, name, self.root)
 
     def _rule_of(
         self,
@@ -258,7 +201,7 @@ class Folder(FileDataset):
         if shares is not None:
             return ByShare(self.frames, shares, *draw)
         if lists is not None:
-            return ByList(self.frames, self.root, lists)
+            return ByList(self.root, lists, frames=self.frames)
         if not in_path:
             raise InputError(
                 f"dataset: nothing defines the splits; write {{{SPLIT}}} in dataset.rgb instead of "
@@ -266,33 +209,12 @@ class Folder(FileDataset):
             )
         return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
 
-    def _check_split(self, split: str) -> None:
-        if split not in self.splits:
-            raise InputError(
-                f"dataset has no split '{split}' (folders, lists or shares); "
-                f"{nearest(split, self.splits)}."
-            )
-
-    def _check_night(self) -> None:
+    def _check_labels_and_night(self) -> None:
+        labelled = [f for name, f in self.frames.items() if name not in self._without_labels]
+        if self.patterns.label is not None:
+            check_partners(self.patterns.label, labelled, self.root)
         if self.night is not None and not any(self.nights(tuple(self.frames)) or ()):
             raise InputError(
                 f"dataset.night: none of {len(self.frames)} names matches '{self.night}', the "
                 f"first is '{next(iter(self.frames))}'; correct it, or set it to null."
             )
-
-
-def _palette(
-    num_classes: int,
-    classes: tuple[str, ...],
-    palette: tuple[Colour, ...] | None,
-    colours: dict[str, Colour | tuple[Colour, ...]] | None,
-) -> tuple[Colour, ...]:
-    if palette is not None:
-        return palette
-    generated = painted(num_classes)
-    if colours is None:
-        return generated
-    return tuple(
-        each_colour(colours[word])[0] if word in colours else colour
-        for word, colour in zip(classes, generated, strict=False)
-    )

@@ -36,19 +36,30 @@ class Patterns(NamedTuple):
     thermal: Pattern
     label: Pattern | None
 
+    @classmethod
+    def of(cls, rgb: str, thermal: str, label: str | None) -> Patterns:
+        """Those of the texts of a configuration; InputError for an invalid pattern."""
+        return cls(
+            Pattern(rgb, "dataset.rgb"),
+            Pattern(thermal, "dataset.thermal"),
+            None if label is None else Pattern(label, "dataset.label"),
+        )
+
+    def frame(self, root: Path, name: str, values: WordValues) -> FolderFrame:
+        """The files of a frame, whether they exist or not; `values` has every word."""
+        label = None if self.label is None else self.label.path(root, values)
+        rgb, thermal = (pattern.path(root, values) for pattern in (self.rgb, self.thermal))
+        return FolderFrame(name, values, rgb, thermal, label)
+
 
 def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
-    """The patterns of the configuration.
+    """The patterns of a user's configuration.
 
     Raises:
         InputError: an invalid pattern, no {name} in the first, words that only the others have,
             or labels in a format that changes values.
     """
-    found = Patterns(
-        Pattern(rgb, "dataset.rgb"),
-        Pattern(thermal, "dataset.thermal"),
-        None if label is None else Pattern(label, "dataset.label"),
-    )
+    found = Patterns.of(rgb, thermal, label)
     if NAME not in found.rgb.words:
         raise InputError(
             f"dataset.rgb: '{rgb}' has {', '.join(found.rgb.words)} but no {NAME}; write "
@@ -77,8 +88,16 @@ def find_frames(root: Path, patterns: Patterns) -> dict[str, FolderFrame]:
             share a partner.
     """
     rgb, thermal, label = patterns
+    every = [
+        patterns.frame(root, "_".join(values[word] for word in rgb.words), values)
+        for _, values in rgb.files(root)
+    ]
+    # If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    partners = {path for each in every for path in (each.thermal, each.label) if path != each.rgb}
     frames: dict[str, FolderFrame] = {}
-    for frame in _candidates(root, patterns):
+    for frame in every:
+        if frame.rgb in partners:
+            continue
         if frame.name in frames:
             raise InputError(
                 f"dataset.rgb: {frames[frame.name].rgb} and {frame.rgb} would both be called "
@@ -107,26 +126,6 @@ def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) 
             f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct "
             "the pattern."
         )
-
-
-def _candidates(root: Path, patterns: Patterns) -> list[FolderFrame]:
-    """Files that match the RGB pattern, without thermal images and labels of other matches.
-
-    If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
-    """
-    rgb, thermal, label = patterns
-    found = [
-        FolderFrame(
-            name="_".join(values[word] for word in rgb.words),
-            values=values,
-            rgb=path,
-            thermal=thermal.path(root, values),
-            label=None if label is None else label.path(root, values),
-        )
-        for path, values in rgb.files(root)
-    ]
-    partners = {path for each in found for path in (each.thermal, each.label) if path != each.rgb}
-    return [frame for frame in found if frame.rgb not in partners]
 
 
 def _check_shared(pattern: Pattern, frames: dict[str, FolderFrame], root: Path) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
@@ -88,19 +88,21 @@ class ByFolder:
 class ByList:
     """A split is a file of one line per frame.
 
-    A line is the name of the frame; or the values of the words of the RGB pattern, joined by "/";
-    or the value of {name}, if it is unique; or the path of the RGB image below the root. Each may
-    have a suffix.
+    Without `frames`, a line is a name. With them it is the name of one; or the values of the words
+    of the RGB pattern, joined by "/"; or the value of {name}, if it is unique; or the path of the
+    RGB image below the root. Each may have a suffix.
 
     Attributes:
-        frames: all.
         root: of the frames, and of the lists where these are relative.
         lists: split -> file.
+        key: of the configuration that names the lists.
+        frames: all; empty: every line is a name.
     """
 
-    frames: Frames
     root: Path
     lists: dict[str, str]
+    key: str = "dataset.lists"
+    frames: Frames = field(default_factory=dict)
 
     @property
     def splits(self) -> dict[str, str]:
@@ -117,10 +119,15 @@ class ByList:
         A line that is no frame stays as it is, so that reading it says so; InputError if none
         is, or there is no such list.
         """
-        path, key = self._path(split), f"dataset.lists.{split}"
+        path, key = self._path(split), f"{self.key}.{split}"
         if not is_there(path):
-            raise InputError(f"{key}: there is no list '{path}'; write it (one name per line).")
+            raise InputError(
+                f"{key}: there is no list '{path}'; write it (one name per line), or name another "
+                f"one with {key}=..."
+            )
         lines = read_names(path, key)
+        if not self.frames:
+            return lines
         forms = self._forms()
         names = tuple(forms.get(line) or forms.get(_stem(line)) or line for line in lines)
         if set(names).isdisjoint(self.frames):
@@ -219,7 +226,10 @@ class ByShare:
         units = []
         for sequence in sorted(sequences, key=in_order):
             # Two cameras of one moment are consecutive, whatever word is first in the path.
-            names = [frame.name for frame in sorted(sequences[sequence], key=_moment)]
+            moments = sorted(
+                sequences[sequence], key=lambda f: (in_order(f.values[NAME]), in_order(f.name))
+            )
+            names = [frame.name for frame in moments]
             size = self.block or len(names)
             units += [names[start : start + size] for start in range(0, len(names), size)]
         return units
@@ -234,10 +244,6 @@ class ByShare:
             found[split] += self.units[index]
             lacking[split] -= len(self.units[index])
         return found
-
-
-def _moment(frame: FolderFrame) -> tuple[list[tuple[bool, int, str]], list[tuple[bool, int, str]]]:
-    return in_order(frame.values[NAME]), in_order(frame.name)
 
 
 def _below(root: Path, frame: FolderFrame) -> str:

@@ -16,30 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from hydra.utils import get_object
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import Progress
 
 from rgbt.checks import InputError, check_choice
-from rgbt.config.compose import conf_dir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.data.check import check_and_print
-from rgbt.data.prepare.copying import Item, check_out, claimed, write_all
+from rgbt.data.prepare.copying import check_out, copy
 from rgbt.data.prepare.download import SourceFiles
-from rgbt.data.prepare.plans import Download, Preparable
+from rgbt.data.prepare.plans import PREPARATIONS, Download
 
 OPTIONAL = ("labels", "lists")
-
-
-def preparable() -> dict[str, Preparable]:
-    """File of conf/dataset -> class of the data set, of those that declare a preparation."""
-    nodes = {path.stem: OmegaConf.load(path) for path in sorted(conf_dir().glob("dataset/*.yaml"))}
-    classes = {
-        name: get_object(node._target_) for name, node in nodes.items() if "_target_" in node
-    }
-    return {name: each for name, each in classes.items() if isinstance(each, Preparable)}
 
 
 @dataclass(frozen=True)
@@ -72,34 +60,28 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Copy the needed files of a download to a new folder and check them; it can be resumed."""
+    """Copy the needed files of a download to a new folder and check them."""
     del overrides  # none has an effect
     name, out, paths = options.dataset, options.out, options.paths
-    classes = preparable()
-    check_choice("dataset", name, classes)
-    preparation = classes[name].preparation
+    check_choice("dataset", name, PREPARATIONS)
+    reader, plan, archives, accepted = PREPARATIONS[name]
     for key in paths:
-        if key in OPTIONAL and key not in preparation.options:
+        if key in OPTIONAL and key not in accepted:
             raise InputError(f"{key} has no effect for dataset={name}; omit it.")
-    plan = {"dataset": name, **{key: str(path.resolve()) for key, path in paths.items()}}
-    check_out(out, tuple(paths.values()), plan)
+    check_out(out, tuple(paths.values()))
     with ExitStack() as opened:
         sources = {
-            key: opened.enter_context(SourceFiles(path, key, preparation.archives))
+            key: opened.enter_context(SourceFiles(path, key, archives))
             for key, path in paths.items()
         }
-        items = preparation.plan(Download(**sources))
-        opened.enter_context(claimed(out, plan))
-        _copy(items, out)
-    code = check_and_print(classes[name](str(out)))
+        items = plan(Download(**sources))
+        origin = {"dataset": name, **{key: str(path.resolve()) for key, path in paths.items()}}
+        with Progress(console=Console(stderr=True)) as progress:
+            task = progress.add_task("copying", total=sum(item.size for item in items))
+            copy(items, out, origin, lambda size: progress.advance(task, size))
+    code = check_and_print(reader(str(out)))
     sys.stdout.write(f"prepared: dataset={name} dataset.root={out}\n")
     return code
-
-
-def _copy(items: list[Item], out: Path) -> None:
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("copying", total=sum(item.size for item in items))
-        write_all(items, out, lambda size: progress.advance(task, size))
 
 
 entry = PlainCommand(Options, main, heeds=())

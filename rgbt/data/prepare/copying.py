@@ -1,4 +1,4 @@
-"""Writes planned files, each one completely or not at all; an interrupted copy can be resumed.
+"""Writes planned files into a temporary folder, which gets its name when it is complete.
 
 Part of `rgbt.data.prepare`.
 """
@@ -16,10 +16,9 @@ from typing import NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.data.prepare.download import SourceFile
-from rgbt.files.budgets import read_json
 
 PLAN = ".prepare.json"
-"""File in the new folder with the arguments of the command, so that it can be resumed."""
+"""File in the new folder that says what it was made from."""
 
 SPARE = 2**24
 """Bytes that must stay free on the disk."""
@@ -46,138 +45,120 @@ class Item(NamedTuple):
         return iter((self.content,)) if isinstance(self.content, bytes) else self.content.chunks()
 
     def is_at(self, path: Path) -> bool:
-        """Whether `path` holds these bytes; all are compared, as downloads may be repaired."""
+        """Whether `path` holds these bytes; all are compared."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
         with path.open("rb") as file:
             return all(file.read(len(chunk)) == chunk for chunk in self.chunks())
 
 
-def check_out(out: Path, sources: tuple[Path, ...], plan: dict[str, str]) -> None:
-    """Refuse a folder that this command must not write to; nothing is written yet.
-
-    Raises:
-        InputError: `out` is inside one of `sources`, holds other files, or was begun with other
-            arguments than those of `plan`.
-    """
+def check_out(out: Path, sources: tuple[Path, ...]) -> None:
+    """Refuse a new folder that is inside one of `sources`."""
     for source in sources:
         if out.resolve().is_relative_to(source.resolve()):
             raise InputError(
                 f"out: {out} is inside {source}, which is only read; name a folder outside it."
             )
-    path = out / PLAN
-    if not path.is_file():
-        # A command that was killed at its start may leave an incomplete note.
-        others = [each for each in _listed(out) if not each.name.startswith(PLAN)]
-        if others:
-            raise InputError(
-                f"out: {out} is not empty and was not begun by this command; name another folder."
-            )
+
+
+def copy(
+    items: list[Item], out: Path, plan: dict[str, str], advance: Callable[[int], object]
+) -> None:
+    """Make `out` of `items`, which have different targets, or compare it with them.
+
+    Files are written into a temporary folder beside `out`, which is renamed when all of them are
+    complete. What an interrupted command left there is removed.
+
+    Args:
+        items: files to write.
+        out: new folder; where it holds files already, these must be the same.
+        plan: what it is made from; written into it.
+        advance: called with the bytes of every file that was written or compared.
+
+    Raises:
+        InputError: `out` holds something else, is being prepared by another process or cannot be
+            written; too little space; or a file of the download that cannot be read or has another
+            size than listed.
+    """
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        _compare(items, out, advance)
         return
     try:
-        begun = read_json(path, dict[str, str], "")
-    except InputError:
-        begun = None
-    if begun != plan:
+        with _temporary(out) as folder:
+            _check_space(items, folder)
+            for item in items:
+                _write(item, folder / item.target)
+                advance(item.size)
+            (folder / PLAN).write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8")
+            folder.replace(out)
+    except OSError as error:
         raise InputError(
-            f"out: {out} was begun with other arguments (see {path}); give the same arguments "
-            "again, name another folder, or remove this one."
+            f"out: cannot write {error.filename or out} ({error.strerror or error}); free some "
+            "space, or name a writable folder."
+        ) from error
+
+
+def _compare(items: list[Item], out: Path, advance: Callable[[int], object]) -> None:
+    """Refuse other bytes than those of `items`, and further files, which a reader would use."""
+    others = []
+    for item in items:
+        if not item.is_at(out / item.target):
+            others.append(out / item.target)
+        advance(item.size)
+    targets = {out / item.target for item in items}
+    folders = {path.parent for path in targets} - {out}
+    others += [
+        path
+        for folder in folders
+        if folder.is_dir()
+        for path in folder.iterdir()
+        if path.is_file() and not path.name.startswith(".") and path not in targets
+    ]
+    if others:
+        raise InputError(
+            f"out: {out} is not empty and differs from the download in {len(others)} files, the "
+            f"first is {min(others)}; remove the folder, or name another one."
         )
 
 
 @contextmanager
-def claimed(out: Path, plan: dict[str, str]) -> Iterator[None]:
-    """Make `out`, which passed `check_out`, write `plan` into it and lock it until the end.
+def _temporary(out: Path) -> Iterator[Path]:
+    """An empty folder beside `out`, removed at the end unless it was renamed.
 
-    Raises:
-        InputError: it is being written by another process, or cannot be written.
+    A lock on it keeps a second process away; it ends with this process.
     """
-    path = out / PLAN
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if not path.is_file():
-            temporary = path.with_name(f"{PLAN}.{os.getpid()}")
-            temporary.write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8")
-            temporary.replace(path)
-        with path.open("r+") as file:
-            _lock(file.fileno(), out)
-            yield
-    except OSError as error:
-        raise InputError(
-            f"out: cannot write {error.filename or out} ({error.strerror or error}); free some "
-            "space, or name a writable folder. Copied files are kept: the same command "
-            "resumes."
-        ) from error
-
-
-def write_all(items: list[Item], out: Path, advance: Callable[[int], object]) -> None:
-    """Write those of `items`, which have different targets, that do not exist yet in `out`.
-
-    `advance` is called with the bytes of every file that exists or has been written.
-
-    Raises:
-        InputError: other files in the folders, too little space, or a file of the download that
-            cannot be read or has another size than listed.
-        OSError: `out` cannot be written.
-    """
-    _refuse_others(items, out)
-    missing = []
-    for item in items:
-        if item.is_at(out / item.target):
-            advance(item.size)
-        else:
-            missing.append(item)
-    needed, free = sum(item.size for item in missing) + SPARE, shutil.disk_usage(out).free
-    if needed > free:
-        raise InputError(
-            f"out: {needed / 1e9:.2f} GB are to be copied to {out}, but its disk has "
-            f"{free / 1e9:.2f} GB left; free some space, or name a folder on another disk."
-        )
-    for item in missing:
-        _write(item, out / item.target)
-        advance(item.size)
-
-
-def _refuse_others(items: list[Item], out: Path) -> None:
-    """Refuse other files in the folders, which a reader would use as well."""
-    targets = {item.target for item in items}
-    folders = {out / target.rpartition("/")[0] for target in targets if "/" in target}
-    found = (path for folder in sorted(folders) if folder.is_dir() for path in folder.iterdir())
-    others = [
-        path
-        for path in found
-        if path.is_file()
-        and not path.name.startswith(".")
-        and path.relative_to(out).as_posix() not in targets
-    ]
-    if others:
-        raise InputError(
-            f"out: {out} contains {len(others)} files that are not in the download, the first is "
-            f"{min(others)}; remove them, or name another folder."
-        )
-
-
-def _listed(out: Path) -> list[Path]:
-    """Content of a folder; of a file, the file itself."""
-    return list(out.iterdir()) if out.is_dir() else [path for path in (out,) if path.exists()]
-
-
-def _lock(descriptor: int, out: Path) -> None:
+    folder = out.absolute().with_name(f".{out.name}.preparing")
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for path in folder.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        yield folder
     except BlockingIOError as error:
         raise InputError(
             f"out: another process is preparing {out}; wait for it, or name another folder."
         ) from error
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def _check_space(items: list[Item], folder: Path) -> None:
+    needed, free = sum(item.size for item in items) + SPARE, shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"out: {needed / 1e9:.2f} GB are to be copied to {folder.parent}, but its disk has "
+            f"{free / 1e9:.2f} GB left; free some space, or name a folder on another disk."
+        )
 
 
 def _write(item: Item, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Files are not flushed one by one, which takes longer than copying. After a power failure the
-    # length, or the check that reads everything, shows the damage.
-    temporary = path.with_name(f".{path.name}.part")
     size = 0
-    with temporary.open("wb") as file:
+    with path.open("xb") as file:
         for chunk in item.chunks():
             file.write(chunk)
             size += len(chunk)
@@ -186,4 +167,3 @@ def _write(item: Item, path: Path) -> None:
             f"{item.content!s} holds {size} bytes but {item.size} were listed; is it still "
             "being downloaded? Repeat the command when it is complete."
         )
-    temporary.replace(path)

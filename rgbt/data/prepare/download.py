@@ -48,8 +48,8 @@ class SourceFile:
     def chunks(self) -> Iterator[bytes]:
         """Its bytes in pieces; InputError if they cannot be read."""
         try:
-            opened = self.file.open("rb") if self.archive is None else self._member(self.archive)
-            with opened as stream:
+            is_plain = self.archive is None
+            with self.file.open("rb") if is_plain else self.archive.open(self.member) as stream:  # type: ignore[union-attr]
                 while chunk := stream.read(CHUNK):
                     yield chunk
         except BROKEN as error:
@@ -67,9 +67,6 @@ class SourceFile:
 
     def __str__(self) -> str:
         return str(self.file) if self.archive is None else f"{self.member} of {self.file}"
-
-    def _member(self, archive: zipfile.ZipFile) -> zipfile.ZipExtFile:
-        return archive.open(self.member)  # type: ignore[return-value]
 
 
 class SourceFiles:
@@ -97,17 +94,17 @@ class SourceFiles:
         self.path = path
         self.key = key
         self._opened = ExitStack()
-        found: dict[str, SourceFile] = {}
+        self._found: dict[str, SourceFile] = {}
         if path.is_dir():
-            self._add_folder(path, re.compile(archives, re.IGNORECASE), found)
+            self._add_folder(path, re.compile(archives, re.IGNORECASE))
         elif path.is_file():
-            self._add_archive(path, "", found)
+            self._add_archive(path, "")
         else:
             raise InputError(
                 f"{key}: there is no file or folder '{path}'; give the downloaded archive, or the "
                 "folder into which it was unpacked."
             )
-        self.entries = dict(sorted(found.items()))
+        self.entries = dict(sorted(self._found.items()))
 
     def __enter__(self) -> SourceFiles:
         return self
@@ -120,26 +117,32 @@ class SourceFiles:
         parents = {parent for path in self.entries for parent in PurePosixPath(path).parents}
         return frozenset("" if str(parent) == "." else str(parent) for parent in parents)
 
-    def _add_folder(
-        self, root: Path, archives: re.Pattern[str], found: dict[str, SourceFile]
-    ) -> None:
-        packed = []
-        try:
-            for file in _files(root):
-                relative = file.relative_to(root).as_posix()
-                found[relative] = SourceFile(relative, file.stat().st_size, file)
-                if archives.fullmatch(file.name):
-                    packed.append(file)
-        except OSError as error:
+    def _add_folder(self, root: Path, archives: re.Pattern[str]) -> None:
+        """Every file below `root`; links to folders are followed unless they lead back up."""
+
+        def stop(error: OSError) -> None:
             raise InputError(
                 f"{self.key}: {error.filename} cannot be listed ({error.strerror}); allow it, or "
                 "give another folder."
             ) from error
-        for file in packed:
-            inside = file.relative_to(root).parent.as_posix()
-            self._add_archive(file, "" if inside == "." else f"{inside}/", found)
 
-    def _add_archive(self, file: Path, parent: str, found: dict[str, SourceFile]) -> None:
+        packed = []
+        for folder, subfolders, names in os.walk(root, onerror=stop, followlinks=True):
+            here = Path(folder)
+            subfolders[:] = sorted(
+                name for name in subfolders if not (_is_hidden(name) or _leads_back(here / name))
+            )
+            files = [here / name for name in names if not _is_hidden(name)]
+            for file in (file for file in files if file.is_file()):
+                relative = file.relative_to(root).as_posix()
+                self._found[relative] = SourceFile(relative, file.stat().st_size, file)
+                if archives.fullmatch(file.name):
+                    packed.append(file)
+        for file in packed:
+            parent = file.relative_to(root).parent.as_posix()
+            self._add_archive(file, "" if parent == "." else f"{parent}/")
+
+    def _add_archive(self, file: Path, parent: str) -> None:
         """List an archive as if unpacked into a folder of its own name in `parent`."""
         try:
             archive = self._opened.enter_context(zipfile.ZipFile(file))
@@ -149,41 +152,23 @@ class SourceFiles:
                 f"{self.key}: {file} is not a complete zip archive ({error}); download it again, "
                 "or give the folder into which it was unpacked."
             ) from error
-        paths = {self._checked(member, file): member for member in members}
+        paths = {member.filename.replace("\\", "/"): member for member in members}
+        for path, member in paths.items():
+            if path.startswith("/") or ":" in path.partition("/")[0] or ".." in path.split("/"):
+                raise InputError(
+                    f"{self.key}: {file} holds '{member.filename}', which is outside the folder "
+                    "into which it is unpacked; this is not the original archive, download it "
+                    "again."
+                )
+            if member.flag_bits & ENCRYPTED:
+                raise InputError(f"{self.key}: {file} is encrypted; unpack it and give the folder.")
         tops = {path.partition("/")[0] for path in paths}
         own = parent if tops <= {file.stem} else f"{parent}{file.stem}/"
         for path, member in paths.items():
             is_link = stat.S_ISLNK(member.external_attr >> 16)
             if not (member.is_dir() or is_link or _is_hidden(path)):
                 entry = SourceFile(own + path, member.file_size, file, archive, member.filename)
-                found.setdefault(entry.path, entry)
-
-    def _checked(self, member: zipfile.ZipInfo, file: Path) -> str:
-        path = member.filename.replace("\\", "/")
-        if path.startswith("/") or ":" in path.partition("/")[0] or ".." in path.split("/"):
-            raise InputError(
-                f"{self.key}: {file} holds '{member.filename}', which is outside the folder into "
-                "which it is unpacked; this is not the original archive, download it again."
-            )
-        if member.flag_bits & ENCRYPTED:
-            raise InputError(f"{self.key}: {file} is encrypted; unpack it and give the folder.")
-        return path
-
-
-def _files(root: Path) -> Iterator[Path]:
-    """Every file below `root`; links to folders are followed unless they lead back up."""
-
-    def stop(error: OSError) -> None:
-        raise error
-
-    for folder, subfolders, names in os.walk(root, onerror=stop, followlinks=True):
-        here = Path(folder)
-        subfolders[:] = sorted(
-            name for name in subfolders if not (_is_hidden(name) or _leads_back(here / name))
-        )
-        for name in names:
-            if not _is_hidden(name) and (here / name).is_file():
-                yield here / name
+                self._found.setdefault(entry.path, entry)
 
 
 def _leads_back(path: Path) -> bool:

@@ -1,0 +1,193 @@
+"""The meaning of values in label files: each is a class, or ignored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+from annotated_types import Interval
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.files import read_array, read_colours, read_indices
+from rgbt.ranges import Colour
+from rgbt.types import IGNORE
+
+Array = NDArray[np.uint8]
+LabelValue = Annotated[int, Interval(ge=-(2**31), lt=2**31)]
+Colours = Mapping[str, Colour | tuple[Colour, ...]]
+
+
+@dataclass(frozen=True)
+class LabelCodes:
+    """Values of label files and the class of each.
+
+    Attributes:
+        codes: whole number -> class index, or 255; a colour is 65536 red + 256 green + blue.
+        key: of the configuration that names the values: "dataset.ids", "dataset.colours", or ""
+            where they are fixed.
+    """
+
+    codes: dict[int, int]
+    key: str = ""
+
+    @property
+    def of_colours(self) -> bool:
+        """Whether the files hold colours."""
+        return self.key == "dataset.colours"
+
+    def read(self, path: Path) -> Array:
+        """Class indices (H, W) uint8, 255 = ignored, of an image or a `.npy` file.
+
+        Raises:
+            InputError: it cannot be read, or holds a value without a class: which, and how often.
+        """
+        raw = self._raw(path)
+        if not self.key and raw.dtype != np.uint8 and path.suffix.lower() != ".npy":
+            raise InputError(f"{path}: expected 8 bits per channel, got {raw.dtype}.")
+        if raw.dtype == np.uint8:
+            classes = self._of_bytes[raw]
+        else:
+            known = np.array(sorted(self.codes), np.int64)
+            at = np.minimum(np.searchsorted(known, raw), len(known) - 1)
+            of_known = np.array([self.codes[code] for code in known.tolist()], np.int16)
+            classes = np.where(known[at] == raw, of_known[at], -1)
+        if classes.min(initial=0) < 0:
+            raise InputError(f"{path}: {self._unknown(raw[classes < 0])}")
+        return np.asarray(classes, np.uint8)
+
+    @cached_property
+    def _of_bytes(self) -> NDArray[np.int16]:
+        return np.array([self.codes.get(value, -1) for value in range(256)], np.int16)
+
+    def _raw(self, path: Path) -> NDArray[Any]:
+        if self.of_colours:
+            red, green, blue = np.moveaxis(read_colours(path).astype(np.int64), -1, 0)
+            return np.asarray(65536 * red + 256 * green + blue)
+        if path.suffix.lower() != ".npy":
+            return read_indices(path)
+        raw = read_array(path, "whole numbers of shape (rows, columns)")
+        if raw.dtype.kind not in "iu" or raw.ndim != 2:
+            raise InputError(
+                f"{path}: expected whole numbers of shape (rows, columns), got {raw.shape} "
+                f"{raw.dtype}; save class indices, or the values of dataset.ids."
+            )
+        return raw
+
+    def _unknown(self, unknown: NDArray[Any]) -> str:
+        values, counts = np.unique(unknown, return_counts=True)
+        code, count = int(values[counts.argmax()]), counts.max()
+        more = f", most frequent of {len(values)} unknown ones" if len(values) > 1 else ""
+        if not self.key:
+            listed = ", ".join(map(str, values[:8].tolist()))
+            last = max(set(self.codes) - {IGNORE})
+            return (
+                f"label value {listed} is out of range; expected 0 to {last}, or {IGNORE} to "
+                "ignore a pixel."
+            )
+        if self.of_colours:
+            colour = [code // 65536, code // 256 % 256, code % 256]
+            return (
+                f"colour {colour} ({count} pixels{more}) is neither in dataset.colours nor in "
+                "dataset.ignored; add it there, or save labels that were never resized."
+            )
+        return (
+            f"label value {code} ({count} pixels{more}) is neither in dataset.ids nor in "
+            f"dataset.ignored (known: {', '.join(map(str, sorted(self.codes)))}); add it there."
+        )
+
+
+def indices(num_classes: int, *ignored: int) -> LabelCodes:
+    """Values that are class indices; 255 and `ignored` do not count."""
+    codes = {value: value for value in range(num_classes)}
+    return LabelCodes({**codes, **dict.fromkeys((*ignored, IGNORE), IGNORE)})
+
+
+def read_label(path: Path, num_classes: int) -> Array:
+    """Class indices (H, W) uint8 below `num_classes`, or 255; errors as of `LabelCodes.read`."""
+    return indices(num_classes).read(path)
+
+
+def label_codes(
+    classes: tuple[str, ...],
+    ids: dict[int, str] | None,
+    colours: Colours | None,
+    ignored: tuple[int | Colour, ...],
+) -> LabelCodes:
+    """What the configuration says of label values, see `rgbt.data.folder.dataset.Folder`.
+
+    Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
+    it a class.
+
+    Raises:
+        InputError: both ids and colours, an unknown class, an invalid value or colour, or one
+            that occurs twice.
+    """
+    if ids is not None and colours is not None:
+        raise InputError(
+            "dataset.ids and dataset.colours: labels hold either numbers or colours; set one of "
+            "them to null."
+        )
+    key = "dataset.ids" if colours is None else "dataset.colours"
+    if colours is None:
+        words = dict(enumerate(classes)) if ids is None else ids
+        pairs: list[tuple[str, int | Colour]] = [(word, value) for value, word in words.items()]
+    else:
+        pairs = [(word, one) for word, given in colours.items() for one in each_colour(given)]
+    for word, _ in pairs:
+        if word not in classes:
+            raise InputError(f"{key}: '{word}' is no class; {nearest(word, classes)}.")
+    codes: dict[int, int] = {}
+    named = [(classes.index(word), value) for word, value in pairs]
+    for index, value in [*named, *((IGNORE, value) for value in ignored)]:
+        code = _code(value, of_colours=colours is not None)
+        if code in codes:
+            raise InputError(
+                f"{key}: {_plain(value)} occurs twice in the classes and dataset.ignored; every "
+                "value must have one meaning."
+            )
+        codes[code] = index
+    if colours is None:
+        codes.setdefault(IGNORE, IGNORE)
+    if not codes:
+        raise InputError("dataset.colours: expected the colour of every class, got none.")
+    return LabelCodes(codes, key)
+
+
+def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
+    """The colours of a class, which may be one or several."""
+    is_one = all(isinstance(each, int) for each in given)
+    return (cast(Colour, given),) if is_one else cast(tuple[Colour, ...], given)
+
+
+def _code(value: int | Colour, *, of_colours: bool) -> int:
+    if isinstance(value, int) == of_colours:
+        wanted = "a colour [red, green, blue]" if of_colours else "a whole number"
+        raise InputError(
+            f"dataset.ignored: expected {wanted}, as labels hold such, got {_plain(value)}."
+        )
+    if isinstance(value, int):
+        return value
+    red, green, blue = value
+    return 65536 * red + 256 * green + blue
+
+
+def _plain(value: int | Colour) -> str:
+    return str(value if isinstance(value, int) else list(value))
+
+
+def painted(num_classes: int) -> tuple[Colour, ...]:
+    """Colours that differ for up to 256 classes, the first of them black.
+
+    The bits of the index are dealt out to red, green and blue in turn, each from its highest bit
+    downwards: 0 black, 1 dark red, 2 dark green, 3 dark yellow, as in the masks of PASCAL VOC.
+    """
+
+    def level(number: int) -> int:
+        return sum((number >> 3 * place & 1) << 7 - place for place in range(3))
+
+    return tuple((level(i), level(i >> 1), level(i >> 2)) for i in range(num_classes))

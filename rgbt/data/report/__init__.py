@@ -1,1 +1,0 @@
-"""Checks of data sets and their report, which `rgbt.data.check` prints."""
