@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from rgbt.config.commands import COMMANDS
+from rgbt.config.plain_command import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 

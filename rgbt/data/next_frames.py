@@ -55,7 +55,7 @@ class NextFrames:
             num_classes=first.num_classes,
             classes=first.classes,
             palette=first.palette,
-            splits=first.splits,
+            splits=dict(first.splits),
             layout=first.layout,
         )
 

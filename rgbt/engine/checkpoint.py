@@ -95,7 +95,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     advice = "copy it again from where it is whole, or train the run again in another runs_dir=..."
     with explained(path, "a checkpoint", advice):
         value, container = read_stored(path)
-        payload = plain(value, path.stat().st_size) if container == ZIP else None
+        payload = plain(value, path.stat().st_size) if container == ZIP else {}
     weights = payload.get("model") if isinstance(payload, dict) else None
     if not isinstance(weights, dict) or not all(
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()

@@ -413,8 +413,10 @@ def test_freiburg_frames_are_cut_scenes(folder: Path) -> None:
 
 def test_freiburg_archive_peculiarities_are_reproduced(folder: Path) -> None:
     data = EMBEDDED["synth_freiburg"].made(folder)
-    frames = data.frames
-    labels = {frame.part: frame.label for frame in frames if frame.label is not None}
+    splits = ("train_day", "train_night", "val", "test")
+    frames = [data.frame(name) for split in splits for name in data.names(split)]
+    paths = [frame.label for frame in frames if frame.label is not None]
+    labels = {path.parent.parent.relative_to(data.root).as_posix(): path for path in paths}
     sizes = {
         part: cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape
         for part, path in labels.items()
@@ -424,7 +426,7 @@ def test_freiburg_archive_peculiarities_are_reproduced(folder: Path) -> None:
     assert sizes["train/seq_00_day/00"] == (98, 288)
     folders = {path.name for path in (data.root / "test").glob("*/Images*")}
     assert folders == {"ImagesRGB", "ImagesIR", "ImagesRgb", "ImagesIr"}
-    shorter = [f.thermal.stem.removesuffix("_ir") != f.stamp for f in frames if f.is_test]
+    shorter = [f.thermal.stem.removesuffix("_ir") != f.values["stamp"] for f in frames[-5:]]
     assert shorter == [True] * 3 + [False] * 2
     counts = cv2.imread(str(frames[0].thermal), cv2.IMREAD_UNCHANGED)
     assert counts.dtype == np.uint16
