@@ -96,14 +96,15 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     with explained(path, "a checkpoint", advice):
         value, container = read_stored(path)
         payload = plain(value, path.stat().st_size) if container == ZIP else None
-    weights = payload.get("model") if isinstance(payload, dict) else None
+    loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
+    weights = loaded.get("model")
     if not isinstance(weights, dict) or not all(
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
     ):
         raise InputError(
             f"{path} holds no weights under 'model'; give a checkpoint written by rgbt.run."
         )
-    return payload
+    return loaded
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
