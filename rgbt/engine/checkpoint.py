@@ -95,15 +95,16 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     advice = "copy it again from where it is whole, or train the run again in another runs_dir=..."
     with explained(path, "a checkpoint", advice):
         value, container = read_stored(path)
-        payload = plain(value, path.stat().st_size) if container == ZIP else {}
-    weights = payload.get("model") if isinstance(payload, dict) else None
+        payload = plain(value, path.stat().st_size) if container == ZIP else None
+    loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
+    weights = loaded.get("model")
     if not isinstance(weights, dict) or not all(
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
     ):
         raise InputError(
             f"{path} holds no weights under 'model'; give a checkpoint written by rgbt.run."
         )
-    return payload
+    return loaded
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
