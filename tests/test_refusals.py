@@ -284,7 +284,7 @@ OF_A_RUN = {
             ("input=val pseudo_labels=true threshold=2", "threshold must lie in [0, 1], got 2"),
             ("input=pictures pseudo_labels=true", "name one of"),
             ("input=val pseudo_labels=true label_map=x", "there is no label_map 'x'"),
-            ("input=val pseudo_labels=true head=target", "head=target chooses between the heads"),
+            ("input=val head=target", "head=target chooses between the heads"),
         ],
     ),
     consistency.entry: (
