@@ -83,7 +83,7 @@ def run_entry(row: int, seed: int, table: str = "spatialseg/table3", label: str 
         commit=["44fd6f73f3070b382b58382b53cbf41db941fbd8+", "c3870df37d" * 4][row % 2],
         started=f"2026-11-{21 - row // 8:02d}T{23 - row:02d}:{10 + seed}:01+00:00",
         seconds=184.3 + 20 * seed,
-        command=f"/work/main/.venv/bin/python -m rgbt.run scale=demo runs_dir=/tmp/t3 "
+        command=f"/home/user/rgbt/.venv/bin/python -m rgbt.run scale=demo runs_dir=/tmp/t3 "
         f"+experiment={experiment}{override} seed={seed}",
         repeat=f"git checkout 44fd6f73f3 && {repeat}",
         host="lab-2 (2 CPU cores, Intel Xeon 2.60 GHz)",
