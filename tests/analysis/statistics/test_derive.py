@@ -10,7 +10,7 @@ from analysis.statistics.collect import MeasurementSettings, collect
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
 from rgbt.types import Sample
-from tests.analysis.statistics.scenes import InMemory, made
+from tests.analysis.statistics.scenes import InMemory, made, random_sample
 
 HW = (60, 80)
 RINGS = Regions(partition="ring", regions=4, aspect="image", absent="released")
@@ -120,3 +120,15 @@ def test_laplacian_is_the_mean_over_images() -> None:
 def test_unknown_words_are_refused(call, message: str) -> None:
     with pytest.raises(InputError, match=message):
         call(made())
+
+
+def test_noise_of_zero_is_no_division_by_zero() -> None:
+    stats = made(images=2, noise=np.zeros((2, 2, 3)))
+    np.testing.assert_allclose(derive.region_snr(stats, "rgb"), 100 / derive.EPSILON)
+
+
+def test_a_part_without_images_is_refused() -> None:
+    dataset = InMemory([random_sample("1D", (24, 32), np.random.default_rng(0))])
+    stats = collect(dataset, "train", MeasurementSettings(regions=RINGS))
+    with pytest.raises(InputError, match="part=night: split 'train' of memory holds no such image"):
+        derive.region_occupancy(stats, "night")

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from analysis.statistics.measure import (
+    ESTIMATORS,
     HAAR_BINS,
+    MEDIAN_OF_NORMAL,
     ImageMeter,
     RegionSums,
     grouped_median,
@@ -129,3 +131,32 @@ def test_largest_values_do_not_overflow() -> None:
     image = (np.indices((300, 300)).sum(0) % 2 * 255).astype(np.uint8)
     found = ImageMeter(np.zeros((300, 300), np.uint8), 9, "four").measure(image)
     assert found[0][0] == pytest.approx(1020.0**2)
+
+
+def test_noise_of_a_straight_edge_and_of_nothing() -> None:
+    image = np.full((40, 40), 50, np.uint8)
+    image[:, 20:] = 200
+    found = ImageMeter(np.zeros((40, 40), np.uint8), 9).measure(image)
+    assert found[IMMERKAER][0] == 0
+    # All magnitudes are 0: the median lies in the middle of [0, 0.5).
+    assert found[MAD][0] == pytest.approx(0.25 / 2 / MEDIAN_OF_NORMAL)
+    assert found[STD][0] == pytest.approx(75)
+
+
+def test_labels_are_counted_by_region() -> None:
+    region_map = regions_map("ring", 3, (24, 32))
+    sample = random_sample("a", (24, 32), np.random.default_rng(3))
+    labels, ignored = ImageMeter(region_map, 9).count_labels(sample.label)
+    for r in range(3):
+        inside = sample.label[region_map == r]
+        assert labels[r].tolist() == [int((inside == k).sum()) for k in range(9)]
+        assert ignored[r] == (inside == 255).sum()
+
+
+def test_a_region_without_a_window_has_no_noise() -> None:
+    region_map = np.zeros((4, 4), np.uint8)
+    region_map[3, 3] = 1  # neither inside the border nor the first pixel of a block
+    found = ImageMeter(region_map, 9).measure(np.zeros((4, 4), np.uint8))
+    assert np.isnan(found[IMMERKAER][1])
+    assert np.isnan(found[MAD][1])
+    assert len(found) == 2 + len(ESTIMATORS)
