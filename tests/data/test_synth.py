@@ -404,7 +404,7 @@ def test_synth_returns_a_reader_of_its_folder(tmp_path: Path) -> None:
     scene = render_scene(0, 3, replace(FACTORS, height=48, width=64))
     assert np.array_equal(sample.rgb, scene.rgb)
     assert np.array_equal(sample.label, scene.label)
-    assert data.is_night(data.names("val")[0]) == scene.is_night
+    assert data.nights(data.names("val")[:1]) == (scene.is_night,)
 
 
 def test_the_cache_lies_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
