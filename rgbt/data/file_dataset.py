@@ -97,7 +97,7 @@ class FileDataset:
         return Record(num_classes=self.num_classes)
 
     @property
-    def splits(self) -> Mapping[str, str]:
+    def splits(self) -> dict[str, str]:
         """Split -> its list, or the pattern of its files."""
         return self.rule.splits
 
