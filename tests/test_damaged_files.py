@@ -483,7 +483,7 @@ def read_flow(path: Path) -> Any:
         classes=("a", "b"),
         palette=((0, 0, 0), (1, 1, 1)),
     )
-    return plain(NextFrames(first)._flow("a", (10, 12)))
+    return plain(NextFrames(first).source("a", (10, 12)))
 
 
 KINDS = {
