@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
 import socket
 import sys
 import urllib.request
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -16,9 +18,6 @@ from rgbt.tracking.provenance import without_passwords
 
 HOST = "127.0.0.1"
 DEFAULT_PORT = 5000
-NUM_PORTS = 20
-"""Ports from MLflow's default on at which a server is looked for and proposed."""
-
 ANSWER_S = 1.0
 """Seconds that a server on this machine gets to answer."""
 
@@ -45,11 +44,12 @@ def pages_of(uri: str, run_id: str) -> Pages:
     """
     if uri.startswith(("http://", "https://")):
         return Pages(without_passwords(uri.rstrip("/")), None)
-    taken = [port for port in _ports() if _is_taken(port)]
-    for address in (f"http://{HOST}:{port}" for port in taken):
+    # The MLflow servers of this machine, read from the running commands (Linux).
+    for port in sorted({_port_of(words) for words in _commands() if _is_server(words)}):
+        address = f"http://{HOST}:{port}"
         if _shows(address, run_id):
             return Pages(address, None)
-    port = next((port for port in _ports() if port not in taken), DEFAULT_PORT)
+    port = _free_port()
     return Pages(f"http://{HOST}:{port}", ui_command(uri, port))
 
 
@@ -60,8 +60,7 @@ def ui_command(uri: str, port: int | None = None) -> str:
         uri: sqlite:///... or postgresql://...; its password is hidden.
         port: None: the first free one from 5000 on, which is MLflow's default.
     """
-    if port is None:
-        port = next((port for port in _ports() if not _is_taken(port)), DEFAULT_PORT)
+    port = _free_port() if port is None else port
     words = ["mlflow", "ui", "--workers", "1", "--backend-store-uri", without_passwords(uri)]
     words += [] if port == DEFAULT_PORT else ["--port", str(port)]
     return f"{python_command()} -m {shlex.join(words)}"
@@ -76,18 +75,27 @@ def python_command() -> str:
     return shlex.quote(str(program))
 
 
-def _ports() -> range:
-    return range(DEFAULT_PORT, DEFAULT_PORT + NUM_PORTS)
+def _commands() -> Iterator[list[str]]:
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            yield path.read_bytes().decode(errors="replace").split("\0")
+        except OSError:
+            continue  # the process has ended
 
 
-def _is_taken(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(ANSWER_S)
-        return probe.connect_ex((HOST, port)) == 0
+def _is_server(words: list[str]) -> bool:
+    return any("mlflow" in word for word in words) and any(
+        word in ("ui", "server") or word.startswith("mlflow.server") for word in words
+    )
+
+
+def _port_of(words: list[str]) -> int:
+    found = re.search(r"\0(?:--port|-p)[=\0](\d{1,5})\0", "\0".join(["", *words, ""]))
+    return int(found.group(1)) if found else DEFAULT_PORT
 
 
 def _shows(address: str, run_id: str) -> bool:
-    """Whether an MLflow server at `address` knows the run."""
+    """Whether the server at `address` knows the run."""
     # Never through a proxy: the server is on this machine.
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     query = f"{address}/api/2.0/mlflow/runs/get?run_id={run_id}"
@@ -96,3 +104,13 @@ def _shows(address: str, run_id: str) -> bool:
             return bool(json.load(answer)["run"]["info"]["run_id"] == run_id)
     except (OSError, HTTPException, ValueError, KeyError, TypeError):
         return False  # no server, another store, or something else that listens there
+
+
+def _free_port() -> int:
+    """The first port from MLflow's default on that nobody listens at."""
+    for port in range(DEFAULT_PORT, DEFAULT_PORT + 20):
+        with socket.socket() as probe:
+            probe.settimeout(ANSWER_S)
+            if probe.connect_ex((HOST, port)) != 0:
+                return port
+    return DEFAULT_PORT

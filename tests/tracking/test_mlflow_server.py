@@ -31,40 +31,67 @@ class Answer(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """Port of a server, the first at which one is looked for."""
+def server() -> Iterator[int]:
+    """Port of a server."""
     with HTTPServer(("127.0.0.1", 0), Answer) as found:
         threading.Thread(target=found.serve_forever, daemon=True).start()
-        monkeypatch.setattr(mlflow_server, "DEFAULT_PORT", found.server_port)
         yield found.server_port
         found.shutdown()
 
 
-def test_pages_of_a_server_that_runs_need_no_command(server: int) -> None:
+def runs(monkeypatch: pytest.MonkeyPatch, *commands: str) -> None:
+    """Let these be the commands that run on this machine."""
+    monkeypatch.setattr(mlflow_server, "_commands", lambda: [each.split() for each in commands])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "python -m mlflow ui --port {}",
+        "/usr/bin/mlflow server --port={} --workers 1",
+        "mlflow ui -p {}",
+        "python -m uvicorn --host 127.0.0.1 --port {} mlflow.server.fastapi_app:app",
+    ],
+)
+def test_pages_of_a_server_that_runs_need_no_command(
+    monkeypatch: pytest.MonkeyPatch, server: int, command: str
+) -> None:
+    runs(monkeypatch, "bash -c sleep", command.format(server))
     assert pages_of(STORE, "mine") == Pages(f"http://127.0.0.1:{server}", None)
 
 
-def test_pages_of_another_store_are_not_linked(server: int) -> None:
-    found = pages_of(STORE, "other")
-    port = int(found.address.rpartition(":")[2])
-    assert port != server
-    assert found.command is not None
-    assert found.command.endswith(f"--port {port}")
-    assert ui_command(STORE).endswith(f"--port {port}")
-
-
-def test_pages_behind_something_that_speaks_no_http_are_not_linked(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("command", ["python -m mlflow ui --port {}", "python -m http.server {}"])
+def test_a_server_of_another_store_or_program_is_not_linked(
+    monkeypatch: pytest.MonkeyPatch, server: int, command: str
 ) -> None:
+    runs(monkeypatch, command.format(server))
+    found = pages_of(STORE, "other")
+    assert found.command is not None
+    assert found.address != f"http://127.0.0.1:{server}"
+
+
+def test_a_port_that_is_taken_is_not_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        monkeypatch.setattr(mlflow_server, "DEFAULT_PORT", other.getsockname()[1])
-        monkeypatch.setattr(mlflow_server, "ANSWER_S", 0.1)
-        assert pages_of(STORE, "mine").command is not None
+        taken = other.getsockname()[1]
+        monkeypatch.setattr(mlflow_server, "DEFAULT_PORT", taken)
+        runs(monkeypatch)
+        found = pages_of(STORE, "mine")
+    port = int(found.address.rpartition(":")[2])
+    assert port != taken
+    assert found.command is not None
+    assert found.command.endswith(f"--port {port}")
 
 
-def test_address_and_command_hide_passwords_and_quote_paths() -> None:
+def test_the_address_of_a_server_is_shown_without_its_password() -> None:
     assert pages_of("http://me:secret@host:5000/", "x") == Pages("http://me:***@host:5000", None)
+
+
+def test_the_command_quotes_paths_and_hides_passwords() -> None:
     assert "'sqlite:////data/my runs/mlflow.db'" in ui_command(STORE, 5000)
     assert "secret" not in ui_command("postgresql://me:secret@host/db", 5000)
+
+
+def test_the_running_commands_are_read() -> None:
+    assert any("pytest" in word for words in mlflow_server._commands() for word in words)

@@ -15,10 +15,11 @@ from mlflow import MlflowClient
 
 from rgbt.metrics.counts import Counts
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.run_files import Description, counts_name
+from rgbt.tracking.run_files import Description, counts_name, read_result
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from sweeps.attributes import DROPPED, KEY, OWNER, REASON, RUNS
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import load_study, open_storage, study_names
 from tests.commands import SMALL, short
 from tests.sweeps.servers import mlflow_server, new_database, postgres
@@ -123,6 +124,32 @@ def test_four_processes_open_a_fresh_database_at_once(database: str, tmp_path: P
     assert {trial.state.name for trial in trials} == {"COMPLETE"}
     by = [trial.user_attrs["by"] for trial in trials]
     assert {name: by.count(name) for name in names} == dict.fromkeys(names, TRIALS)
+
+
+def test_run_of_one_machine_is_found_on_another(servers: Servers, tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+
+    def tracking(runs_dir: Path) -> MlflowTracking:
+        return MlflowTracking(
+            servers.mlflow, artifact_uri=None, experiment="rgbt", runs_dir=str(runs_dir)
+        )
+
+    folder, tracker = RunFolder(here / "0123456789ab"), tracking(here)
+    tracker.start(folder, Description("grbm seed=0", {"rgbt.key": "0123456789ab"}, {"seed": "0"}))
+    counts = finished(folder, dataset="feed")
+    tracker.finish("FINISHED")
+    _, this_run = tracker.links()[0]
+    assert this_run.startswith(servers.mlflow)
+    assert list(servers.artifacts.rglob("counts_test.npz")), "files go through the server"
+
+    runs = RunStore(there, tracking(there))
+    assert runs.find("0123456789ab", "other data") is None
+    found = runs.find("0123456789ab", "feed")
+    assert found is not None
+    assert found.result == read_result(folder.path)
+    assert found.scores() == {"test/mIoU": 40.0, "test/Var": 156.25}
+    np.testing.assert_array_equal(found.counts().counts, counts.counts)
+    assert found.commit == "0123456789"
 
 
 def test_no_password_is_written_into_a_run(servers: Servers, tmp_path: Path) -> None:
