@@ -216,6 +216,12 @@ def test_second_frames_form_data_set(tmp_path: Path) -> None:
     assert (tmp_path / "next/test.txt").read_text() == (tmp_path / "test.txt").read_text()
 
 
+def test_one_test_scene_has_no_list_of_the_other_time(tmp_path: Path) -> None:
+    data = dataset.synth(cache_dir=str(tmp_path), num_train=2, num_val=1, num_test=1)
+    assert sum(data.has(f"test_{time}") for time in ("day", "night")) == 1
+    assert data.fingerprint()
+
+
 def test_interrupted_generation_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

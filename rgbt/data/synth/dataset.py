@@ -91,13 +91,12 @@ def _images(scene: Scene, shot: Shot) -> Images:
 
 
 def _lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
-    lists: dict[str, list[str]] = {
-        f"{split}.txt": [] for split in ("train", "val", "test", "test_day", "test_night")
-    }
+    lists: dict[str, list[str]] = {}
     for shot in shots:
-        lists[f"{shot.split}.txt"].append(shot.name)
+        lists.setdefault(f"{shot.split}.txt", []).append(shot.name)
         if shot.split == "test":
-            lists[f"test_{'night' if shot.night else 'day'}.txt"].append(shot.name)
+            time = "night" if shot.night else "day"
+            lists.setdefault(f"test_{time}.txt", []).append(shot.name)
     return lists
 
 
