@@ -308,13 +308,8 @@ def assert_equal(one: Any, other: Any) -> None:
         assert one == other
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("two heads", "heatnet")),
-        "one head",
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["two heads", "heatnet", "one head"])
 def test_stopped_in_the_critics_phase_and_continued(
     run: Runs,
     elsewhere: Callable[[str], Runs],

@@ -36,6 +36,7 @@ def pretend(folder: Path, **changes: Any) -> None:
     (folder / "provenance.json").write_text(json.dumps([{**first, **changes}, *others]))
 
 
+@pytest.mark.slow
 def test_fresh_trains_again_what_other_code_made_and_keeps_it(
     call: Call, data: Path, runs: Path
 ) -> None:

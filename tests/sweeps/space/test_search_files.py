@@ -47,7 +47,9 @@ def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None
     build_pruner(settings.pruner, len(settings.objectives))
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == "grbm" else pytest.mark.slow) for n in FILES]
+)
 def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
     known = flatten(compose(f"+search={name}"))
     parameters = parse_space(space_of(name))
