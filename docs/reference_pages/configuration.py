@@ -1,0 +1,226 @@
+"""Pages of the configuration: every group with its files, keys, types, defaults and source."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from reference_pages.docstrings import description, parameters
+from reference_pages.guides import guides, link
+from reference_pages.markdown import block, code, page, table
+from rgbt.config.component import RUN_SETTINGS, constructor, setting_types
+from rgbt.config.compose import conf_dir
+from rgbt.config.values import expected
+
+OWN_PAGES = ("experiment",)
+"""Groups that have a page of another form (`reference_pages.experiments`)."""
+
+
+class ConfigFile(NamedTuple):
+    """One file of conf/.
+
+    Attributes:
+        name: as it is chosen on the command line.
+        path: from the root of the repository.
+        text: of the file.
+        about: its first comment, in one line.
+    """
+
+    name: str
+    path: str
+    text: str
+    about: str
+
+
+def groups() -> list[str]:
+    """Every folder of conf/ with files, nested ones with a slash: "model/inputs"."""
+    root = Path(conf_dir())
+    folders = {path.parent.relative_to(root).as_posix() for path in root.rglob("*.yaml")}
+    return sorted(folders - {"."})
+
+
+def files_of(group: str) -> list[ConfigFile]:
+    """The files of a group, by name."""
+    paths = sorted((Path(conf_dir()) / group).glob("*.yaml"))
+    return [_file(path, f"conf/{group}/{path.name}") for path in paths]
+
+
+def _file(path: Path, shown: str) -> ConfigFile:
+    text = path.read_text()
+    return ConfigFile(path.stem, shown, text, " ".join(header(text).split()))
+
+
+def header(text: str) -> str:
+    """The comment at the top of a file, without marks; a line of Hydra's (@package) is left out."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @"):
+            lines.append(line.removeprefix("#").removeprefix(" "))
+    return "\n".join(lines)
+
+
+END = re.compile(r"(?<!\bSec)(?<!\bEq)(?<!\bEqs)(?<!\bFig)(?<!\bNo)(?<!\be\.g)(?<!\bi\.e)[.:] ")
+"""The end of a sentence, and not of an abbreviation."""
+
+
+def first_sentence(text: str) -> str:
+    """Up to the first full stop or colon that ends a sentence."""
+    return END.split(f"{text} ", maxsplit=1)[0].strip()
+
+
+def page_name(group: str) -> str:
+    """Path of the page of a group in the site, from docs/."""
+    if group in OWN_PAGES:
+        return f"reference/{group}s.md"
+    return f"reference/configuration/{group.replace('/', '-')}.md"
+
+
+def pages() -> dict[str, str]:
+    """Text of the pages of the configuration, by path in docs/."""
+    own = [group for group in groups() if group not in OWN_PAGES]
+    return {
+        "reference/configuration/index.md": index_page(),
+        **{page_name(group): group_page(group) for group in own},
+    }
+
+
+def group_page_paths() -> list[str]:
+    """Paths of the pages of the groups, for the navigation."""
+    return [page_name(group) for group in groups() if group not in OWN_PAGES]
+
+
+def index_page() -> str:
+    """All groups, and the default configuration."""
+    chosen = _defaults()
+    rows = [
+        [
+            f"[`{group}`]({_from_configuration(group)})",
+            guides("groups")[group].about if group in guides("groups") else "",
+            code(chosen.get(group, "")),
+            link("groups", group, 2),
+        ]
+        for group in groups()
+    ]
+    base = (Path(conf_dir()) / "config.yaml").read_text()
+    return page(
+        "# Configuration",
+        "A run is composed of one file of each group. `GROUP=FILE` on the command line chooses "
+        "another file, `KEY=VALUE` sets one key, and `+experiment=NAME` adds a method as published. "
+        "`rgbt run ... --cfg job` prints the whole configuration of a command.",
+        table(["Group", "What it sets", "Default", "Guide"], rows),
+        "## Default configuration",
+        "The keys of a run that belong to no group, and the file of each group that is used by "
+        "default.",
+        block(base, "yaml", "conf/config.yaml"),
+    )
+
+
+def _from_configuration(group: str) -> str:
+    return page_name(group).removeprefix("reference/configuration/").replace("reference/", "../")
+
+
+def _defaults() -> dict[str, str]:
+    entries = yaml.safe_load((Path(conf_dir()) / "config.yaml").read_text())["defaults"]
+    return {
+        key: value
+        for entry in entries
+        if isinstance(entry, dict)
+        for key, value in entry.items()
+        if not key.startswith("override ")
+    }
+
+
+def group_page(group: str) -> str:
+    """One group: its files, the settings of the classes that they configure, and their text."""
+    files = files_of(group)
+    default = _defaults().get(group)
+    choose = f"Choose a file with `{group}=NAME`"
+    return page(
+        f"# `{group}`",
+        guides("groups")[group].about if group in guides("groups") else "",
+        f"{choose}; the default is `{default}`." if default else f"{choose}.",
+        "The column *Default* shows the value of the default file, or of the file in brackets.",
+        f"Guide: {link('groups', group, 2)}" if link("groups", group, 2) else "",
+        table(
+            ["File", "What it is"],
+            [[f"[`{each.name}`](#{each.name})", first_sentence(each.about)] for each in files],
+        ),
+        "## Settings",
+        *_settings(group, files),
+        "## Files",
+        *(part for each in files for part in (f"### {each.name}", _source(each))),
+    )
+
+
+def _source(file: ConfigFile) -> str:
+    return block(file.text, "yaml", file.path)
+
+
+def _settings(group: str, files: list[ConfigFile]) -> Iterator[str]:
+    found: dict[str, dict[str, str]] = {}  # target -> key -> the value of the file that sets it
+    default = _defaults().get(group)
+    for each in sorted(files, key=lambda file: file.name != default):
+        for target, values in _targets(yaml.safe_load(each.text)):
+            entry = found.setdefault(target, {})
+            for key, value in values.items():
+                shown = code(_shown(value))
+                entry.setdefault(key, shown if each.name == default else f"{shown} ({each.name})")
+    if not found:
+        yield "These files set keys of other groups. The comments say what each key means."
+    for target, values in found.items():
+        made = constructor(target, group)
+        yield f"### {target.rpartition('.')[2]}"
+        yield code(target)
+        yield description(made)
+        yield _keys(made, values)
+    if group in RUN_SETTINGS:
+        yield "### Settings of the run"
+        yield "The run itself reads these keys; the constructor does not take them."
+        kinds = RUN_SETTINGS[group].items()
+        yield table(["Key", "Type and range"], [[code(key), kind_of(kind)] for key, kind in kinds])
+
+
+def _targets(node: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every `_target_` in a file, with the values that are set beside it."""
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield node["_target_"], {str(key): value for key, value in node.items() if key != "_target_"}
+        for value in node.values():
+            yield from _targets(value)
+    elif isinstance(node, list):
+        for value in node:
+            yield from _targets(value)
+
+
+def _keys(made: Any, values: dict[str, str]) -> str:
+    """Table of the settings of a constructor; objects that the run provides are left out."""
+    documented = parameters(made)
+    signature = inspect.signature(made).parameters
+    rows = []
+    for name, kind in setting_types(made).items():
+        parameter = signature.get(name)
+        if parameter is None or (name not in values and parameter.default is parameter.empty):
+            continue
+        value = values.get(name) or f"{code(_shown(parameter.default))} (class)"
+        rows.append([code(name), kind_of(kind), value, documented.get(name, "")])
+    return table(["Key", "Type and range", "Default", "Meaning"], rows)
+
+
+def kind_of(annotation: Any) -> str:
+    """What an annotation takes, for a cell of a table: "number from 0 to 1, or null"."""
+    return expected(annotation).removeprefix("a ")
+
+
+def _shown(value: Any) -> str:
+    """A value as YAML in one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=10**6, sort_keys=False)
+    shown = text.removesuffix("...\n").strip()
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."
