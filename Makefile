@@ -3,6 +3,7 @@
 # make test-all   the slow tests as well
 # make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
 # make lint       formatting, lint, types
+# make docs       the site, into site/index.html; fails on a broken link
 # make bench      benchmarks, as ratios measured in one run
 
 PYTHON ?= python3
@@ -14,7 +15,7 @@ BIN := $(VENV)/bin
 # `make test SPREAD=` runs one after the other.
 SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo test test-all test-servers lint bench
+.PHONY: demo test test-all test-servers lint docs bench
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
@@ -37,10 +38,18 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: $(VENV)/.docs
+	$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site/index.html is the site"
+
 bench: $(VENV)/.ready
 	for file in tests/benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m tests.benchmarks.$$(basename $$file .py) || exit 1; done
 
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@
+
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@

@@ -68,7 +68,9 @@ def _command(command: PlainCommand[Any], usage: str) -> Iterator[str]:
 
 def _required(command: PlainCommand[Any]) -> list[str]:
     fields: Any = dataclasses.fields(command.options)
-    return [f"{each.name}=..." for each in fields if _is_required(each) and each.name != command.first]
+    return [
+        f"{each.name}=..." for each in fields if _is_required(each) and each.name != command.first
+    ]
 
 
 def _is_required(field: Any) -> bool:

@@ -112,7 +112,7 @@ def index_page() -> str:
     return page(
         "# Configuration",
         "A run is composed of one file of each group. `GROUP=FILE` on the command line chooses "
-        "another file, `KEY=VALUE` sets one key, and `+experiment=NAME` adds a method as published. "
+        "another file, `KEY=VALUE` sets one key, and `+experiment=NAME` adds a published method. "
         "`rgbt run ... --cfg job` prints the whole configuration of a command.",
         table(["Group", "What it sets", "Default", "Guide"], rows),
         "## Default configuration",
@@ -191,7 +191,10 @@ def _targets(node: Any) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every `_target_` in a file, with the values that are set beside it."""
     if isinstance(node, dict):
         if "_target_" in node:
-            yield node["_target_"], {str(key): value for key, value in node.items() if key != "_target_"}
+            yield (
+                node["_target_"],
+                {str(key): value for key, value in node.items() if key != "_target_"},
+            )
         for value in node.values():
             yield from _targets(value)
     elif isinstance(node, list):

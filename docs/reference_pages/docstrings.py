@@ -46,4 +46,5 @@ def parameters(target: Any) -> dict[str, str]:
 
 def _sections(target: Any) -> list[Any]:
     text = target.__doc__ if inspect.isclass(target) else inspect.getdoc(target)
-    return griffe.Docstring(inspect.cleandoc(text or ""), parser="google").parse(warnings=False)
+    docstring = griffe.Docstring(inspect.cleandoc(text or ""), parser="google")
+    return list(docstring.parse(warnings=False))

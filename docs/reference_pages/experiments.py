@@ -16,12 +16,16 @@ def experiments_page() -> str:
     """Every file of conf/experiment/ with its header and its text."""
     files = files_of("experiment")
     rows = [
-        [f"[`{each.name}`](#{each.name})", first_sentence(each.about), link("experiments", each.name, 1)]
+        [
+            f"[`{each.name}`](#{each.name})",
+            first_sentence(each.about),
+            link("experiments", each.name, 1),
+        ]
         for each in files
     ]
     return page(
         "# Experiments",
-        "An experiment is a method as published: a file that chooses the other groups. Add one with "
+        "An experiment is a method as published: a file that chooses other groups. Add it with "
         "`rgbt run +experiment=NAME`. *Expect* gives the printed value at `scale=paper`; at the "
         "default `scale=demo` the values are other ones, see [Results](../results/index.md).",
         table(["Experiment", "What it is", "Guide"], rows),

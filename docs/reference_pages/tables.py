@@ -24,14 +24,12 @@ def tables_page() -> str:
         for name, anchor, spec in zip(names, anchors, specs, strict=True)
     ]
     sections = [
-        part
-        for name, spec in zip(names, specs, strict=True)
-        for part in _section(name, spec)
+        part for name, spec in zip(names, specs, strict=True) for part in _section(name, spec)
     ]
     return page(
         "# Published tables",
-        "Each results table of the four papers is a file. `rgbt reproduce table=NAME` runs the rows "
-        "that can be run and prints them beside the published values. Values measured here are on "
+        "Each results table of the four papers is a file. `rgbt reproduce table=NAME` runs its "
+        "rows, where they can be run, and prints them beside the published values. Values measured here are on "
         "the pages of [Results](../results/index.md).",
         table(["Table", "Caption", "Rows that can be run"], rows),
         *sections,
