@@ -88,7 +88,10 @@ def open_counts(
     _check_trainings_differ(text, found)
     labels = dict.fromkeys(each.label for each in found)
     if len(labels) > 1:
-        info(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
+        info(
+            f"{' and '.join(labels)} are treated as seeds of one method, because they "
+            "were listed together."
+        )
     return tuple(found)
 
 
@@ -101,7 +104,8 @@ def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in settings beside their overrides); name the runs."
+                f"{second.key}, which differ in settings other than their overrides); name the "
+                "runs."
             )
         is_one = first.label == second.label or not (first.run and second.run)
         if is_one and np.array_equal(first.counts.counts, second.counts.counts):
@@ -137,8 +141,8 @@ def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCo
         groups = groups_in(runs_dir)
         known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
         raise InputError(
-            f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
-            f"counts (.npz){known}."
+            f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
+            f"of counts (.npz){known}."
         ) from error
     return [_of_run(RunResult(folder), split, frames)]
 
@@ -155,12 +159,12 @@ def _of_scores(folder: Path) -> NamedCounts:
     files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
     if not files:
         raise InputError(
-            f"{folder} holds neither a run (config.yaml) nor counts (counts_*.npz); label images "
-            "of a method are counted with: rgbt score predictions=... dataset=..."
+            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
+            "label images of a method: rgbt score predictions=... dataset=..."
         )
     if len(files) > 1:
         raise InputError(
-            f"{folder} holds {', '.join(file.name for file in files)}; name one of these files."
+            f"{folder} contains {', '.join(file.name for file in files)}; name one of these files."
         )
     return _of_file(files[0])
 

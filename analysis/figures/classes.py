@@ -91,7 +91,7 @@ def class_regions(
             counts = counts.select(name for name, dark in at_night if dark == (part == NIGHT))
             if not counts.names:
                 raise InputError(
-                    f"part={part}: the counts of '{label}' hold no image of the {part}."
+                    f"part={part}: the counts of '{label}' contain no image of the {part}."
                 )
         scores = 100 * miou(counts.by_region(), absent, counts.scored)
     return ClassRegions(

@@ -142,16 +142,16 @@ class FigureInput:
         for key in keys:
             if key in self.values or key in words:
                 raise InputError(
-                    f"'{key}' has no effect on figure={self.figure} without {without}; leave it "
-                    "out, or give that too."
+                    f"'{key}' has no effect on figure={self.figure} without {without}; omit it, "
+                    "or give both."
                 )
 
     def check_split(self, stored: str, source: object) -> None:
         """Refuse a ``split=`` that is not the `stored` one of an opened file, `source`."""
         if self.get("split", stored) != stored:
             raise InputError(
-                f"split={self.values['split']}: {source} is of split '{stored}' already; leave "
-                "split= out, or give a file of that split."
+                f"split={self.values['split']}: {source} has split '{stored}'; omit split=, "
+                "or give a file of that split."
             )
 
     def maps(self) -> PixelMaps:
@@ -241,7 +241,8 @@ class FigureInput:
             if place.is_dir() and not path.is_file():
                 files = sorted(each.name for each in place.glob("counts*.npz"))
                 raise InputError(
-                    f"{place} lacks {path.name} (it holds {', '.join(files) or 'no counts'}); "
+                    f"{place} does not contain {path.name} "
+                    f"(it contains {', '.join(files) or 'no counts'}); "
                     "score the predictions over that partition with rgbt score."
                 )
             found[label] = Counts.load(path)

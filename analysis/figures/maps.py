@@ -63,7 +63,7 @@ def make_heats(given: FigureInput) -> Figure:
             "occupancy, or both."
         )
     if not has_statistics:
-        given.refuse(["part"], "statistics=... or dataset=..., whose images it chooses")
+        given.refuse(["part"], "statistics=... or dataset=..., whose images it selects")
     heats, part = [], given.get("part", ALL)
     if "maps" in given.values:
         pixel_maps = given.maps()

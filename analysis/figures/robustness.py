@@ -120,7 +120,9 @@ def panels(
         first.setdefault(level.row, level)
     known = [row for row in first if row != CLEAN]
     if not known:
-        raise InputError("runs: clean images alone were measured; rgbt robustness does.")
+        raise InputError(
+            "runs: only clean images were measured; measure the corruptions with rgbt robustness."
+        )
     shown = [row_name(row) for row in rows] or known
     for row in shown:
         if row not in known:
@@ -146,11 +148,13 @@ def _panel(methods: Mapping[str, Sequence[Training]], like: Level, absent: Absen
     }
     measured = {label: found for label, found in ladders.items() if found != {()}}
     if len(set().union(*measured.values())) > 1:
-        told = "; ".join(
+        measured_at = "; ".join(
             f"of '{label}' at {' and '.join(str([*ladder]) for ladder in sorted(found))}"
             for label, found in measured.items()
         )
-        raise InputError(f"runs: {like.row} was measured {told}; rgbt robustness completes them.")
+        raise InputError(
+            f"runs: {like.row} was measured {measured_at}; rgbt robustness measures the rest."
+        )
     severities = next(iter(next(iter(measured.values()))))
     curves = _curves(methods, lambda t: t.of(like.row) or [None] * len(severities), absent)
     return Panel(like.row, like.title, like.unit, (0.0, *severities), (), curves)

@@ -57,7 +57,7 @@ def find(
     if not there:
         raise InputError(
             f"none of the {len(names)} images of split '{split}' has a file NAME{suffix}.png in "
-            f"{folder}; it holds {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
+            f"{folder}; it contains {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
         )
     if absent and missing == "refuse":
         raise InputError(
@@ -84,7 +84,7 @@ def _stems(folder: Path) -> set[str]:
     stems = {path.stem for path in folder.glob("*.png")}
     if not stems:
         others = sorted(path.name for path in folder.iterdir())
-        holds = f"it holds {listed(others)}" if others else "it is empty"
+        holds = f"it contains {listed(others)}" if others else "it is empty"
         raise InputError(f"predictions={folder}: expected PNG files named NAME.png, but {holds}.")
     return stems
 

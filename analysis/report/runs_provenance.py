@@ -85,7 +85,7 @@ def read_provenance(files: RunFiles, key: str, remarks: list[str]) -> list[dict[
     commits = dict.fromkeys(commit_of(process) for process in processes)
     if len(commits) > 1:
         named = ", then ".join(commit or "no commit" for commit in commits)
-        remarks.append(f"Run {key} was begun and continued by different code: {named}.")
+        remarks.append(f"Run {key} was started and continued by different code: {named}.")
     return processes
 
 

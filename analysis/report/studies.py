@@ -22,7 +22,8 @@ COMPLETE = "complete"
 
 OBJECTIVES = re.compile(r"^Kind: (\w+)\. Objectives: (.+)\.$", re.MULTILINE)
 OBJECTIVE = re.compile(r"(highest|lowest) (.+)")
-BEGUN = re.compile(r"^Begun by `(.+)`\.$", re.MULTILINE)
+# Studies that were recorded before the wording changed have "Begun by".
+CREATED = re.compile(r"^(?:Created|Begun) by `(.+)`\.$", re.MULTILINE)
 FIGURES = re.compile(r"\n## [^\n]*\n\n!\[", re.MULTILINE)
 """Where the figures of a report begin; they are files of their own and not part of the page."""
 
@@ -66,7 +67,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
             f"study '{name}' has no {TRIALS_FILE} in the store; "
             f"`rgbt study name={name}` records it again."
         )
-    begun = BEGUN.search(note)
+    created = CREATED.search(note)
     return StudyEntry(
         name=name,
         kind=record.tags.get("rgbt.study.kind", head.group(1)),
@@ -74,7 +75,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
         maximize=maximize,
         trials=_trials(text, name, objectives, maximize),
         note=without_passwords(FIGURES.split(note)[0].strip() + "\n"),
-        command=without_passwords(begun.group(1)) if begun else "",
+        command=without_passwords(created.group(1)) if created else "",
     )
 
 

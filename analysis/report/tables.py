@@ -72,7 +72,7 @@ def table_entries(
         try:
             files[name] = load_table(name)
         except InputError as error:
-            remarks.append(f"Table '{name}' is left out: {error}")
+            remarks.append(f"Table '{name}' is omitted: {error}")
     recorded = []
     for record in records:
         try:
@@ -92,7 +92,7 @@ def table_entries(
     known = {each.name for each in recorded}
     for index, each in enumerate(recorded):
         if each.name not in files:
-            remarks.append(f"Table '{each.name}' has no file here any more; it is as recorded.")
+            remarks.append(f"Table '{each.name}' has no file any more; it is shown as recorded.")
             orders = {name: (rho, 0) for name, rho in each.orders.items()}
             made[index] = replace(made[index], orders=orders)
     return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
@@ -217,7 +217,7 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
     gone = [label for label in recorded.rows() if label not in {row.label for row in table.rows}]
     if gone:
         remarks.append(
-            f"Table '{recorded.name}': its file has no row '{gone[0]}' any more, which was run."
+            f"Table '{recorded.name}': row '{gone[0]}' was run but is no longer in its file."
         )
     remarks += draft.changed()
     return _laid_out(

@@ -51,9 +51,9 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
         if count > 1:
             said += f"; corrected for all {count} scores compared, {_p(found.p_corrected)}"
     else:
-        limit = f"with this much, one below about {found.interval.half:.2f}{unit} cannot be seen"
+        limit = f"this data shows only differences above about {found.interval.half:.2f}{unit}"
         if 0.0 not in found.interval:
-            limit = "the interval leaves 0 out, the exchange test does not confirm it"
+            limit = "the interval excludes 0, but the exchange test does not confirm it"
         said = (
             f"{start}a difference in {found.metric} between {label_b} and {label_a} is not shown "
             f"{evidence}, {basis}; {limit}"

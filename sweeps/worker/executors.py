@@ -106,7 +106,7 @@ def check_gpus(gpus: tuple[int, ...] | None) -> None:
     for number in gpus:
         if str(number) not in known:
             here = "this machine" if shown is None else f"{GPUS}={shown}"
-            found = f"the GPUs {', '.join(known)} alone; take" if known else "no GPU; omit"
+            found = f"the GPUs {', '.join(known)} only; choose" if known else "no GPU; omit"
             raise InputError(
                 f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
                 f"{'some of these' if known else 'gpus'}."

@@ -57,7 +57,7 @@ def other_code_line(outcomes: Sequence[Outcome]) -> str:
     if not others:
         return ""
     return (
-        f"{others} of {len(results)} runs were made by other code; fresh=true trains these again "
+        f"{others} of {len(results)} runs were made by other code; fresh=true retrains them "
         "and keeps the old runs."
     )
 

@@ -57,8 +57,8 @@ class RunStore:
             raise RunError(str(error)) from error
         if trained_on != dataset:
             raise RunError(
-                f"{result.folder} was made on other files of the data set ({trained_on[:8]}, now "
-                f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
+                f"{result.folder} was trained on other files of the data set ({trained_on[:8]}, "
+                f"now {dataset[:8]}); use another folder of runs (runs_dir=...)."
             )
         return None if self._is_outdated(result) else result
 
@@ -128,8 +128,8 @@ class RunStore:
             self._is_unreachable = True
             lines = without_passwords(str(error)).splitlines() or [type(error).__name__]
             info(
-                f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched in "
-                f"{self.runs_dir} alone. Send new runs later: `rgbt sync`."
+                f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched only "
+                f"in {self.runs_dir}. Send new runs later: `rgbt sync`."
             )
             return None
 

@@ -170,8 +170,8 @@ class SubmititExecutor:
             self._executor.update_parameters(**self._named(values))
         except RuntimeError as error:
             raise InputError(
-                "executor=submitit: there is no `srun` here; start the command on a login node of "
-                "the cluster, or use submitit.cluster=local."
+                "executor=submitit: this machine has no `srun`; start the command on a login node "
+                "of the cluster, or use submitit.cluster=local."
             ) from error
         except (AssertionError, TypeError, ValueError) as error:
             raise InputError(f"submitit={dict(options)}: {str(error).splitlines()[0]}") from error
@@ -188,8 +188,8 @@ class SubmititExecutor:
         wanted: dict[str, str | None] = dict(environment)
         if self._cluster == "slurm" and GPUS in wanted:
             raise InputError(
-                "gpus=[...] are GPUs of this machine; with executor=submitit the cluster gives "
-                "each run its own: submitit.gpus_per_node=1."
+                "gpus=[...] selects GPUs of this machine; with executor=submitit, the cluster "
+                "assigns GPUs to each run: set submitit.gpus_per_node=1."
             )
         if self._cluster == "local":
             # submitit hides all GPUs from a local job that did not ask for a number of them.
@@ -220,8 +220,8 @@ class SubmititExecutor:
                 )
         if self._cluster == "slurm" and values.get("timeout_min") is None:
             raise InputError(
-                "submitit.timeout_min has no value; give the minutes that a job may take, at most "
-                "what the partition allows (`sinfo` shows it)."
+                "submitit.timeout_min has no value; set the time limit of a job in minutes, at "
+                "most the limit of the partition (see `sinfo`)."
             )
         return values
 

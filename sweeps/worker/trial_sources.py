@@ -216,7 +216,7 @@ def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
 
 def reason_of(trial: FrozenTrial) -> str:
     """Why a trial failed."""
-    return str(trial.user_attrs.get(names.REASON, "no reason was noted"))
+    return str(trial.user_attrs.get(names.REASON, "no reason was recorded"))
 
 
 @dataclass
